@@ -25,7 +25,7 @@ import httpx
 import numpy as np
 
 from benchmarks.api_process import api_process
-from regnf_cli.local_service import running_service
+from regnf_cli.demo import running_service
 from regnf_cli.remote import RemoteService
 from tests.core.importing.checkpoints import write_full_size_checkpoint
 

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.random_worlds.models import read_catalog, seeds_of
+from benchmarks.random_worlds.walks import KINDS, LENGTHS, make_world
 from benchmarks.robust.library_objects import GIVEN
 from benchmarks.worlds.recipe import Seen, see
 from regnf_core.errors import RegnfError
@@ -29,10 +31,6 @@ from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_data.fusing import open3d
-from regnf_data.worlds.models import read_catalog
-from regnf_data.worlds.rooms import KINDS, make_world
-from regnf_data.worlds.split import seeds_of
-from regnf_data.worlds.walks import LENGTHS
 
 DEFAULT, OTHERS = 8.0, (4.0, 6.0, 12.0, 16.0)
 _EDGE = 16

@@ -16,8 +16,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from regnf_core.errors import NoSurfaceError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.neus_facto import NeusFactoField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.surface.isosurface import extract_surface
 from regnf_data.mesh_scene import MeshScene

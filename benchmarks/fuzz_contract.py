@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, write_small_pair
 from regnf_cli.remote import RemoteService
-from regnf_service.http.paging import encode_token
+from regnf_service.http.query import encode_token
 from tests.contract.live import Live, eventually, live_service
 from tests.processes import children_of
 

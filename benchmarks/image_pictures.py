@@ -20,11 +20,9 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.robust.cases import Pair, load_pairs
 from regnf_core import RegistrationResult, Sim3, register
 from regnf_core.fields.observation import observation_of
-from regnf_core.geometry.metrics import errors_against_truth
-from regnf_core.geometry.points import gaps
-from regnf_core.robust.sampling import sample_scene_surface
-from regnf_core.robust.working_frame import WorkingFrame
-from regnf_core.schema.observation_grid import SURFACE
+from regnf_core.geometry.metrics import errors_against_truth, gaps
+from regnf_core.robust.working_frame import WorkingFrame, sample_scene_surface
+from regnf_core.schema.description import SURFACE
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR
 from regnf_core.viewing.splats import Surfels, render, view_from
 

@@ -27,7 +27,7 @@ from regnf_core.editing.storing import write_field
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_fit.mesh.options import FitOptions
+from regnf_fit.options import FitOptions
 from scripts import make_demo_fields as demo
 
 UNITS_PER_METER = {

@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks.make_fields import UNITS_PER_METER, surface
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
-from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.options import ReconstructionOptions
 from scripts import make_demo_fields as demo
 
 ROOMS = ("ac-room", "atbl-room", "mix-room")

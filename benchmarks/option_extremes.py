@@ -28,8 +28,8 @@ from torch import Tensor
 from regnf_core.cost import MIB, Cost, estimate
 from regnf_core.errors import RegnfError
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from regnf_core.registration import register
 from regnf_core.viewing import write_artifacts
 from regnf_worker import kernel
 from regnf_worker.job_limits import JobLimits

@@ -22,7 +22,7 @@ import trimesh
 from playwright.sync_api import Page, sync_playwright
 
 from benchmarks.service_load.report import headed, load, write
-from regnf_cli.local_service import running_service
+from regnf_cli.demo import running_service
 from tests.ui.conftest import ARGUMENTS
 from tests.ui.room import room
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 import sys
 
 from regnf_cli import api_process
-from regnf_cli.listening import open_socket
-from regnf_cli.start_errors import StartError
+from regnf_cli.embedded_redis import StartError, open_socket
 from regnf_state.settings import Settings
 
 

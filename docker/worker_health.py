@@ -14,7 +14,7 @@ from redis import Redis, RedisError
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_state.queue import QUEUE_NAME
-from regnf_state.redis.address import NoRedisError, redis_address
+from regnf_state.redis.client import NoRedisError, redis_address
 from regnf_state.settings import Settings
 
 _TIMEOUT_S = 5.0

@@ -8,18 +8,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.errors import InvalidInputError, InvalidOptionsError, suggestion
 from regnf_core.field_files import require_file
-from regnf_core.fields.base import SdfField
-from regnf_core.hints import suggestion
+from regnf_core.fields.observation import SdfField
 from regnf_core.in_memory import field_of
 from regnf_core.options import seed_of
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
-from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
-from regnf_fit.mesh.file import mesh_target
-from regnf_fit.mesh.fit import fit_field
-from regnf_fit.mesh.options import FitOptions, FitReport
+from regnf_fit.mesh import fit_field, mesh_target
+from regnf_fit.options import FitOptions, FitReport, ReconstructionOptions, ReconstructionReport
 
 Progress = Callable[[int, float, float], None]
 """Called with the iteration, the loss and the seconds left."""

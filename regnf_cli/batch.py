@@ -2,21 +2,209 @@
 
 from __future__ import annotations
 
+import logging
+import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from regnf_cli.batch_file import FilePair, ResultsFile, read_pairs
-from regnf_cli.batch_here import failure, register_here
-from regnf_cli.console import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, phase_progress
-from regnf_cli.extras import require
+from regnf_cli.guard import require
 from regnf_cli.options import Server, Token, WorkerTimeout
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, phase_progress
+from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.pairs import short_result
+from regnf_core.processes import die_with_parent
 
 if TYPE_CHECKING:
     from regnf_client import Pair, PairResult
+    from regnf_core.fields.observation import SdfField
+    from regnf_core.library import LibraryObject, ObjectModel
+    from regnf_core.options import RegistrationOptions
+
+
+# Registering many pairs here: processes that keep fields and object models open from one pair to the next.
+
+_FIELDS_OPEN = 16
+_MODELS_HELD = 256
+_TRIES = 2
+"""How often a pair is begun whose process died: another pair of the same moment may have been the cause."""
+logger = logging.getLogger(__name__)
+
+
+def register_here(pairs: Sequence[FilePair], processes: int) -> Iterator[tuple[FilePair, dict[str, Any]]]:
+    """The result of each pair as it comes. Pairs of one scene and object follow each other, so that both stay open."""
+    ordered = sorted(pairs, key=lambda pair: (pair.scene, pair.objects, pair.line))
+    if processes == 1:
+        yield from ((pair, register_pair(pair)) for pair in ordered)
+    else:
+        yield from _in_processes(ordered, processes)
+
+
+def _in_processes(pairs: Sequence[FilePair], processes: int) -> Iterator[tuple[FilePair, dict[str, Any]]]:
+    left = iter(pairs)
+    again: list[tuple[FilePair, int]] = []
+    while True:
+        try:
+            yield from _one_pool(left, again, processes)
+        except BrokenProcessPool:
+            for pair, tries in [one for one in again if one[1] >= _TRIES]:
+                again.remove((pair, tries))
+                error = InvalidInputError("its process died", reason="WORKER_LOST", hint="Is there enough memory?")
+                yield pair, failure(error)
+            continue
+        return
+
+
+def _one_pool(
+    left: Iterator[FilePair], again: list[tuple[FilePair, int]], processes: int
+) -> Iterator[tuple[FilePair, dict[str, Any]]]:
+    """Results until all pairs are done. When a process dies, those that were begun are put into ``again``."""
+    running: dict[Future[dict[str, Any]], tuple[FilePair, int]] = {}
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (os.getpid(),))
+    try:
+        while True:
+            while len(running) < 2 * processes and (found := _next(left, again)) is not None:
+                with _kept_from_children():
+                    running[pool.submit(register_pair, found[0])] = found
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                pair, _ = running[future]
+                told = future.result()
+                del running[future]
+                yield pair, told
+    except BrokenProcessPool:
+        again += [(pair, tries + 1) for pair, tries in running.values()]
+        raise
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in multiprocessing.active_children():  # those in the midst of a pair that nobody waits for any more
+            child.kill()
+
+
+def _next(left: Iterator[FilePair], again: list[tuple[FilePair, int]]) -> tuple[FilePair, int] | None:
+    if again:
+        return again.pop(0)
+    return next(((pair, 0) for pair in islice(left, 1)), None)
+
+
+@contextmanager
+def _kept_from_children() -> Iterator[None]:
+    """Processes that begin meanwhile never get a terminal's signals: this one has them, and ends the others."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(parent: int) -> None:
+    """One thread each: the processes share the cores."""
+    die_with_parent(parent)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def register_pair(pair: FilePair) -> dict[str, Any]:
+    """What the results say of a pair. Nothing that is wrong with it is raised."""
+    try:
+        return {"status": "successful", **short_result(_document(pair))}
+    except RegnfError as error:
+        return failure(error)
+    except OSError as error:
+        return failure(InvalidInputError(str(error), reason="FILE_UNUSABLE"))
+    except Exception as error:
+        logger.exception("line %d: an internal error", pair.line)
+        return failure(InvalidInputError(f"an internal error: {type(error).__name__}", reason="INTERNAL"))
+
+
+def failure(error: RegnfError) -> dict[str, Any]:
+    """What the results say of a pair without a result."""
+    told = {"reason": error.reason, "detail": str(error)} | ({"hint": error.hint} if error.hint else {})
+    return {"status": "failed", "error": told}
+
+
+def _document(pair: FilePair) -> dict[str, Any]:
+    from regnf_core.detections import parse_detection, require_in_scene
+    from regnf_core.geometry.box import OrientedBox
+    from regnf_core.geometry.sim3 import Sim3
+    from regnf_core.library import WarmStart, register, search_library
+    from regnf_core.options import RegistrationOptions
+    from regnf_core.viewing import ranking_document, result_document
+
+    request = pair.request or {}
+    options = RegistrationOptions.from_dict(request["options"])
+    detection, scene = parse_detection(request["detection"]), _field(pair.scene, "scene")
+    lower, upper = scene.bounds.tolist()
+    require_in_scene(detection, (lower, upper))
+    box = OrientedBox.from_detection(detection)
+    start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
+    if pair.is_search:
+        _require_nothing_of_one_object(start, truth)
+        library = [_candidate(one, options) for one in pair.objects]
+        found = search_library(scene, box, library, options, request["seed"], clouds=False)
+        ranking = ranking_document(found.ranking, {})
+        document: dict[str, Any] = result_document(found.result, object_name=found.ranking[0].name, candidates=ranking)
+        return document
+    (name,) = pair.objects
+    model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
+    warm = WarmStart(None if start is None else Sim3.from_matrix(start), model)
+    # errors against a truth are those of the clouds' points
+    clouds = truth is not None
+    result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=clouds)
+    told: dict[str, Any] = result_document(result, None if truth is None else Sim3.from_matrix(truth))
+    return told
+
+
+def _require_nothing_of_one_object(start: object, truth: object) -> None:
+    """Raises InvalidInputError, as a service refuses such a line."""
+    for name, given, reason in (
+        ("initial_transform", start, "INITIAL_TRANSFORM_UNSUPPORTED"),
+        ("ground_truth", truth, "INVALID_REQUEST"),
+    ):
+        if given is not None:
+            hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
+            raise InvalidInputError(
+                f"`{name}` applies to one object, not to several candidates", reason=reason, hint=hint
+            )
+
+
+@lru_cache(_FIELDS_OPEN)
+def _field(path: str, role: Any) -> SdfField:
+    from regnf_core.field_source import find_source
+    from regnf_core.loading import load_field
+
+    return load_field(find_source(Path(path), role=role)).field
+
+
+@lru_cache(_MODELS_HELD)
+def _model(path: str, samples: int) -> ObjectModel:
+    from dataclasses import replace
+
+    from regnf_core.field_source import find_source
+    from regnf_core.object_models import object_model
+    from regnf_core.options import RobustOptions
+
+    return object_model(find_source(Path(path), role="object"), replace(RobustOptions(), object_samples=samples))
+
+
+def _candidate(path: str, options: RegistrationOptions) -> LibraryObject:
+    from regnf_core.library import LibraryObject
+
+    return LibraryObject(path, lambda: _field(path, "object"), _model(path, options.robust.object_samples))
+
 
 PairsFile = Annotated[
     Path,

@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from regnf_cli.request_files import as_transform, is_json
+from regnf_cli.options import as_transform, is_json
 from regnf_core.detections import parse_detection
-from regnf_core.engine_revision import ENGINE_REVISION
-from regnf_core.errors import InvalidInputError, RegnfError
-from regnf_core.hints import suggestion
+from regnf_core.errors import InvalidInputError, RegnfError, suggestion
 from regnf_core.options import RegistrationOptions
 from regnf_core.texts import TextError, decode_text, json_value
+from regnf_core.version import ENGINE_REVISION
 
 MEMBERS = ("key", "scene", "object", "candidates", "detection", "detection_index", "options", "seed")
 _MORE = ("initial_transform", "ground_truth", "pictures")

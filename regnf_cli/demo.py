@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import select
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -19,12 +23,71 @@ from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.console import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, phase_progress
-from regnf_cli.demo_data import demo_folder
-from regnf_cli.extras import require
-from regnf_cli.local_service import running_service
+from regnf_cli.guard import require
 from regnf_cli.remote import RemoteService
-from regnf_cli.report import show_pose
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, phase_progress, show_pose
+from regnf_core.errors import InvalidInputError
+
+# Where the demo's fields lie: in the installed package, or in a checkout's examples folder.
+
+_PACKAGED = Path(__file__).with_name("demo_files")
+_CHECKOUT = Path(__file__).resolve().parents[1] / "examples" / "data"
+FILES = ("mix-room.safetensors", "armchair.safetensors", "detection.json", "truth.json")
+"""What the demo needs; the build of the wheel copies these files into the package."""
+
+
+def demo_folder() -> Path:
+    """The folder that holds all of ``FILES``. Raises InvalidInputError (DEMO_DATA_MISSING)."""
+    for folder in (_PACKAGED, _CHECKOUT):
+        if all((folder / name).is_file() for name in FILES):
+            return folder
+    raise InvalidInputError(
+        f"the demo's files ({', '.join(FILES)}) are neither in {_PACKAGED} nor in {_CHECKOUT}; "
+        "install regnf from its wheel or run from a checkout",
+        reason="DEMO_DATA_MISSING",
+    )
+
+
+# A private service for scripts and notebooks: `regnf serve` on a free port, stopped at the end.
+
+START_DEADLINE_S = 30
+STOP_DEADLINE_S = 30
+
+
+@contextmanager
+def running_service(state_dir: Path, checkout: Path | None = None, **settings: object) -> Iterator[str]:
+    """Start `regnf serve` with its state under ``state_dir``; yields its address.
+
+    ``checkout`` may name another checkout, whose `.venv` is used. ``settings`` are those of the service by name; the
+    REGNF_* of this process' environment are not passed on. Its log is ``state_dir``/serve.log.
+    Raises RuntimeError when it does not listen within half a minute.
+    """
+    state_dir.mkdir(parents=True, exist_ok=True)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("REGNF_", "PYTHONPATH"))}
+    environment |= {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
+    python = sys.executable if checkout is None else str(checkout / ".venv" / "bin" / "python")
+    command = [python, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(state_dir)]
+    with (state_dir / "serve.log").open("w") as log:
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment, cwd=checkout)
+    try:
+        yield _address(server)
+    finally:
+        server.send_signal(signal.SIGTERM)
+        server.communicate(timeout=STOP_DEADLINE_S)
+
+
+def _address(server: subprocess.Popen[str]) -> str:
+    assert server.stdout is not None
+    deadline = time.monotonic() + START_DEADLINE_S
+    while time.monotonic() < deadline and server.poll() is None:
+        if not select.select([server.stdout], [], [], 0.2)[0]:
+            continue
+        for word in server.stdout.readline().split():
+            if word.startswith("http://"):
+                return word.rstrip("/")
+    server.kill()
+    raise RuntimeError("the service did not start; see serve.log in its state folder")
+
 
 MAX_ROTATION_RAD = 0.03
 MAX_CENTER_SHARE = 0.03

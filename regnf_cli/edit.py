@@ -7,11 +7,18 @@ from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.extras import require
-from regnf_cli.field_options import choice_of, source_of
-from regnf_cli.options import NoConfigs, Scene, SceneConfig, SceneDescription
-from regnf_cli.paths import JSON_FILE
-from regnf_cli.render_here import render_here
+from regnf_cli.guard import require
+from regnf_cli.options import (
+    JSON_FILE,
+    NoConfigs,
+    Scene,
+    SceneConfig,
+    SceneDescription,
+    choice_of,
+    read_list,
+    read_transform,
+    source_of,
+)
 from regnf_cli.rendering_options import (
     Antialias,
     Around,
@@ -25,9 +32,9 @@ from regnf_cli.rendering_options import (
     Request,
     Size,
     Up,
+    render_here,
     request_of,
 )
-from regnf_cli.request_files import read_list, read_transform
 
 EditsFile = Annotated[
     Path,

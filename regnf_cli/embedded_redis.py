@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
+import errno
+import ipaddress
+import logging
 import shutil
+import socket
 from pathlib import Path
 
 from redis import Redis
 from redis.exceptions import RedisError
 
-from regnf_cli.start_errors import StartError
+from regnf_core.errors import RegnfError
+from regnf_service.http.hosts import HostsError, allowed_hosts, cors_origins
+from regnf_service.tokens import TokensError, read_callers
+from regnf_service.webhooks.targets import AllowList, read_secrets
+from regnf_state.settings import Settings
+
+# Why a service or a worker could not be started.
+
+
+class StartError(RegnfError):
+    """Reasons: STATE_DIR_IN_USE, STATE_DIR_UNUSABLE, ADDRESS_UNAVAILABLE, UNAUTHENTICATED_PUBLIC_BIND,
+    TOKENS_UNUSABLE, EMBEDDED_REDIS_MISSING, SERVICE_START_FAILED, REDIS_URL_MISSING, REDIS_UNAVAILABLE,
+    STORAGE_MISMATCH."""
+
+    unavailable = True
+    reason = "SERVICE_START_FAILED"
+
 
 _SERVERS = ("valkey-server", "redis-server")
 
@@ -59,3 +79,93 @@ def answers(url: str) -> bool:
             return bool(redis.ping())
         except RedisError:
             return False
+
+
+# The socket that the service listens on: opened by the supervisor, so that it outlives an API process that dies.
+
+_BACKLOG = 2048
+_TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list or one a line in REGNF_API_TOKENS_FILE."
+_SECRETS_HINT = (
+    "Write entries as CALLER:whsec_BASE64, in REGNF_WEBHOOK_SECRETS as a JSON list or one a line in "
+    "REGNF_WEBHOOK_SECRETS_FILE."
+)
+_WEBHOOK_HOSTS_HINT = 'Write REGNF_WEBHOOK_HOSTS as a JSON list, for example ["hooks.example.org", "10.0.0.5:9000"].'
+_HOSTS_HINT = (
+    'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"], and'
+    ' REGNF_CORS_ORIGINS likewise: ["https://app.example.org"].'
+)
+logger = logging.getLogger(__name__)
+
+
+def check_access(settings: Settings) -> None:
+    """Raises StartError for what would let strangers in, and for callers that cannot be read.
+
+    UNAUTHENTICATED_PUBLIC_BIND: others can reach the address while no token is asked for. TOKENS_UNUSABLE and
+    ALLOWED_HOSTS_UNUSABLE: see there.
+    """
+    if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
+        raise StartError(
+            f"{settings.publish or settings.host} can be reached by others, and no token is configured",
+            reason="UNAUTHENTICATED_PUBLIC_BIND",
+            hint="Set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind a proxy that authenticates.",
+        )
+    try:
+        read_callers(settings.api_tokens, settings.api_tokens_file)
+    except TokensError as error:
+        raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
+    try:
+        read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
+    except TokensError as error:
+        raise StartError(str(error), reason=error.reason, hint=_SECRETS_HINT) from error
+    try:
+        AllowList(settings.webhook_hosts)
+    except TokensError as error:
+        raise StartError(str(error), reason=error.reason, hint=_WEBHOOK_HOSTS_HINT) from error
+    try:
+        allowed_hosts(settings)
+        cors_origins(settings)
+    except HostsError as error:
+        raise StartError(str(error), reason=error.reason, hint=_HOSTS_HINT) from error
+    if not settings.is_private and not settings.allowed_hosts:
+        logger.warning(
+            "REGNF_ALLOWED_HOSTS is empty: who calls by a name, or through a port of another host, is refused"
+        )
+
+
+def open_socket(settings: Settings) -> socket.socket:
+    """A listening socket on the settings' host and port (0: a free one).
+
+    Raises StartError: ADDRESS_UNAVAILABLE, or what ``check_access`` refuses.
+    """
+    check_access(settings)
+    try:
+        found = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, address = found[0]
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(_BACKLOG)
+        except OSError:
+            listener.close()
+            raise
+    except OSError as error:
+        detail = f"cannot listen on {settings.host}, port {settings.port}: {error.strerror or error}"
+        raise StartError(detail, reason="ADDRESS_UNAVAILABLE", hint=_address_hint(error, settings)) from error
+    return listener
+
+
+def _address_hint(error: OSError, settings: Settings) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return f"Another program uses port {settings.port}: stop it, or give --port 0 for a free one."
+    if error.errno == errno.EACCES:
+        return "Ports below 1024 need privileges: give --port 8080."
+    return "Give an address of this machine with --host: 127.0.0.1 for this machine alone, 0.0.0.0 for all networks."
+
+
+def address_of(listener: socket.socket) -> str:
+    """The address to open in a browser on this machine."""
+    host, port = listener.getsockname()[:2]
+    if ipaddress.ip_address(host).is_unspecified:
+        host = "127.0.0.1"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -3,36 +3,106 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import asdict, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
-from regnf_cli.camera_options import Axes, CameraAxes
-from regnf_cli.console import err
-from regnf_cli.extras import require
-from regnf_cli.fit_options import (
-    Device,
-    DeviceChoice,
-    Extent,
-    HiddenWidth,
-    Iterations,
-    Label,
-    Pictures,
-    RefinePoses,
-    SafeField,
-    Sdfstudio,
-    Snapshots,
-    Source,
-    Start,
-    StartChoice,
-    TableLog2,
-    check_field_to_write,
-    print_report,
-)
-from regnf_cli.options import Seed
+from regnf_cli.convert import Axes, CameraAxes
+from regnf_cli.guard import require
+from regnf_cli.options import Seed, check_output
+from regnf_cli.report import err, out
 from regnf_core.errors import InvalidOptionsError
+
+# The options of ``regnf fit``, some of ``regnf fuse`` too.
+
+_LONGEST_LABEL = 200  # of the safe format
+
+
+class StartChoice(StrEnum):
+    """A ball, a hollow ball round the bounds, or what the images suggest."""
+
+    auto = "auto"
+    object = "object"
+    room = "room"
+
+
+class DeviceChoice(StrEnum):
+    """Where to compute; auto: a GPU if there is one."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+# of both kinds of sources
+
+Source = Annotated[
+    Path,
+    typer.Argument(help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True),
+]
+SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
+Iterations = Annotated[
+    int | None,
+    typer.Option(min=1, help="Training steps; more is finer. Without it 3000."),
+]
+TableLog2 = Annotated[
+    int | None,
+    typer.Option(
+        min=8, max=22, help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show."
+    ),
+]
+Label = Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")]
+HiddenWidth = Annotated[
+    int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
+]
+
+# of meshes
+
+Extent = Annotated[
+    float | None,
+    typer.Option(
+        help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
+        "Else its own frame."
+    ),
+]
+
+# of images
+
+Snapshots = Annotated[
+    str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
+]
+Sdfstudio = Annotated[
+    Path | None,
+    typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt)."),
+]
+Pictures = Annotated[bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")]
+Start = Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")]
+RefinePoses = Annotated[
+    bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
+]
+Device = Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")]
+
+
+def check_field_to_write(output: Path, label: str | None) -> None:
+    """Refuse before the work what would fail after it. Raises InvalidOptionsError."""
+    check_output(output, (".safetensors",))
+    if label is not None and len(label) > _LONGEST_LABEL:
+        raise InvalidOptionsError(f"the label has more than {_LONGEST_LABEL} characters")
+
+
+def print_report(figures: dict[str, Any]) -> None:
+    """The figures of a fit or a fusion, a line each, and its warnings."""
+    warnings = figures.pop("warnings", ())
+    for name, value in figures.items():
+        out.print(f"{name:<24} {'none' if value is None else format(value, '.6g')}")
+    for warning in warnings:
+        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
+
 
 _OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto, None)
 
@@ -75,7 +145,6 @@ def fit(
         return
     if extent is not None:
         raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
-    from regnf_cli.fit_images import fit_images
 
     settings |= {"table_log2": table_log2, "start": start.value, "refine_poses": refine_poses}
     files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures, "opengl": axes == Axes.OPENGL}
@@ -90,9 +159,8 @@ def _fit_mesh(
     extent: float | None,
     rest: dict[str, Any],
 ) -> None:
-    from regnf_fit.mesh.file import mesh_target
-    from regnf_fit.mesh.fit import fit_field
-    from regnf_fit.mesh.options import FitOptions
+    from regnf_fit.mesh import fit_field, mesh_target
+    from regnf_fit.options import FitOptions
 
     options = FitOptions(**settings)
     if table_log2 is not None:
@@ -113,3 +181,57 @@ def _fit_with_bar(fit_field: Any, target: Any, output: Path, options: Any, rest:
 
         figures = fit_field(target, output, options, progress=report, **rest)
     print_report(asdict(figures))
+
+
+# ``regnf fit`` of a folder of posed images.
+
+
+def fit_images(
+    dataset: Path, output: Path, settings: dict[str, Any], extra: dict[str, Any], rest: dict[str, Any]
+) -> None:
+    """Fit to the images in ``dataset``.
+
+    settings: of ReconstructionOptions · extra: ``snapshots``, percents between commas, and ``sdfstudio``, a path, or
+    None each; ``pictures``, whether to draw; ``opengl``, the cameras' axes · rest: what ``reconstruct`` takes beside.
+    """
+    from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.fit import FitFiles, reconstruct
+    from regnf_fit.options import ReconstructionOptions
+
+    options = ReconstructionOptions(**settings)
+    files = FitFiles(
+        output,
+        output.with_suffix(".checkpoint"),
+        shares(extra["snapshots"]),
+        pictures=extra["pictures"],
+        sdfstudio=extra["sdfstudio"],
+    )
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
+    with Progress(*columns, console=err) as bar:
+        task = bar.add_task("fitting", total=1.0, state="reading the images")
+        images = load_dataset(dataset, opengl=extra["opengl"])
+
+        def report(iteration: int, loss: float, seconds_left: float) -> None:
+            elapsed = time.monotonic() - started
+            state = f"iteration {iteration}, loss {loss:.5f}, {seconds_left:.0f} s left"
+            bar.update(task, completed=elapsed / max(elapsed + seconds_left, 1e-9), state=state)
+
+        bar.update(task, state="laying out the rays")
+        started = time.monotonic()
+        figures = reconstruct(
+            images, files, options, progress=report, source={"dataset": dataset.resolve().name}, **rest
+        )
+    print_report(asdict(figures))
+
+
+def shares(percents: str | None) -> tuple[float, ...]:
+    """Percents such as ``1,3,10`` as shares. Raises InvalidOptionsError."""
+    if not percents:
+        return ()
+    try:
+        values = tuple(float(part) / 100.0 for part in percents.split(","))
+    except ValueError as error:
+        raise InvalidOptionsError(f"snapshots are percents such as 1,3,10, not {percents:.40}") from error
+    if not all(0.0 < value < 1.0 for value in values):
+        raise InvalidOptionsError("snapshots lie between 0 and 100 percent")
+    return values

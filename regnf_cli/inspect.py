@@ -12,13 +12,12 @@ from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.candidates import keep_pictures
-from regnf_cli.console import out
-from regnf_cli.extras import require
-from regnf_cli.field_options import choice_of, source_of
-from regnf_cli.options import Config, Description, Field, NoConfig
+from regnf_cli.guard import require
+from regnf_cli.options import Config, Description, Field, NoConfig, choice_of, source_of
+from regnf_cli.report import out
+from regnf_cli.search import keep_pictures
 from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
-from regnf_core.labels import shown_number
+from regnf_core.library_entries import shown_number
 
 Picture = Annotated[Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)]
 Candidates = Annotated[

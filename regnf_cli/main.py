@@ -73,7 +73,7 @@ def command(ended_by: list[int] | None = None) -> int:
             return 128 + signal.SIGINT
         if error.filename is None and error.errno not in _OUTPUT:
             raise
-        from regnf_cli.console import fail
+        from regnf_cli.report import fail
 
         told = error.strerror or str(error)
         return fail("FILE_UNUSABLE", f"{error.filename or 'output'}: {told}", hint=_what_to_do(error.errno))
@@ -130,11 +130,9 @@ def _run() -> int:
     """Run the command that the arguments name; the exit code. Errors of users take two lines."""
     import typer
 
-    from regnf_cli.commands import COMMANDS, GROUPS, app_of
-    from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
-    from regnf_cli.usage import usage_fault
-    from regnf_core.errors import RegnfError
-    from regnf_core.hints import HINTS
+    from regnf_cli.commands import COMMANDS, GROUPS, app_of, usage_fault
+    from regnf_cli.report import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
+    from regnf_core.errors import HINTS, RegnfError
 
     usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # typer does not export its name
     asked = sys.argv[1:2]
@@ -148,7 +146,7 @@ def _run() -> int:
         raise KeyboardInterrupt from error
     except RegnfError as error:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
-        from regnf_cli.candidates import show_candidates
+        from regnf_cli.search import show_candidates
 
         hint = error.hint
         if hint == HINTS["INVALID_OPTIONS"] and "options." not in str(error):  # options of the command line

@@ -10,9 +10,8 @@ import typer
 from rich.markdown import Markdown
 from rich.table import Table
 
-from regnf_cli.console import out
-from regnf_core.errors import InvalidInputError
-from regnf_core.hints import suggestion
+from regnf_cli.report import out
+from regnf_core.errors import InvalidInputError, suggestion
 
 _PACKAGED = Path(__file__).with_name("manual_pages")
 _CHECKOUT = Path(__file__).resolve().parents[1] / "docs"

@@ -5,13 +5,235 @@ The name of an option is its parameter's. Its default stands in the command's si
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.field_options import CONFIG, DESCRIPTION
-from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT, RECORDING
+from regnf_cli.report import err
+from regnf_core.detections import Detection, parse_detection
+from regnf_core.errors import (
+    RECORDING_SUFFIX,
+    FieldFormatError,
+    InvalidDetectionError,
+    InvalidInputError,
+    InvalidOptionsError,
+    new_file,
+)
+from regnf_core.field_files import require_field_file, require_file
+from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
+from regnf_core.options import Preset, RegistrationOptions
+from regnf_core.rotations import Rows, transform_rows
+from regnf_core.texts import json_value
+
+# Files named at the command line: a name that cannot be used is refused with the one that was meant.
+
+
+def field_path(text: str) -> Path:
+    """The path of a field: of a file, a training run's folder or an archive. Raises what ``find_source`` does."""
+    path = Path(text)
+    find_source(path, settings=False)
+    return path
+
+
+def file(text: str) -> Path:
+    """The path of a file that is there. Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER)."""
+    path = Path(text)
+    require_file(path)
+    return path
+
+
+def folder(text: str) -> Path:
+    """The path of a folder that is there. Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_NO_FOLDER)."""
+    path = Path(text)
+    if path.is_dir():
+        return path
+    if path.exists():
+        hint = f"Give the folder that holds it: {path.parent}"
+        raise InvalidInputError(f"{path}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
+    require_file(path)
+    return path
+
+
+def existing(text: str) -> Path:
+    """The path of a file or a folder that is there. Raises InvalidInputError (FILE_NOT_FOUND)."""
+    path = Path(text)
+    if not path.is_dir():
+        require_file(path)
+    return path
+
+
+def library_path(text: str) -> Path:
+    """A folder of fields, or a field. Raises what ``require_field_file`` does."""
+    path = Path(text)
+    if not path.is_dir():
+        require_field_file(path)
+    return path
+
+
+def output_folder(text: str) -> Path:
+    """The path of a folder to write into, which may not be there yet. Raises InvalidInputError (FILE_IS_NO_FOLDER)."""
+    path = Path(text)
+    for place in (path, *path.parents):
+        if place.is_dir():
+            break
+        if place.exists():
+            message = f"{place}: a file, expected a folder to write into"
+            raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Name another folder.")
+    return path
+
+
+def check_output(output: Path, endings: Sequence[str], given: Iterable[Path | None] = ()) -> None:
+    """Refuse, before the work, a file to write that cannot be written, or is one of those ``given`` to be read.
+
+    endings: those that its name may have. Raises InvalidOptionsError.
+    """
+    if output.suffix.lower() not in endings:
+        hint = "The ending chooses the format." if len(endings) > 1 else f"Write for example {output.stem}{endings[0]}."
+        expected = f"one of {', '.join(endings)}" if len(endings) > 1 else endings[0]
+        raise InvalidOptionsError(f"{output}: expected a name that ends in {expected}", hint=hint)
+    if not output.parent.is_dir():
+        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
+    if any(one is not None and one.exists() and output.exists() and output.samefile(one) for one in given):
+        raise InvalidOptionsError(f"{output}: it is read, and would be overwritten", hint="Name another file to write.")
+
+
+def recording_file(text: str) -> Path:
+    """The path of a recording to write, whose folder may not be there yet.
+
+    Raises InvalidOptionsError for a name of something else, InvalidInputError (FILE_IS_FOLDER, FILE_IS_NO_FOLDER).
+    """
+    path = Path(text)
+    output_folder(str(path.parent))
+    return new_file(path, RECORDING_SUFFIX)
+
+
+FIELD: dict[str, Any] = {"parser": field_path, "metavar": "FIELD"}
+JSON_FILE: dict[str, Any] = {"parser": file, "metavar": "FILE"}
+OUTPUT: dict[str, Any] = {"parser": output_folder, "metavar": "FOLDER"}
+RECORDING: dict[str, Any] = {"parser": recording_file, "metavar": "FILE"}
+"""How options and arguments of these kinds are declared."""
+
+
+# The files that describe a registration at the command line: detection, options, transforms.
+
+_TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: scene coordinates to object coordinates;'
+_TRANSFORM += ' or {"T_scene_object": ...}: object coordinates to scene coordinates.'
+
+
+def read_detection(path: Path, index: int | None = None) -> Detection:
+    """The detection in a file, in any form. Raises InvalidInputError (MALFORMED_JSON) and InvalidDetectionError."""
+    try:
+        return parse_detection(read_json(path, "detection"), index)
+    except InvalidDetectionError as error:
+        message = f"{path}: {error}"
+        raise InvalidDetectionError(message, reason=error.reason, hint=error.hint, place=error.place) from error
+
+
+def read_object(path: Path, what: str) -> dict[str, Any]:
+    """A JSON object from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
+    value = read_json(path, what)
+    if not isinstance(value, dict):
+        hint = "Write an object: {...}."
+        raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
+    return value
+
+
+def read_list(path: Path, what: str) -> list[Any]:
+    """A JSON list from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
+    value = read_json(path, what)
+    if not isinstance(value, list):
+        raise InvalidInputError(f"{what} {path}: expected a JSON list", reason="MALFORMED_JSON", hint="Write [...].")
+    return value
+
+
+def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
+    """Plain options: those of a file, or none, with the preset that was asked for by name.
+
+    Raises InvalidOptionsError when the file names another preset, or holds what is no option.
+    """
+    values = read_object(path, "options") if path else {}
+    named = values.get("preset", preset)
+    if preset is not None and named != preset:
+        raise InvalidOptionsError(f"options.preset: {path} says {named!r}, --preset {preset}: leave one of them out")
+    options = values | {"preset": named} if named is not None else values
+    try:
+        RegistrationOptions.from_dict(options)
+    except InvalidOptionsError as error:
+        source = f"{path}: " if path else ""
+        hint = error.hint or "docs/api.md lists every option with its range."
+        raise InvalidOptionsError(f"{source}{error}", reason=error.reason, hint=hint) from error
+    return options
+
+
+def read_transform(path: Path, what: str) -> Rows:
+    """The 4x4 T_object_scene in a file: rows, a transform object, or a document with a T_object_scene of either kind,
+    or with its inverse, T_scene_object.
+
+    Raises InvalidInputError (INVALID_TRANSFORM) when there is none, or it is no similarity.
+    """
+    return as_transform(read_json(path, what), f"{what} {path}")
+
+
+def as_transform(value: Any, what: str) -> Rows:
+    """The same of a value. Raises InvalidInputError (INVALID_TRANSFORM), which begins with ``what``."""
+    try:
+        return transform_rows(value)
+    except ValueError as error:
+        raise InvalidInputError(f"{what}: {error}", reason="INVALID_TRANSFORM", hint=_TRANSFORM) from error
+
+
+def is_json(text: str) -> bool:
+    """Whether a text that stands where a file may be named is the JSON itself."""
+    return text.lstrip().lstrip("\ufeff")[:1] in ("{", "[")
+
+
+def read_json(path: Path, what: str) -> Any:
+    """The value in a JSON file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold, OSError."""
+    return json_value(path.read_bytes(), f"{what} {path}: ")
+
+
+# Fields named at the command line: the options that go with them, and what they stand for.
+
+
+def description(text: str) -> dict[str, Any]:
+    """A description: JSON written out, or the name of a file that holds it.
+
+    Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER, MALFORMED_JSON), FieldFormatError (INVALID_DESCRIPTION).
+    """
+    from regnf_core.importing.upload_description import UploadDescription
+
+    values = json_value(text, "description: ") if is_json(text) else read_object(file(text), "description")
+    try:
+        UploadDescription.from_dict(values)
+    except FieldFormatError as error:
+        hint = "docs/import-gate.md lists every entry of a description."
+        raise FieldFormatError(str(error), reason=error.reason, hint=error.hint or hint) from error
+    return values
+
+
+def choice_of(config: Path | None, no_config: bool) -> SettingsChoice:
+    """Which settings are meant by --config and --no-config."""
+    return config if config is not None else not no_config
+
+
+def source_of(
+    path: Path, said: Mapping[str, Any] | None, settings: SettingsChoice = None, role: Role | None = None
+) -> FieldSource:
+    """What a path stands for; the settings that were found are said. Raises what ``find_source`` does."""
+    source = find_source(path, said, settings, role)
+    if source.file != path:
+        err.print(f"checkpoint: {source.file}", markup=False, soft_wrap=True)
+    if source.settings:
+        err.print(f"settings: {', '.join(source.settings_names)}", markup=False, soft_wrap=True)
+    return source
+
+
+CONFIG: dict[str, Any] = {"parser": file, "metavar": "FILE"}
+DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
+"""How options of these kinds are declared. A description is a file, or the JSON itself."""
+
 
 # a field by itself
 

@@ -7,10 +7,12 @@ from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.console import err, phase_progress
-from regnf_cli.extras import require
-from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
+from regnf_cli.guard import require
 from regnf_cli.options import (
+    CONFIG,
+    DESCRIPTION,
+    FIELD,
+    JSON_FILE,
     AsJson,
     CancelOnInterrupt,
     DetectionFile,
@@ -25,12 +27,14 @@ from regnf_cli.options import (
     Server,
     Token,
     WorkerTimeout,
+    choice_of,
+    read_detection,
+    read_options,
+    read_transform,
+    source_of,
 )
-from regnf_cli.output import Files, tell_files
-from regnf_cli.paths import FIELD, JSON_FILE
-from regnf_cli.report import exit_code, show
-from regnf_cli.request_files import read_detection, read_options, read_transform
-from regnf_cli.scene_file import check_box_by_header, open_scene
+from regnf_cli.report import err, exit_code, phase_progress, show
+from regnf_cli.search import Files, check_box_by_header, open_scene, tell_files
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.field_source import FieldSource
@@ -131,9 +135,9 @@ def _register_here(
 ) -> dict[str, Any]:
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
+    from regnf_core.library import WarmStart
+    from regnf_core.library import register as run
     from regnf_core.loading import import_smallest_first, load_field
-    from regnf_core.registration import WarmStart
-    from regnf_core.registration import register as run
     from regnf_core.viewing import result_document
 
     options = RegistrationOptions.from_dict(request["options"])

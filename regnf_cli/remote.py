@@ -5,18 +5,71 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 
-from regnf_cli.patient_client import PatientClient
-from regnf_cli.remote_errors import checked, service_error
-from regnf_client.errors import ServiceError, checked_address
-from regnf_client.worker_watch import WorkerWatch, worker_lives
+from regnf_client import answers
+from regnf_client.answers import ServiceError, UnreachableError, checked_address
+from regnf_client.steps import Patience, WorkerWatch, worker_lives
 from regnf_core.field_source import FieldSource
 from regnf_core.importing.upload_description import UploadDescription
+
+# An HTTP client that obeys a service which says that it is asked too fast, or that a file is still to come.
+
+
+class PatientClient(httpx.Client):
+    """Asks again after the seconds of `Retry-After`, for two minutes at most; then the refusal is the answer.
+
+    Up to twice the seconds, so that many that were refused together do not ask together ever after. The body of a
+    request must be one that can be sent again.
+    """
+
+    def __init__(self, *, sleep: Callable[[float], None] = time.sleep, **options: Any) -> None:
+        super().__init__(**options)
+        self._sleep = sleep
+
+    def send(self, request: httpx.Request, **how: Any) -> httpx.Response:
+        """The answer that is no such refusal, or the last one."""
+        tries = Patience(retries=0).tries()
+        while True:
+            answer = super().send(request, **how)
+            if answer.is_error:
+                answer.read()
+            wait_s = tries.wait_s(answer)
+            if wait_s is None:
+                return answer
+            self._sleep(wait_s)
+
+
+# What a service answers when it refuses, in the words of the command line.
+
+_HINTS = {
+    "UNAUTHENTICATED": "Give the service's token with --token, or in the environment variable REGNF_API_TOKEN.",
+    "RATE_LIMITED": "Wait a moment, and give the same command again.",
+    "TOO_MANY_WRITES": "Wait a moment, and give the same command again.",
+    "QUEUE_FULL": "Give the same command again later.",
+}
+
+
+def checked(response: httpx.Response) -> dict[str, Any]:
+    """The JSON object of a good answer; raises ServiceError for a refusal, and for what is no regnf service."""
+    return answers.checked(response, _HINTS)
+
+
+def service_error(problem: dict[str, Any]) -> ServiceError:
+    """The error for a problem object."""
+    return answers.service_error(problem, _HINTS)
+
+
+def unreachable(address: str, error: httpx.RequestError) -> UnreachableError:
+    """The error for a service that does not answer."""
+    hint = "Is it running? `regnf serve` starts one and prints its address; without --server the work is done here."
+    return UnreachableError(f"{address} does not answer: {error}", hint=hint)
+
 
 _BLOCK = 1 << 20
 _FINISHED = ("successful", "failed", "dismissed")

@@ -11,13 +11,11 @@ from typing import Any
 import httpx
 from rich.progress import Progress
 
-from regnf_cli.console import err, phase_progress
-from regnf_cli.remote import RemoteService, Report
-from regnf_cli.remote_errors import unreachable
-from regnf_client.errors import ServiceError
-from regnf_core.field_candidates import Said
+from regnf_cli.remote import RemoteService, Report, unreachable
+from regnf_cli.report import err, phase_progress
+from regnf_client.answers import ServiceError
+from regnf_core.errors import Said, filled_folder
 from regnf_core.field_source import FieldSource
-from regnf_core.files import filled_folder
 
 _NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from regnf_cli.extras import require
-from regnf_cli.field_options import choice_of, source_of
-from regnf_cli.options import Config, Description, Field, NoConfig
-from regnf_cli.render_here import render_here
+from regnf_cli.guard import require
+from regnf_cli.options import Config, Description, Field, NoConfig, choice_of, source_of
 from regnf_cli.rendering_options import (
     Antialias,
     Around,
@@ -25,6 +23,7 @@ from regnf_cli.rendering_options import (
     Size,
     Up,
     poses_of,
+    render_here,
     request_of,
     size_of,
 )

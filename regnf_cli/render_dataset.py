@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from regnf_cli.console import err, out
-from regnf_cli.extras import require
+from regnf_cli.guard import require
+from regnf_cli.report import err, out
 from regnf_core.errors import InvalidOptionsError
 
 if TYPE_CHECKING:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.paths import JSON_FILE, OUTPUT, existing
-from regnf_cli.request_files import read_detection, read_object
-from regnf_core.errors import InvalidOptionsError
-from regnf_core.rendering.options import MOST_FRAMES
-from regnf_core.rendering.request import RenderRequest
+from regnf_cli.options import JSON_FILE, OUTPUT, existing, read_detection, read_object
+from regnf_cli.report import out, phase_progress
+from regnf_core.errors import InvalidOptionsError, filled_folder, require_writable
+from regnf_core.field_source import FieldSource, find_source
+from regnf_core.rendering.request import MOST_FRAMES, RenderRequest
 
 
 class Mode(StrEnum):
@@ -102,7 +103,7 @@ def request_of(
 
 def poses_of(path: Path, every: int, size: tuple[int, int] | None) -> list[dict[str, Any]]:
     """The cameras of a file as a request says them."""
-    from regnf_core.rendering.paths import cameras_of_file
+    from regnf_core.rendering.camera import cameras_of_file
 
     found = []
     for camera in cameras_of_file(path, size=size, every=every):
@@ -130,3 +131,33 @@ def _size(text: str) -> list[int]:
     if len(words) != 2 or not all(word.isdecimal() and len(word) < 8 and int(word) > 0 for word in words):
         raise InvalidOptionsError(f"--size {text[:40]}: expected WIDTHxHEIGHT in pixels, like 640x480")
     return [int(word) for word in words]
+
+
+# A rendering done in this process, with a bar: what ``regnf render`` and ``regnf edit`` share.
+
+
+def render_here(scene: FieldSource, request: RenderRequest, output: Path, jobs: int | None) -> None:
+    """Write the request's files into ``output``, each whole or not at all. An object's name is its file.
+
+    jobs: processes; None: one a core.
+    """
+    from regnf_core.fields.observation import SdfField
+    from regnf_core.loading import load_field
+    from regnf_core.rendering.job import run_render
+
+    require_writable(output)
+
+    def open_object(name: str) -> SdfField:
+        return load_field(find_source(Path(name))).field
+
+    with phase_progress() as bar, filled_folder(output) as folder:
+        task = bar.add_task("loading", total=1.0)
+        field = load_field(scene).field
+        bar.update(task, description="rendering")
+
+        def tell(share: float) -> None:
+            bar.update(task, completed=share)
+
+        report = run_render(field, request, open_object, folder, tell, processes=jobs or os.cpu_count() or 1)
+    for artifact in report.artifacts:
+        out.print(str(output / artifact.name), markup=False, soft_wrap=True)

@@ -3,13 +3,51 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
+from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from regnf_cli.console import EXIT_AMBIGUOUS, EXIT_NOT_REGISTERED, EXIT_REGISTERED, out
+from regnf_core.errors import hint_of
+
+# What the commands share for talking to people and to programs.
+
+EXIT_REGISTERED = 0
+EXIT_NOT_REGISTERED = 1
+EXIT_BAD_INPUT = 2
+EXIT_UNAVAILABLE = 3
+EXIT_AMBIGUOUS = 4
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+_PAGE = re.compile(r"\bdocs/([a-z0-9/-]+)\.md\b")
+
+
+def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None = None) -> int:
+    """Say on stderr what went wrong, and what to do next; returns the exit code."""
+    err.print(f"[bold red]{reason}[/] ", end="")
+    err.print(_with_commands(message), markup=False, soft_wrap=True)
+    if hint := hint or hint_of(reason):
+        err.print("[bold]hint:[/] ", end="")
+        err.print(_with_commands(hint), markup=False, soft_wrap=True)
+    return code
+
+
+def _with_commands(text: str) -> str:
+    """Pages of the manual by the command that prints them: an installed regnf has no folder docs."""
+    return _PAGE.sub(r"`regnf manual \1`", text)
+
+
+def phase_progress() -> Progress:
+    """A bar on stderr, so that stdout stays clean for results."""
+    return Progress(
+        TextColumn("{task.description:>14}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), console=err
+    )
+
 
 _EXIT_CODES = {"registered": EXIT_REGISTERED, "ambiguous": EXIT_AMBIGUOUS}
 _COLORS = {"registered": "green", "ambiguous": "yellow"}

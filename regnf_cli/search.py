@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from regnf_cli.console import phase_progress
-from regnf_cli.extras import require
-from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
-from regnf_cli.library_objects import objects_of
+from regnf_cli.guard import require
 from regnf_cli.options import (
+    CONFIG,
+    DESCRIPTION,
+    JSON_FILE,
     AsJson,
     CancelOnInterrupt,
     DetectionFile,
@@ -27,20 +30,138 @@ from regnf_cli.options import (
     Server,
     Token,
     WorkerTimeout,
+    choice_of,
+    library_path,
+    read_detection,
+    read_options,
+    source_of,
 )
-from regnf_cli.output import Files, tell_files, write_into
-from regnf_cli.paths import JSON_FILE, library_path
-from regnf_cli.report import exit_code, show
-from regnf_cli.request_files import read_detection, read_options
-from regnf_cli.scene_file import check_box_by_header, open_scene
-from regnf_core.detections import Detection
-from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.field_source import FieldSource
+from regnf_cli.report import err, exit_code, phase_progress, show
+from regnf_core.detections import Bounds, Detection, require_in_scene
+from regnf_core.errors import (
+    Candidate,
+    InvalidDetectionError,
+    InvalidInputError,
+    NoSurfaceError,
+    RegnfError,
+    Said,
+    filled_folder,
+    require_writable,
+)
+from regnf_core.field_files import library_files, stored_bounds
+from regnf_core.field_source import FieldSource, SettingsChoice
+from regnf_core.library_folder import LibraryFolder
 from regnf_core.options import RegistrationOptions, RobustOptions
 
 if TYPE_CHECKING:
-    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.observation import SdfField
+    from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import LibraryObject
+    from regnf_core.loading import LoadedField
+    from regnf_core.result import RegistrationResult
+
+
+# The objects of a search: entries of libraries by their names, and fields by their files.
+
+
+def objects_of(
+    named: list[Path] | None, tag: str | None, description: Mapping[str, Any] | None, settings: SettingsChoice
+) -> Iterator[FieldSource]:
+    """What each path stands for; without any, the user's own library.
+
+    Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE), and what ``find_source`` does.
+    """
+    paths = named or [LibraryFolder.usual().folder]
+    libraries = [LibraryFolder(path) for path in paths if not named or LibraryFolder.is_one(path)]
+    entries = [(library, one) for library in libraries for one in library.entries(tag)]
+    if libraries and not entries:
+        which = "" if tag is None else f" with the tag {tag!r}"
+        hint = "`regnf library add NAME FIELD` adds one; or name a folder of fields."
+        raise InvalidInputError(f"{libraries[0].folder}: no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
+    for library, one in entries:
+        yield FieldSource(Path(one.notes.name), library.file(one))
+    files = [path for path in paths if path not in [library.folder for library in libraries]]
+    for path in library_files(files) if files else ():
+        yield source_of(path, description, settings, "object")
+
+
+# The files that a registration leaves: those of its folder, and its recording.
+
+
+@dataclass(frozen=True)
+class Files:
+    """What a registration here is to write. output: a folder · recording: a file."""
+
+    output: Path | None = None
+    recording: Path | None = None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anything is."""
+        return self.output is not None or self.recording is not None
+
+    def check(self) -> None:
+        """Raises PermissionError before the work, which would be lost if nothing may be written there."""
+        for folder in (self.output, self.recording and self.recording.parent):
+            if folder is not None:
+                require_writable(folder)
+
+    def write(self, result: RegistrationResult, box: OrientedBox, **said: Any) -> None:
+        """Write what is wanted, each file whole or not at all; ``said`` goes on to ``write_artifacts``."""
+        from regnf_core.viewing.recording import write_recording
+
+        write_into(self.output, result, **said)
+        if self.recording is not None:
+            write_recording(result, self.recording, box, said["object_name"])
+
+
+def tell_files(output: Path | None, recording: Path | None = None) -> None:
+    """Say where the files are, on stderr: the document on stdout may be JSON."""
+    if output is not None:
+        err.print(f"wrote {output}: result.json, preview.png, point clouds", markup=False, soft_wrap=True)
+    if recording is not None:
+        err.print(f"wrote {recording}", markup=False, soft_wrap=True)
+
+
+def write_into(output: Path | None, result: RegistrationResult, **said: Any) -> None:
+    """Write every artifact, each whole or not at all; ``said`` goes on to ``write_artifacts``."""
+    from regnf_core.viewing import write_artifacts
+
+    if output is None:
+        return
+    with filled_folder(output) as folder:
+        write_artifacts(result, folder, **said)
+
+
+# The scene's file: opened only once the box is known to lie in it, as far as the file's header tells.
+
+
+def check_box_by_header(scene: Path, box: Detection, obj: Path | None = None) -> None:
+    """Refuse a box outside the scene before anything is opened; a checkpoint has no header that tells its bounds.
+
+    Raises InvalidDetectionError naming the scene's file.
+    """
+    bounds = stored_bounds(scene)
+    if bounds is not None:
+        _require_in(scene, box, bounds, None if obj is None else stored_bounds(obj))
+
+
+def open_scene(source: FieldSource, box: Detection) -> LoadedField:
+    """The scene's field, refused as above by the bounds that only its import told."""
+    from regnf_core.loading import load_field
+
+    loaded = load_field(source)
+    lower, upper = loaded.field.bounds.tolist()
+    _require_in(source.named, box, (lower, upper), None)
+    return loaded
+
+
+def _require_in(path: Path, box: Detection, scene: Bounds, obj: Bounds | None) -> None:
+    try:
+        require_in_scene(box, scene, obj)
+    except InvalidDetectionError as error:
+        raise InvalidDetectionError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
+
 
 Library = Annotated[
     list[Path] | None,
@@ -180,3 +301,27 @@ def _search_here(
     write_into(output, found.result, **said)
     document: dict[str, Any] = result_document(found.result, **said)
     return document
+
+
+# What a file may be, where nothing in it tells: each with what to add to the command, and pictures on demand.
+
+
+def show_candidates(error: RegnfError) -> None:
+    """Say on stderr what to add to the command for each function that a refused file may be, if that is why."""
+    asked: Sequence[Candidate] = getattr(error, "candidates", ())
+    said: Said = getattr(error, "said", None) or Said(None, {})
+    option = "--description" if said.use is None else f"--{said.use}-description"
+    for number, one in enumerate(asked, 1):
+        whole = one.added_to(said.description)
+        err.print(f"{number}  {one.name}", markup=False, soft_wrap=True)
+        err.print(f"   {option} {shlex.quote(json.dumps(whole))}", markup=False, soft_wrap=True)
+
+
+def keep_pictures(asked: Sequence[Candidate], folder: Path) -> None:
+    """Write the candidates' pictures, 1.png and so on as they are numbered; the folder is made if need be."""
+    pictures = {f"{number}.png": one.picture for number, one in enumerate(asked, 1) if one.picture is not None}
+    with filled_folder(folder) as work:
+        for name, picture in pictures.items():
+            (work / name).write_bytes(picture)
+    for name in pictures:
+        err.print(f"wrote {folder / name}", markup=False, soft_wrap=True)

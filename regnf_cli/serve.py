@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from regnf_cli.demo_data import demo_folder
-from regnf_cli.extras import require
+from regnf_cli.demo import demo_folder
+from regnf_cli.guard import require
 
 
 def serve(
@@ -26,7 +26,7 @@ def serve(
     Example: **regnf serve --port 8080**
     """
     require("service")
-    from regnf_cli.settings import read_settings
+    from regnf_cli.doctor import read_settings
     from regnf_cli.supervisor import Supervisor
     from regnf_state.logs import configure_logging
 

@@ -2,26 +2,249 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import http.client
+import json
 import logging
 import os
+import shutil
 import signal
 import socket
+import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from types import FrameType
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import FrameType, TracebackType
 from urllib.parse import urlsplit
 
-from regnf_cli.child import Child
-from regnf_cli.embedded_redis import answers, server_command
-from regnf_cli.listening import address_of, open_socket
-from regnf_cli.start_errors import StartError
-from regnf_cli.state_lock import StateLock
-from regnf_cli.storage_check import check_storage
+from redis.exceptions import RedisError
+
+from regnf_cli.embedded_redis import StartError, address_of, answers, open_socket, server_command
+from regnf_state.journal.journal import StorageMismatchError, claim_storage
 from regnf_state.settings import SECRETS, Settings
+from regnf_state.stores import open_stores
+
+# One process that the supervisor keeps running.
+
+_STDERR = 2
+"""Where children write: standard output is for the one line that tells the address."""
+_FIRST_PAUSE_S = 0.5
+_LONGEST_PAUSE_S = 10.0
+_STEADY_AFTER_S = 30.0
+
+
+class Child:
+    """A command, which ends with this process and is restarted after growing pauses whenever it ends.
+
+    Start it from the main thread: the kernel ties its life to the thread that started it. ``lifeline`` is the reading
+    end of a pipe that nobody writes to; ``passed`` are descriptors that the command inherits.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        lifeline: int,
+        passed: Sequence[int] = (),
+    ) -> None:
+        self.name = name
+        self._command = [sys.executable, "-m", "regnf_cli.guard", str(os.getpid()), str(lifeline), *command]
+        self._environment = dict(environment)
+        self._passed = (lifeline, *passed)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._started = 0.0
+        self._pause_s = _FIRST_PAUSE_S
+        self._start_at = 0.0
+
+    def start(self) -> None:
+        """Start the command in a session of its own: a terminal's Ctrl+C is for the supervisor alone."""
+        self._started = time.monotonic()
+        self._process = subprocess.Popen(
+            self._command,
+            env=self._environment,
+            pass_fds=self._passed,
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=_STDERR,
+        )
+        logger.info("%s started, process %d", self.name, self._process.pid)
+
+    @property
+    def exit_status(self) -> int | None:
+        """None while it runs, and before it has been started."""
+        return self._process.poll() if self._process is not None else None
+
+    def keep_running(self) -> None:
+        """Restart it when it has ended and its pause is over."""
+        if self._process is None or self._process.poll() is None:
+            return
+        now = time.monotonic()
+        if not self._start_at:
+            if now - self._started > _STEADY_AFTER_S:
+                self._pause_s = _FIRST_PAUSE_S
+            logger.error("%s ended (%s); restarted in %.1f s", self.name, self._process.returncode, self._pause_s)
+            self._start_at = now + self._pause_s
+            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        elif now >= self._start_at:
+            self._start_at = 0.0
+            self.start()
+
+    def ask_to_stop(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+
+    def wait(self, seconds: float) -> None:
+        """Wait for its end, at most this long; then it is killed."""
+        if self._process is None:
+            return
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            logger.warning("%s does not stop: killed", self.name)
+            self._process.kill()
+            self._process.wait()
+
+
+# One service for each state folder.
+
+_NAME = "serve.lock"
+_SOCKET_PREFIX = "regnf-"
+_LEAST_FREE_BYTES = 1 << 20
+"""What Redis and the storage write when they start takes some kilobytes."""
+
+
+class StateLock:
+    """Holds a state folder for one service, and records what the next one must remove if this one is killed.
+
+    Raises StartError (STATE_DIR_IN_USE, STATE_DIR_UNUSABLE) on entry.
+    """
+
+    def __init__(self, state_dir: Path) -> None:
+        self._state_dir = state_dir
+        self._noted: dict[str, object] = {}
+        self.socket_dir: Path | None = None
+
+    def __enter__(self) -> StateLock:
+        made = [folder for folder in (self._state_dir, *self._state_dir.parents) if not folder.exists()]
+        try:
+            self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._lock()
+            _require_writable(self._state_dir)
+            self._remove_leftover()
+            self.note(pid=os.getpid())
+        except OSError as error:
+            with suppress(AttributeError, OSError):  # it may not have come to be
+                self._file.close()
+            _take_back(made)
+            detail = f"cannot keep state in {self._state_dir}: {error.strerror}"
+            if error.filename is not None and Path(error.filename).is_relative_to(self._state_dir):
+                detail = f"cannot keep state in {error.filename}: {error.strerror}"
+            hint = "Give a folder that can be written with --state-dir."
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                hint = "Make room on the disk, or give a folder on another one with --state-dir."
+            raise StartError(detail, reason="STATE_DIR_UNUSABLE", hint=hint) from error
+        return self
+
+    def _lock(self) -> None:
+        """Raises OSError, StartError (STATE_DIR_IN_USE)."""
+        self._file = (self._state_dir / _NAME).open("a+")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            held = self._read()
+            self._file.close()
+            who = f" (process {held['pid']}, {held.get('address', 'not listening yet')})" if "pid" in held else ""
+            detail = f"another `regnf serve`{who} uses {self._state_dir}"
+            hint = "Use that one, or stop it, or give this one its own folder with --state-dir."
+            raise StartError(detail, reason="STATE_DIR_IN_USE", hint=hint) from error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.socket_dir is not None:
+            shutil.rmtree(self.socket_dir, ignore_errors=True)
+        with suppress(OSError):  # on a full disk the note stays: the lock itself is what counts
+            self._write({})
+        with suppress(OSError):
+            self._file.close()
+
+    def make_socket_dir(self) -> Path:
+        """A private folder with a short path: socket paths hold about a hundred bytes, state folders may lie deep."""
+        usual = tempfile.gettempdir()
+        folder = Path(tempfile.mkdtemp(prefix=_SOCKET_PREFIX, dir=usual if len(usual) < 60 else "/tmp"))  # noqa: S108
+        self.socket_dir = folder
+        self.note(socket_dir=str(folder))
+        return folder
+
+    def note(self, **more: object) -> None:
+        """Record more of this service: process, address, the folder of its socket."""
+        self._noted |= more
+        self._write(self._noted)
+
+    def _write(self, content: Mapping[str, object]) -> None:
+        self._file.seek(0)
+        self._file.truncate()
+        json.dump(content, self._file)
+        self._file.flush()
+
+    def _read(self) -> dict[str, object]:
+        self._file.seek(0)
+        try:
+            content = json.loads(self._file.read() or "{}")
+        except ValueError:
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    def _remove_leftover(self) -> None:
+        left = Path(str(self._read().get("socket_dir", "")))
+        if left.name.startswith(_SOCKET_PREFIX) and left.is_dir() and left.stat().st_uid == os.getuid():
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _require_writable(state_dir: Path) -> None:
+    """Raises OSError for a folder of the service's, one within it, or a disk, that takes no more files."""
+    inside = [folder for pattern in ("*/", "*/*/") for folder in state_dir.glob(pattern)]
+    for folder in (state_dir, *inside):
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                if folder == state_dir:
+                    os.posix_fallocate(file.fileno(), 0, _LEAST_FREE_BYTES)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(folder)) from error
+
+
+def _take_back(made: list[Path]) -> None:
+    """Remove the folders that a start has made, the innermost first, and nothing else."""
+    with suppress(OSError):
+        if made:
+            (made[0] / _NAME).unlink(missing_ok=True)
+        for folder in made:
+            folder.rmdir()
+
+
+# Before `regnf serve` starts its processes: is its storage the one whose records Redis holds?
+
+_WAIT_S = 10.0
+
+
+def check_storage(settings: Settings) -> None:
+    """Raises StartError (STORAGE_MISMATCH). While Redis or the storage is away nobody can tell; the API looks again."""
+    stores = open_stores(settings, retries=None, storage_wait_s=_WAIT_S)
+    try:
+        claim_storage(stores.redis, stores.records.journal.storage_id(), settings.adopt_storage or None)
+    except StorageMismatchError as error:
+        raise StartError(str(error), reason=error.reason) from error
+    except (RedisError, OSError) as error:
+        logger.warning("whose records Redis holds is looked up later: %s", type(error).__name__)
+    finally:
+        stores.redis.close()
+
 
 _LOOK_EVERY_S = 0.2
 _START_DEADLINE_S = 60.0

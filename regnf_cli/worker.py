@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from regnf_cli.extras import require
+from regnf_cli.guard import require
 
 
 def worker(
@@ -27,12 +27,11 @@ def worker(
     from redis.exceptions import ConnectionError as RedisConnectionError
     from redis.exceptions import TimeoutError as RedisTimeoutError
 
-    from regnf_cli.settings import check_redis_url, read_settings
-    from regnf_cli.start_errors import StartError
-    from regnf_state.journal.storage_claim import StorageMismatchError
-    from regnf_state.redis.address import NoRedisError
-    from regnf_worker.main import run_worker
-    from regnf_worker.preload import PreloadError
+    from regnf_cli.doctor import check_redis_url, read_settings
+    from regnf_cli.embedded_redis import StartError
+    from regnf_state.journal.journal import StorageMismatchError
+    from regnf_state.redis.client import NoRedisError
+    from regnf_worker.main import PreloadError, run_worker
 
     if redis_url is not None:
         check_redis_url(redis_url, "--redis-url")

@@ -5,30 +5,123 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 
-import regnf_client.artifacts as artifacts
 import regnf_client.fields as fields
+import regnf_client.jobs as artifacts
 import regnf_client.jobs as jobs
+import regnf_client.library as library
 import regnf_client.registrations as registrations
-from regnf_client.answers import refusal
-from regnf_client.async_driver import AsyncDriver
-from regnf_client.async_library import AsyncLibrary
+from regnf_client.answers import refusal, unreachable
 from regnf_client.batches import BatchReader, PairLike, PairResult
-from regnf_client.connection import ADDRESS, WORKER_TIMEOUT_S, Connection
-from regnf_client.errors import unreachable
-from regnf_client.events import EventReader
-from regnf_client.fields import FieldLike, Report, Sendable
-from regnf_client.jobs import JobLike, id_of
-from regnf_client.lists import delete_field, list_fields, list_jobs
-from regnf_client.models import BatchOutcome, Event, Field, Job, Rendering, Result
-from regnf_client.patience import Patience
+from regnf_client.fields import ADDRESS, WORKER_TIMEOUT_S, Connection, FieldLike, Report, Sendable
+from regnf_client.jobs import JobLike, delete_field, id_of, list_fields, list_jobs
+from regnf_client.models import BatchOutcome, Entry, Event, EventReader, Field, Job, Rendering, Result
 from regnf_client.registrations import Batch, Request
-from regnf_core.detections.objects import BoxLike
+from regnf_client.steps import Call, Download, Flow, Patience, Pause, Step
+from regnf_core.detections.parsing import BoxLike
 from regnf_core.field_source import Role, SettingsChoice
+from regnf_core.library_entries import EntryNotes
 from regnf_core.options import OptionsLike
+
+# Performs the steps of a flow without blocking the event loop.
+
+_T = TypeVar("_T")
+
+
+class AsyncDriver:
+    """Over one HTTP client."""
+
+    def __init__(self, http: httpx.AsyncClient) -> None:
+        self._http = http
+
+    async def run(self, flow: Flow[_T]) -> _T:
+        """What the flow returns."""
+        answer: Any = None
+        try:
+            while True:
+                step = flow.send(answer)
+                answer = await self._perform(step)
+        except StopIteration as done:
+            value: _T = done.value
+            return value
+        finally:
+            flow.close()
+
+    async def _perform(self, step: Step) -> Any:
+        if isinstance(step, Pause):
+            return await asyncio.sleep(step.seconds)
+        try:
+            if isinstance(step, Call):
+                return await self._http.request(step.method, step.path, **step.how)
+            if isinstance(step, Download):
+                return await self._download(step)
+        except httpx.RequestError as error:
+            return error
+        return await asyncio.to_thread(step.do)
+
+    async def _download(self, step: Download) -> httpx.Response:
+        """Go on behind what the file holds already."""
+        held = step.target.stat().st_size if step.target.exists() else 0
+        headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={held}-"} if held else {})
+        async with self._http.stream("GET", step.path, headers=headers) as answer:
+            if answer.is_success:
+                with step.target.open("ab" if answer.status_code == httpx.codes.PARTIAL_CONTENT else "wb") as file:
+                    async for block in answer.aiter_bytes():
+                        await asyncio.to_thread(file.write, block)
+            else:
+                await answer.aread()
+            return answer
+
+
+# The library of the awaited client: ``client.library``.
+
+
+class AsyncLibrary:
+    """Objects by name. An ``Entry`` may be given wherever a field may."""
+
+    def __init__(self, connection: Connection, driver: AsyncDriver) -> None:
+        self._connection = connection
+        self._driver = driver
+
+    async def add(
+        self,
+        name: str,
+        field: FieldLike,
+        tags: Sequence[str] = (),
+        unit: str | None = None,
+        note: str | None = None,
+        symmetry: dict[str, Any] | None = None,
+        progress: Report | None = None,
+    ) -> Entry:
+        """Make a field an entry; a file is uploaded. symmetry: order, axis, continuous; None: the detected one.
+
+        Raises ServiceError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY), InvalidInputError (LIBRARY_ENTRY_INVALID).
+        """
+        notes = EntryNotes.checked(name, tags, unit, note, symmetry)
+        return await self._driver.run(library.add(self._connection.asking(progress), field, notes))
+
+    async def entries(self, tag: str | None = None, name: str | None = None) -> list[Entry]:
+        """Those with the tag, and with ``name`` in their names; the one added last first."""
+        return await self._driver.run(library.entries(self._connection.asking(), tag, name))
+
+    async def get(self, name: str) -> Entry:
+        """Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        return await self._driver.run(library.get(self._connection.asking(), name))
+
+    async def change(self, name: str, /, **changes: Any) -> Entry:
+        """Change name, tags, unit, note or symmetry; None takes one back. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
+        return await self._driver.run(library.change(self._connection.asking(), name, changes))
+
+    async def remove(self, name: str) -> None:
+        """Take an entry out; its field stays. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        await self._driver.run(library.remove(self._connection.asking(), name))
+
+    async def download(self, name: str, target: str | Path) -> Path:
+        """Write an entry's field, in the safe format."""
+        return await self._driver.run(library.download(self._connection.asking(), name, Path(target)))
 
 
 class AsyncClient:
@@ -38,7 +131,7 @@ class AsyncClient:
     file is sent only if the service lacks it; a large one goes on where an earlier try stopped. What is asked too fast,
     and what a broken connection stopped, is asked again. ``progress`` is called with a phase and the share of it done.
 
-    Errors: see :mod:`regnf_client.errors`. Each has ``reason`` and ``hint``; ServiceError has ``status`` too.
+    Errors: see :mod:`regnf_client.answers`. Each has ``reason`` and ``hint``; ServiceError has ``status`` too.
     """
 
     def __init__(

@@ -16,13 +16,21 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from regnf_client.answers import checked, parsed, refusal, service_error
-from regnf_client.errors import ServiceError, WaitTimeoutError
+import httpx
+
+from regnf_client.answers import (
+    ServiceError,
+    WaitTimeoutError,
+    checked,
+    checked_address,
+    checked_token,
+    parsed,
+    refusal,
+    service_error,
+)
 from regnf_client.models import Entry, Field
-from regnf_client.patience import Patience
-from regnf_client.steps import Flow, call, work
-from regnf_client.worker_watch import WorkerWatch, look
-from regnf_core.field_candidates import Said
+from regnf_client.steps import Flow, Patience, WorkerWatch, call, look, work
+from regnf_core.errors import Said
 from regnf_core.field_source import FieldSource, Role, SettingsChoice, assumed_role, find_source
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.in_memory import HasGeometry, HasPoints, HasVertices
@@ -286,3 +294,33 @@ def _require_same(held: Field, source: FieldSource) -> None:
         message = "the service holds the same bytes with another description or other settings"
         hint = f"Delete the field there first (DELETE /fields/{held.sha256}), or leave them out."
         raise ServiceError(message, reason="FIELD_DESCRIPTION_DIFFERS", hint=hint)
+
+
+# What both clients are made of: address, token, patience.
+
+ADDRESS = "http://127.0.0.1:8080"
+WORKER_TIMEOUT_S = 60.0
+_AROUND = "\ufeff \t\r\n"
+"""What a shell keeps of a file that Windows wrote."""
+_TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+
+
+@dataclass(frozen=True)
+class Connection:
+    """Address, token and manners of a client."""
+
+    address: str
+    token: str | None
+    retries: int
+    worker_timeout_s: float | None
+
+    def http_options(self) -> dict[str, Any]:
+        """Of httpx's clients. Raises InvalidInputError (INVALID_ADDRESS, INVALID_TOKEN)."""
+        checked_address(self.address)
+        token = self.token if self.token is not None else os.environ.get("REGNF_API_TOKEN")
+        headers = {"Authorization": f"Bearer {checked_token(token.strip(_AROUND))}"} if token else {}
+        return {"base_url": self.address.rstrip("/"), "headers": headers, "timeout": _TIMEOUT}
+
+    def asking(self, report: Report | None = None, timeout_s: float | None = None) -> Asking:
+        """For one call of a method."""
+        return Asking(Patience(retries=self.retries), WorkerWatch(self.worker_timeout_s), report, timeout_s)

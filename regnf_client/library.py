@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from regnf_client.answers import checked, parsed, refusal
 from regnf_client.fields import Asking, FieldLike, upload
-from regnf_client.lists import pages
+from regnf_client.jobs import pages
 from regnf_client.models import Entry
 from regnf_client.steps import Download, Flow, again, call
 from regnf_core.library_entries import EntryNotes, checked_name

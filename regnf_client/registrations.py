@@ -11,7 +11,7 @@ from regnf_client.fields import Asking, FieldLike, known_sha256, smallest_first,
 from regnf_client.jobs import id_of, rendering, result, submit, wait
 from regnf_client.models import BatchOutcome, Entry, Job, Rendering, Result
 from regnf_client.steps import Flow
-from regnf_core.detections.objects import BoxLike, detection_of
+from regnf_core.detections.parsing import BoxLike, detection_of
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of

@@ -17,48 +17,45 @@ from typing import TYPE_CHECKING
 from regnf_core.version import __version__
 
 if TYPE_CHECKING:
-    from regnf_core.api.picturing import compose, render
-    from regnf_core.api.registered import Registered
-    from regnf_core.api.registering import BatchOutcome, register, register_batch
-    from regnf_core.api.searching import Search, search
+    from regnf_core.api import BatchOutcome, Registered, Search, compose, register, register_batch, render, search
     from regnf_core.editing.edits import Insertion, Removal, Replacement, Substitution
     from regnf_core.errors import RegnfError
-    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.observation import SdfField
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.in_memory import FieldWarning, from_function, from_grid, from_mesh, from_points
     from regnf_core.loading import open_field
     from regnf_core.options import RegistrationOptions
     from regnf_core.rendering.camera import Camera
-    from regnf_core.rendering.options import RenderOptions
+    from regnf_core.rendering.request import RenderOptions
     from regnf_core.result import RegistrationResult
     from regnf_core.robust.pipeline import WarmStart
 
 _HOMES = {
-    "BatchOutcome": "regnf_core.api.registering",
+    "BatchOutcome": "regnf_core.api",
     "Camera": "regnf_core.rendering.camera",
     "FieldWarning": "regnf_core.in_memory",
     "Insertion": "regnf_core.editing.edits",
     "OrientedBox": "regnf_core.geometry.box",
-    "Registered": "regnf_core.api.registered",
+    "Registered": "regnf_core.api",
     "RegistrationOptions": "regnf_core.options",
     "RegistrationResult": "regnf_core.result",
     "RegnfError": "regnf_core.errors",
     "Removal": "regnf_core.editing.edits",
-    "RenderOptions": "regnf_core.rendering.options",
+    "RenderOptions": "regnf_core.rendering.request",
     "Replacement": "regnf_core.editing.edits",
-    "SdfField": "regnf_core.fields.base",
-    "Search": "regnf_core.api.searching",
+    "SdfField": "regnf_core.fields.observation",
+    "Search": "regnf_core.api",
     "Sim3": "regnf_core.geometry.sim3",
     "Substitution": "regnf_core.editing.edits",
     "WarmStart": "regnf_core.robust.pipeline",
-    "compose": "regnf_core.api.picturing",
+    "compose": "regnf_core.api",
     **dict.fromkeys(("from_function", "from_grid", "from_mesh", "from_points"), "regnf_core.in_memory"),
     "open_field": "regnf_core.loading",
-    "register": "regnf_core.api.registering",
-    "register_batch": "regnf_core.api.registering",
-    "render": "regnf_core.api.picturing",
-    "search": "regnf_core.api.searching",
+    "register": "regnf_core.api",
+    "register_batch": "regnf_core.api",
+    "render": "regnf_core.api",
+    "search": "regnf_core.api",
 }
 
 __all__ = [

@@ -10,23 +10,18 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from regnf_core.errors import CancelledError, RegnfError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.pairs import pairs_of
-from regnf_core.result import Phase, ProgressCallback, RegistrationResult
-from regnf_core.robust.devices import working_device
-from regnf_core.robust.fused.parts import Sizes
-from regnf_core.robust.fused.registering import SampledPair, register_together
-from regnf_core.robust.model.object_model import ObjectModel, model_object
+from regnf_core.result import Phase, ProgressCallback, RegistrationResult, Run
+from regnf_core.robust.model import ObjectModel, model_object
 from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
-from regnf_core.robust.scene.scene_view import SceneView, view_scene
-from regnf_core.run import STARTS, Run
+from regnf_core.robust.scene import SceneView, view_scene
+from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
 
 _T = TypeVar("_T")
-_MEMORY_ELSEWHERE = 256 * 2**20
-"""Bytes for the work on many pairs on a GPU."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +55,8 @@ def register_batch(
     """Register pairs of detection and object (by number; None: each with each) by the preset `robust`.
 
     Each result is that of :func:`regnf_core.register` for this pair and seed; a pair that fails does not stop the
-    others. On a GPU, and where the option ``robust.batch_memory`` is given, many pairs are worked on at once. A result
-    is then the same up to rounding, and does not depend on which pairs go together. Without ``clouds`` the point clouds
-    for viewers are left out, which take about half of the time. ``progress`` gets the phases of one pair, or of one
-    group of pairs, after the other, and the share done of all pairs.
+    others. Without ``clouds`` the point clouds for viewers are left out, which take about half of the time.
+    ``progress`` gets the phases of one pair after the other, and the share done of all pairs.
     Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the
     lists, and CancelledError from ``progress``.
     """
@@ -71,19 +64,9 @@ def register_batch(
     options.require_robust("registers a batch")
     wanted = pairs_of(pairs, len(detections), len(objects))
     batch = _Batch(scene, detections, objects, options, seed)
-    memory = options.robust.batch_memory
-    if memory is None and working_device(scene).type != "cpu":
-        memory = _MEMORY_ELSEWHERE
-    size = 1 if memory is None else Sizes(memory).pairs
-    outcomes: list[BatchOutcome] = []
-    while len(outcomes) < len(wanted):
-        begin, group = len(outcomes), wanted[len(outcomes) : len(outcomes) + size]
-        share = _share_of(progress, begin, len(group), len(wanted))
-        if memory is None:
-            outcomes.append(batch.one(*group[0], Run(share), clouds))
-        else:
-            outcomes += batch.several(group, Run(share), clouds, Sizes(memory))
-    return outcomes
+    return [
+        batch.one(d, o, Run(_share_of(progress, number, len(wanted))), clouds) for number, (d, o) in enumerate(wanted)
+    ]
 
 
 class _Batch:
@@ -107,43 +90,6 @@ class _Batch:
     def one(self, d: int, o: int, run: Run, clouds: bool) -> BatchOutcome:
         """Of one pair."""
         return _outcome(d, o, lambda: self._register(d, o, run, clouds))
-
-    def several(self, pairs: Sequence[tuple[int, int]], run: Run, clouds: bool, sizes: Sizes) -> list[BatchOutcome]:
-        """Of several pairs, registered together; of those that cannot be sampled, their errors."""
-        sampled: dict[int, SampledPair] = {}
-        failed: dict[int, RegnfError] = {}
-        with run.phase("sampling"):
-            for number, (d, o) in enumerate(pairs):
-                try:
-                    sampled[number] = SampledPair(self._view(d), self.objects[o], self._model(o))
-                except RegnfError as error:
-                    failed[number] = error
-                run.report("sampling", STARTS["initializing"] * (number + 1) / len(pairs))
-        try:
-            found = register_together(self.scene, list(sampled.values()), self.options, self.seed, run, sizes)
-        except CancelledError:
-            raise
-        except RegnfError:  # a field's own; whose it is shows when each pair is alone
-            return [self.one(d, o, run, clouds) for d, o in pairs]
-        ends = failed | dict(zip(sampled, found, strict=True))
-        outcomes = [self._ended(pair, ends[number], run, clouds) for number, pair in enumerate(pairs)]
-        run.report("exporting", 1.0)
-        for one in outcomes:
-            if one.result is not None:
-                one.result.metrics.update({name: value / len(found) for name, value in run.seconds.items()})
-        return outcomes
-
-    def _ended(
-        self, pair: tuple[int, int], found: RegistrationResult | RegnfError, run: Run, clouds: bool
-    ) -> BatchOutcome:
-        """The outcome, with the result's clouds."""
-        d, o = pair
-        if isinstance(found, RegnfError):
-            return BatchOutcome(d, o, None, found)
-        if not clouds:
-            return BatchOutcome(d, o, found)
-        with run.phase("exporting"):
-            return _outcome(d, o, lambda: self._with_clouds(d, o, found))
 
     def _register(self, d: int, o: int, run: Run, clouds: bool) -> RegistrationResult:
         with run.phase("sampling"):
@@ -203,12 +149,12 @@ def _outcome(d: int, o: int, make: Callable[[], RegistrationResult]) -> BatchOut
         return BatchOutcome(d, o, None, error)
 
 
-def _share_of(progress: ProgressCallback | None, begin: int, size: int, count: int) -> ProgressCallback | None:
-    """The progress of ``size`` pairs, from number ``begin`` on, as that of all ``count`` pairs."""
+def _share_of(progress: ProgressCallback | None, number: int, count: int) -> ProgressCallback | None:
+    """The progress of one pair as that of all ``count`` pairs."""
     if progress is None:
         return None
 
     def shared(phase: Phase, done: float) -> None:
-        progress(phase, (begin + size * done) / count)
+        progress(phase, (number + done) / count)
 
     return shared

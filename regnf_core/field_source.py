@@ -11,14 +11,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.field_candidates import Said
+from regnf_core.errors import FieldFormatError, Said
 from regnf_core.field_files import require_field_file, require_file
-from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
+from regnf_core.importing.containers.sniff import HEAD_BYTES, MESH_FORMATS, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.run.folder import Run, find_run, pack_settings, settings_beside
-from regnf_core.importing.run.settings_names import DATA_FILES
-from regnf_core.labels import MOST_OF_LABEL, UNSHOWN
+from regnf_core.importing.run.opened import DATA_FILES
+from regnf_core.library_entries import MOST_OF_LABEL, UNSHOWN
 
 Role = Literal["scene", "object"]
 SettingsChoice = str | Path | bool | None

@@ -17,10 +17,10 @@ from regnf_core.errors import FieldFormatError, InvalidInputError
 
 if TYPE_CHECKING:
     from regnf_core.field_source import Role
-    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.observation import SdfField
     from regnf_core.fields.user_fields import PointFunction
     from regnf_core.importing.families.converted import ConvertedField
-    from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array
+    from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array
 
 HINT = (
     'Give a path such as "chair.glb", a mesh or a cloud of trimesh or Open3D, what open_field returns, an object with'
@@ -81,8 +81,8 @@ def from_points(points: Any, normals: Any, description: Said = None) -> SdfField
     Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, POINT_CLOUD_TOO_SMALL,
     POINT_CLOUD_NORMALS_DISAGREE, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
     """
-    from regnf_core.importing.families.point_cloud import convert_cloud
-    from regnf_core.importing.meshes.geometry import Geometry, require_room
+    from regnf_core.importing.families.mesh import convert_cloud
+    from regnf_core.importing.meshes.triangle_files import Geometry, require_room
 
     places = _rows("points", points, "MESH_INVALID")
     if normals is None:
@@ -103,8 +103,8 @@ def from_grid(values: Any, origin: Any, spacing: Any, description: Said = None) 
     Raises FieldFormatError: TENSOR_SHAPE, TENSOR_DTYPE, TENSOR_NOT_FINITE, BOUNDS_INVALID, NO_ZERO_LEVEL,
     FIELD_IMPLAUSIBLE, INVALID_DESCRIPTION.
     """
-    from regnf_core.importing.arrays import finite_float32
     from regnf_core.importing.families.dense_grid import grid_field
+    from regnf_core.importing.upload_description import finite_float32
 
     array = _array("values", values, "TENSOR_DTYPE")
     if array.ndim != 3 or min(array.shape) < 2:
@@ -148,7 +148,7 @@ def field_of(thing: Any, role: Role | None = None, description: Said = None) -> 
 
     Raises InvalidInputError (NO_FIELD) for what is none, and what the functions above raise.
     """
-    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.observation import SdfField
 
     said = dict(description or {})
     if role is not None and "as" not in said:
@@ -166,7 +166,7 @@ def geometry_of(thing: Any, role: Role | None = None) -> Geometry:
 
     Raises InvalidInputError (NO_FIELD) for what has none, FieldFormatError (MESH_INVALID).
     """
-    from regnf_core.importing.meshes.geometry import Geometry
+    from regnf_core.importing.meshes.triangle_files import Geometry
 
     if isinstance(thing, type):
         raise _no_field(f"the class {thing.__name__}", role)
@@ -196,7 +196,7 @@ def _users(field: SdfField) -> SdfField:
 
 def _mesh(places: Float64Array, corners: Int64Array, painted: Float64Array | None, description: Said) -> SdfField:
     from regnf_core.importing.families.triangles import mesh_field
-    from regnf_core.importing.meshes.geometry import Geometry, require_room
+    from regnf_core.importing.meshes.triangle_files import Geometry, require_room
 
     require_room(len(places), len(corners))
     geometry = Geometry(places, corners, colors=painted)
@@ -205,7 +205,7 @@ def _mesh(places: Float64Array, corners: Int64Array, painted: Float64Array | Non
 
 def _scene(scene: Any, role: Role | None) -> Geometry:
     """All triangle meshes of a trimesh scene at their poses."""
-    from regnf_core.importing.meshes.geometry import Geometry
+    from regnf_core.importing.meshes.triangle_files import Geometry
 
     meshes = [one for one in scene.dump() if hasattr(one, "faces") and hasattr(one, "vertices")]
     if not meshes:
@@ -219,8 +219,8 @@ def _scene(scene: Any, role: Role | None) -> Geometry:
 def _field(converted: ConvertedField, description: Said) -> SdfField:
     """The field of what a converter made, checked as an import's is; warnings are issued as FieldWarnings."""
     from regnf_core.importing.families.converted import Reading
-    from regnf_core.importing.gate.placement import placed
     from regnf_core.importing.gate.reading_field import field_of as built
+    from regnf_core.importing.gate.report import placed
 
     done = placed(converted, _said(description))
     field = built(Reading("", done.description, done.tensors))
@@ -283,7 +283,7 @@ def _rows(name: str, values: Any, reason: str) -> Float64Array:
 
 def _faces(faces: Any, vertices: int) -> Int64Array:
     """(F, 3) indices of ``vertices``; polygons as fans. Raises FieldFormatError (MESH_INVALID)."""
-    from regnf_core.importing.meshes.geometry import fan, fans
+    from regnf_core.importing.meshes.triangle_files import fan, fans
 
     counts = {len(face) for face in faces} if isinstance(faces, list | tuple) and all(map(_is_row, faces)) else set()
     if len(counts) > 1:
@@ -322,7 +322,7 @@ def _is_row(value: Any) -> bool:
 
 def _colors(colors: Any, vertices: int) -> Float64Array:
     """(V, 3) in [0, 1]. Raises FieldFormatError (MESH_INVALID)."""
-    from regnf_core.importing.meshes.geometry import within_unit
+    from regnf_core.importing.meshes.triangle_files import within_unit
 
     array = _array("colors", colors, "MESH_INVALID")
     if array.ndim != 2 or len(array) != vertices or array.shape[1] not in (3, 4):

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import ProgressCallback, RegistrationResult, Verdict
+from regnf_core.paper import pipeline as paper
+from regnf_core.result import STARTS, ProgressCallback, RegistrationResult, Run, Verdict
 from regnf_core.robust.library_search import (
     CoarseMatch,
     LibraryQuery,
@@ -27,12 +28,9 @@ from regnf_core.robust.library_search import (
     refine_match,
     worth_refining,
 )
-from regnf_core.robust.model.model_file import read_object_model, write_object_model
-from regnf_core.robust.model.object_model import ObjectModel, model_object
-from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
-from regnf_core.robust.report import result_of
-from regnf_core.robust.scene.scene_view import view_scene
-from regnf_core.run import STARTS, Run
+from regnf_core.robust.model import ObjectModel, model_object, read_object_model, write_object_model
+from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust, result_of
+from regnf_core.robust.scene import view_scene
 from regnf_core.surface.result_clouds import with_clouds
 
 Stage = Literal["refined", "coarse", "signature"]
@@ -177,3 +175,56 @@ __all__ = [
     "search_library",
     "write_object_model",
 ]
+
+
+# Registration of two fields: by the preset that the options name, then the point clouds of the result.
+
+__all__ = ["WarmStart", "register", "with_late_clouds"]
+
+
+def register(
+    scene: SdfField,
+    obj: SdfField,
+    detection: OrientedBox,
+    options: RegistrationOptions | None = None,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+    warm_start: WarmStart | None = None,
+    clouds: bool = True,
+) -> RegistrationResult:
+    """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
+
+    ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimizing; it may
+    raise CancelledError. ``warm_start``, for the preset `robust` alone: a pose to try first, and the object's model.
+    Without ``clouds`` the result holds only the samples that the registration used, and neither residuals nor
+    surroundings; this saves time when no pictures are drawn.
+    Deterministic for a seed, on one machine and with the same number of threads.
+    Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE), and
+    InvalidOptionsError (INITIAL_TRANSFORM_UNSUPPORTED, INVALID_OPTIONS) for a warm start under another preset.
+    """
+    options = options or RegistrationOptions()
+    if warm_start is not None:
+        _check_warm_start(warm_start, options)
+    run = Run(progress)
+    if options.preset == "robust":
+        result = register_robust(scene, obj, detection, options, seed, run, warm_start)
+    else:
+        result = paper.register_paper(scene, obj, detection, options, seed, run)
+    return run.finish(
+        result, (lambda found: with_late_clouds(found, scene, obj, detection, options)) if clouds else None
+    )
+
+
+def with_late_clouds(
+    result: RegistrationResult, scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions
+) -> RegistrationResult:
+    """The result of ``register`` without clouds as it returns it with them, but for the seconds of this phase."""
+    region = cloud_region(detection) if options.preset == "robust" else paper.cloud_region(detection, options)
+    return with_clouds(result, scene, obj, detection, region)
+
+
+def _check_warm_start(warm_start: WarmStart, options: RegistrationOptions) -> None:
+    if warm_start.T_object_scene is not None:
+        options.require_robust("starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED")
+    if warm_start.object_model is not None:
+        options.require_robust("uses an object model")

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_core.errors import atomic_path
 from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import FieldSource, SettingsChoice, find_source
-from regnf_core.files import atomic_path
 from regnf_core.in_memory import FieldWarning, field_of
-from regnf_core.version import __version__
+from regnf_core.version import ENGINE_REVISION, __version__
 
 if TYPE_CHECKING:
-    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.observation import SdfField
 
 
 @dataclass(frozen=True)

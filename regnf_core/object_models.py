@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import FieldFormatError
 from regnf_core.field_source import FieldSource
 from regnf_core.fields.build import open_field
 from regnf_core.library import ObjectModel, model_object, read_object_model, write_object_model
 from regnf_core.loading import default_cache_dir, safe_field
 from regnf_core.options import RobustOptions
+from regnf_core.version import ENGINE_REVISION
 
 
 def object_model(source: FieldSource, options: RobustOptions) -> ObjectModel:

@@ -13,8 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le
 from pydantic import TypeAdapter, ValidationError
 
-from regnf_core.errors import InvalidOptionsError
-from regnf_core.hints import nearest_name
+from regnf_core.errors import InvalidOptionsError, nearest_name
 
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
@@ -161,11 +160,6 @@ class RobustOptions:
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score, and they are at most 20 times less likely. Increase it to list less exact symmetry equivalents
     too."""
-
-    batch_memory: Annotated[int, Ge(2**22), Le(2**40)] | None = None
-    """Memory in bytes for the work of ``register_batch`` on many pairs at once; the fields' own comes in addition.
-    Pairs that do not fit wait for the next group. null: 256 MiB on a GPU; one pair after the other on the CPU, where
-    that is faster."""
 
     def __post_init__(self) -> None:
         if self.min_scale is not None and self.max_scale is not None and self.min_scale > self.max_scale:

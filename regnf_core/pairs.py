@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
+from typing import Any
 
 from regnf_core.errors import InvalidInputError
 
@@ -22,3 +23,30 @@ def pairs_of(pairs: Sequence[tuple[int, int]] | None, detections: int, objects: 
             hint = "A pair is (number of the detection, number of the object); both count from 0."
             raise InvalidInputError(message, reason="PAIR_UNKNOWN", hint=hint)
     return list(pairs)
+
+
+# What the results of a batch say of one pair: a registration's document, cut down to a line.
+
+_MEMBERS = (
+    "verdict",
+    "verdict_reason",
+    "probability",
+    "T_scene_object",
+    "T_object_scene",
+    "center_scene",
+    "uncertainty",
+    "alternatives",
+)
+_SECONDS = "seconds_"
+
+
+def short_result(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Verdict, transforms and metrics of a result document; the seconds of all phases as one. Of a search, the object
+    too."""
+    found = {name: document.get(name) for name in _MEMBERS}
+    if document.get("candidates") is not None:
+        found["object"] = document.get("object")
+    metrics: Mapping[str, Any] = document.get("metrics") or {}
+    kept = {name: value for name, value in metrics.items() if not name.startswith(_SECONDS)}
+    seconds = sum(value or 0.0 for name, value in metrics.items() if name.startswith(_SECONDS))
+    return found | {"metrics": kept | {"seconds": round(seconds, 4)}}

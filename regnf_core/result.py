@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -126,7 +128,7 @@ class RegistrationResult:
     """(7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t, becomes
     s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the place of
     the scene's origin: the farther that is from the object, the larger are the entries of t, however well the object's
-    place is known. :func:`regnf_core.viewing.uncertainty.center_covariance` gives that. None from the preset
+    place is known. :func:`regnf_core.viewing.document.center_covariance` gives that. None from the preset
     `paper`."""
     symmetry: ObjectSymmetry | None = None
     """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
@@ -151,3 +153,50 @@ class RegistrationResult:
         is within 5 % of the object's diameter, or equal to that by the object's symmetry. What the option
         ``min_probability`` is compared with. None from the preset `paper`."""
         return self.metrics.get("probability")
+
+
+# Progress reports and the seconds of each phase, the same for every preset.
+
+STARTS: dict[Phase, float] = {
+    "sampling": 0.0,
+    "initializing": 0.15,
+    "optimizing": 0.2,
+    "verifying": 0.95,
+    "exporting": 0.98,
+}
+"""The overall share done when each phase begins."""
+
+
+class Run:
+    """Progress reports and the seconds of each phase."""
+
+    def __init__(self, progress: ProgressCallback | None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._done = 0.0
+        self._progress = progress
+
+    def report(self, phase: Phase, done: float) -> None:
+        """Report a phase and the overall share done (0..1). The share never falls: a second attempt repeats earlier
+        phases."""
+        self._done = max(self._done, min(done, 1.0))
+        if self._progress is not None:
+            self._progress(phase, self._done)
+
+    def finish(
+        self, result: RegistrationResult, add_clouds: Callable[[RegistrationResult], RegistrationResult] | None = None
+    ) -> RegistrationResult:
+        """The result with its clouds, if any are wanted, and with the seconds of all phases among its metrics."""
+        if add_clouds is not None:
+            with self.phase("exporting"):
+                result = add_clouds(result)
+        self.report("exporting", 1.0)
+        result.metrics.update(self.seconds)
+        return result
+
+    @contextmanager
+    def phase(self, name: Phase) -> Iterator[None]:
+        self.report(name, STARTS[name])
+        start = time.perf_counter()
+        yield
+        key = f"seconds_{name}"
+        self.seconds[key] = self.seconds.get(key, 0.0) + time.perf_counter() - start

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError, InvalidDetectionError
 from regnf_core.geometry.box import OrientedBox
-from regnf_data.json_values import array, matrix4, similarity
+from regnf_data.layouts import array, matrix4, similarity
 from regnf_data.posed_images import Instance
 
 _REASON = "DATASET_INSTANCE_INVALID"

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_data.mesh_scene import Hits, MeshScene
-from regnf_data.paint import to_srgb
+from regnf_data.mesh_scene import Hits, MeshScene, to_srgb
 
 Size = tuple[int, int]
 """Height and width, pixels."""

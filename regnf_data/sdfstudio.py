@@ -2,7 +2,403 @@
 
 from __future__ import annotations
 
-from regnf_data.sdfstudio_reader import METADATA, load_dataset
-from regnf_data.sdfstudio_writer import check_target, write_dataset
+import json
+import os
+import struct
+import tempfile
+import tokenize
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from regnf_core.errors import DatasetError
+from regnf_data.instances import read_instances, write_instance
+from regnf_data.layouts import array, rigid, similarity, whole_number
+from regnf_data.posed_images import PosedImages
+
+# The image files of a dataset: colors, depths and masks, each checked against the size that is due.
+
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+_FAULTS_OF_CONTENT = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    tokenize.TokenError,
+    zlib.error,
+    Image.DecompressionBombError,
+    Image.DecompressionBombWarning,
+)
+"""What pillow and numpy raise on malformed files."""
+
+
+def resolve(folder: Path, name: Any, what: str) -> Path:
+    """The file ``name`` in the folder, which it may not leave.
+
+    Raises DatasetError (DATASET_METADATA_INVALID, DATASET_PATH_OUTSIDE, DATASET_IMAGE_MISSING).
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise DatasetError(f"{what} is not a path", reason="DATASET_METADATA_INVALID")
+    try:
+        path = (folder / name).resolve()
+        inside = path.is_relative_to(folder.resolve())
+        exists = inside and path.is_file()
+    except (OSError, RuntimeError, ValueError) as error:  # too long, links in a circle, half a character
+        raise DatasetError(f"{what} cannot be followed: {name!r:.200}", reason="DATASET_METADATA_INVALID") from error
+    if not inside:
+        raise DatasetError(f"{what} leaves the dataset's folder: {name!r:.200}", reason="DATASET_PATH_OUTSIDE")
+    if not exists:
+        raise DatasetError(f"{what} names no file of the dataset: {name!r:.200}", reason="DATASET_IMAGE_MISSING")
+    return path
+
+
+def image_size(path: Path) -> Size:
+    """Height and width by the file's header."""
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except _FAULTS_OF_CONTENT as error:
+        raise _invalid(path, error) from error
+
+
+def read_colors(path: Path, size: Size) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8, sRGB; transparency is left out."""
+    return np.asarray(_decoded(path, size, "RGB"), dtype=np.uint8)
+
+
+def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
+    """(H, W): true where the picture is brighter than half; one of zeros and ones counts as such."""
+    gray = _decoded(path, size, "L")
+    return np.asarray(gray > (127 if gray.max() > 1 else 0))
+
+
+def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32]:
+    """(H, W) float32 in world units, 0 where there is none: what is not finite and positive counts as none, and so does
+    the largest number that a file's type has (65535 in many recordings).
+
+    ``.npy`` holds world units; an image holds whole numbers of ``unit`` world units each.
+    Raises DatasetError (DATASET_DEPTH_UNIT_MISSING, DATASET_SIZES_DIFFER, DATASET_IMAGE_INVALID).
+    """
+    stored = _array_file(path, size) if path.suffix.lower() == ".npy" else None
+    if stored is None and unit is None:
+        raise DatasetError(
+            f"{path.name}: a depth image needs depth_unit_scale_factor in the metadata",
+            reason="DATASET_DEPTH_UNIT_MISSING",
+        )
+    if stored is None:
+        stored, factor = _decoded(path, size, None), unit or 1.0
+    else:
+        factor = 1.0
+    largest = np.finfo(stored.dtype).max if stored.dtype.kind == "f" else np.iinfo(stored.dtype).max
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = (stored.astype(np.float64) * factor).astype(np.float32)
+        measured = np.isfinite(depth) & (depth > 0.0) & (stored < largest)
+    return np.where(measured, depth, np.float32(0.0))
+
+
+def _array_file(path: Path, size: Size) -> NDArray[Any]:
+    try:
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+        shape, kind = stored.shape, stored.dtype.kind
+    except _FAULTS_OF_CONTENT as error:
+        raise _invalid(path, error) from error
+    if kind not in "fiu":
+        raise DatasetError(f"{path.name} holds no numbers", reason="DATASET_IMAGE_INVALID")
+    if shape not in (size, (*size, 1), (1, *size)):
+        raise _differs(path, shape, size)
+    return np.array(stored).reshape(size)
+
+
+def _decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
+    try:
+        with Image.open(path) as image:
+            # Told by the header: nothing of the wrong size is decoded.
+            if (image.height, image.width) != size:
+                raise _differs(path, (image.height, image.width), size)
+            kind, pixels = image.mode, np.asarray(image.convert(mode) if mode else image)
+    except _FAULTS_OF_CONTENT as error:
+        raise _invalid(path, error) from error
+    if pixels.shape[:2] != size or (mode is None and pixels.ndim != 2):
+        raise DatasetError(f"{path.name} has more than one channel", reason="DATASET_IMAGE_INVALID")
+    if mode is None and (kind == "P" or pixels.dtype.kind not in "fiu"):
+        what = "a palette of colors" if kind == "P" else "one bit a pixel, as masks have"
+        raise DatasetError(f"{path.name} holds no depths: it has {what}", reason="DATASET_IMAGE_INVALID")
+    return pixels
+
+
+def _differs(path: Path, found: tuple[int, ...], size: Size) -> DatasetError:
+    shape = " x ".join(map(str, found))
+    return DatasetError(
+        f"{path.name} is {shape}, not {size[0]} x {size[1]} (height x width)", reason="DATASET_SIZES_DIFFER"
+    )
+
+
+def _invalid(path: Path, error: BaseException) -> DatasetError:
+    return DatasetError(f"{path.name} cannot be read as an image: {error}", reason="DATASET_IMAGE_INVALID")
+
+
+# Reads a folder in the sdfstudio data format.
+
+METADATA = "meta_data.json"
+_INVALID = "DATASET_METADATA_INVALID"
+_INTRINSICS = "DATASET_INTRINSICS_INVALID"
+_CAMERAS = ("OPENCV", "PINHOLE")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MAX_BYTES = 64 << 20
+_MAX_PIXELS = 1 << 30
+USUAL_BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+"""sdfstudio's own: scenes are scaled into this cube."""
+
+
+def load_dataset(folder: str | os.PathLike[str], opengl: bool = False) -> PosedImages:
+    """The images of a folder with ``meta_data.json``, in the folder's world frame. Frames whose pose is not finite, of
+    a camera that was lost, are left out. opengl: its cameras look against z, y is up.
+
+    Frames need ``rgb_path``, ``camtoworld`` and ``intrinsics`` (their own, or one for all beside ``frames``);
+    everything else may be absent, see docs/datasets.md.
+    Raises DatasetError: DATASET_NO_METADATA, DATASET_METADATA_INVALID, DATASET_CAMERA_UNSUPPORTED, DATASET_NO_FRAMES,
+    DATASET_POSE_NOT_RIGID, DATASET_INTRINSICS_INVALID, DATASET_IMAGE_MISSING, DATASET_IMAGE_INVALID,
+    DATASET_SIZES_DIFFER, DATASET_DEPTH_UNIT_MISSING, DATASET_PATH_OUTSIDE, DATASET_INSTANCE_INVALID, DATASET_TOO_LARGE.
+    """
+    root = Path(folder)
+    metadata = _metadata(root)
+    _check_camera(metadata)
+    frames = _frames(metadata)
+    size = _size(metadata, root, frames)
+    # What lies in the metadata comes first: it is refused before any image is decoded.
+    intrinsics = np.stack([_intrinsics(frame, metadata, index) for index, frame in enumerate(frames)])
+    poses = [rigid(f.get("camtoworld"), f"camtoworld of frame {i}", _pose_reason(f)) for i, f in enumerate(frames)]
+    bounds = _bounds(metadata)
+    instances = read_instances(metadata.get("instances"))
+    return PosedImages(
+        colors=_colors(root, frames, size),
+        intrinsics=intrinsics,
+        T_world_camera=np.stack(poses) * np.array((1.0, -1.0, -1.0, 1.0) if opengl else 1.0),
+        bounds=bounds,
+        depths=_depths(root, metadata, frames, size),
+        masks=_masks(root, metadata, frames, size),
+        instances=instances,
+        T_metric_world=_metric_world(metadata),
+    )
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    path = folder / METADATA
+    if not path.is_file():
+        raise DatasetError(f"{folder.name} holds no {METADATA}", reason="DATASET_NO_METADATA")
+    if path.stat().st_size > _MAX_BYTES:
+        raise DatasetError(f"{METADATA} has more than {_MAX_BYTES} bytes", reason="DATASET_TOO_LARGE")
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{METADATA} is not JSON: {error}", reason=_INVALID) from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"{METADATA} is not a JSON object", reason=_INVALID)
+    return content
+
+
+def _check_camera(metadata: dict[str, Any]) -> None:
+    model = metadata.get("camera_model", "OPENCV")
+    if model not in _CAMERAS:
+        raise DatasetError(
+            f"camera model {model!r:.80}: only {', '.join(_CAMERAS)}", reason="DATASET_CAMERA_UNSUPPORTED"
+        )
+    if any(metadata.get(name) not in (None, 0, 0.0) for name in _DISTORTION):
+        raise DatasetError("lenses that distort: undistort the images", reason="DATASET_CAMERA_UNSUPPORTED")
+
+
+def _frames(metadata: dict[str, Any]) -> list[dict[str, Any]]:
+    frames = metadata.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise DatasetError("the metadata lists no frames", reason="DATASET_NO_FRAMES")
+    if not all(isinstance(frame, dict) for frame in frames):
+        raise DatasetError("a frame is not a JSON object", reason=_INVALID)
+    found = [frame for frame in frames if not _lost(frame.get("camtoworld"))]
+    if not found:
+        raise DatasetError("no frame has a pose of finite numbers", reason="DATASET_POSE_NOT_RIGID")
+    return found
+
+
+def _lost(pose: Any) -> bool:
+    """Whether a pose has the right shape, and numbers that are not finite."""
+    try:
+        numbers = np.array(pose, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return numbers.shape in ((4, 4), (3, 4)) and not np.isfinite(numbers).all()
+
+
+def _size(metadata: dict[str, Any], folder: Path, frames: list[dict[str, Any]]) -> Size:
+    stated = (metadata.get("height"), metadata.get("width"))
+    if None in stated:
+        height, width = image_size(resolve(folder, frames[0].get("rgb_path"), "rgb_path of frame 0"))
+    else:
+        height, width = (
+            whole_number(value, name, _INVALID) for value, name in zip(stated, ("height", "width"), strict=True)
+        )
+    if len(frames) * height * width > _MAX_PIXELS:
+        raise DatasetError(
+            f"{len(frames)} images of {height} x {width}: more than {_MAX_PIXELS} pixels", reason="DATASET_TOO_LARGE"
+        )
+    return height, width
+
+
+def _intrinsics(frame: dict[str, Any], metadata: dict[str, Any], index: int) -> NDArray[np.float64]:
+    given = frame.get("intrinsics", metadata.get("intrinsics"))
+    matrix = array(given, ((4, 4), (3, 3), (3, 4)), f"intrinsics of frame {index}", _INTRINSICS)[:3, :3]
+    upright = np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], (0.0, 0.0, 0.0, 1.0))
+    if not upright or matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
+        raise DatasetError(f"intrinsics of frame {index} are not a camera matrix", reason=_INTRINSICS)
+    return matrix
+
+
+def _pose_reason(frame: dict[str, Any]) -> str:
+    return _INVALID if frame.get("camtoworld") is None else "DATASET_POSE_NOT_RIGID"
+
+
+def _bounds(metadata: dict[str, Any]) -> NDArray[np.float64]:
+    scene_box = metadata.get("scene_box") or {}
+    if not isinstance(scene_box, dict):
+        raise DatasetError("scene_box is not a JSON object", reason=_INVALID)
+    bounds = array(scene_box.get("aabb", USUAL_BOUNDS), ((2, 3),), "aabb of scene_box", _INVALID)
+    if not (bounds[0] < bounds[1]).all():
+        raise DatasetError("aabb of scene_box: the lowest corner is not below the highest", reason=_INVALID)
+    return bounds
+
+
+def _metric_world(metadata: dict[str, Any]) -> NDArray[np.float64] | None:
+    given = metadata.get("worldtogt")
+    if given is None:  # some files say it with each instance instead
+        named = metadata.get("instances")
+        entries = list(named.values()) if isinstance(named, dict) else named or []
+        given = next((entry["worldtogt"] for entry in entries if entry.get("worldtogt") is not None), None)
+    return None if given is None else similarity(given, "worldtogt", _INVALID)
+
+
+def _colors(folder: Path, frames: list[dict[str, Any]], size: Size) -> NDArray[np.uint8]:
+    paths = [resolve(folder, frame.get("rgb_path"), f"rgb_path of frame {i}") for i, frame in enumerate(frames)]
+    return np.stack([read_colors(path, size) for path in paths])
+
+
+def _depths(
+    folder: Path, metadata: dict[str, Any], frames: list[dict[str, Any]], size: Size
+) -> NDArray[np.float32] | None:
+    if metadata.get("has_sensor_depth") is False:
+        return None
+    paths = _paths(folder, frames, "sensor_depth_path", bool(metadata.get("has_sensor_depth")))
+    if paths is None:
+        return None
+    given = metadata.get("depth_unit_scale_factor")
+    unit = None if given is None else float(array(given, ((),), "depth_unit_scale_factor", _INVALID))
+    return np.stack([read_depth(p, size, unit) if p else np.zeros(size, dtype=np.float32) for p in paths])
+
+
+def _masks(
+    folder: Path, metadata: dict[str, Any], frames: list[dict[str, Any]], size: Size
+) -> NDArray[np.bool_] | None:
+    if metadata.get("has_foreground_mask") is False:
+        return None
+    paths = _paths(folder, frames, "foreground_mask", bool(metadata.get("has_foreground_mask")))
+    if paths is None:
+        return None
+    return np.stack([read_mask(p, size) if p else np.ones(size, dtype=np.bool_) for p in paths])
+
+
+def _paths(folder: Path, frames: list[dict[str, Any]], key: str, promised: bool) -> list[Path | None] | None:
+    """A frame may lack its file; if all do, the dataset has none of the kind, unless it promised them."""
+    named = [frame.get(key) for frame in frames]
+    if any(name is not None for name in named):
+        what = f"{key} of frame"
+        return [None if n is None else resolve(folder, n, f"{what} {i}") for i, n in enumerate(named)]
+    if promised:
+        raise DatasetError(f"the metadata promises files that no frame names: {key}", reason="DATASET_IMAGE_MISSING")
+    return None
+
+
+# Writes a folder in the sdfstudio data format.
+
+
+def write_dataset(images: PosedImages, folder: str | os.PathLike[str]) -> None:
+    """Write ``meta_data.json``, colors and masks as PNG, depths as ``.npy`` in world units.
+
+    All of it or nothing: the folder appears when it is whole. It may exist if it is empty.
+    Raises DatasetError (DATASET_FOLDER_NOT_EMPTY) and OSError.
+    """
+    target = Path(folder)
+    check_target(target)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}-") as work:
+        made = Path(work) / "dataset"
+        made.mkdir()  # with the usual rights: a temporary folder is the owner's alone
+        frames = [_write_frame(images, index, made) for index in range(len(images))]
+        (made / METADATA).write_text(json.dumps(_written_metadata(images, frames), indent=1) + "\n", encoding="utf-8")
+        os.replace(made, target)
+
+
+def check_target(folder: Path) -> None:
+    """Raises DatasetError (DATASET_FOLDER_NOT_EMPTY) where a dataset would mix with other files, and OSError."""
+    if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+        raise DatasetError(f"{folder} exists and is not an empty folder", reason="DATASET_FOLDER_NOT_EMPTY")
+    if not folder.parent.is_dir():
+        raise DatasetError(f"no such folder: {folder.parent}", reason="DATASET_FOLDER_MISSING")
+
+
+def _write_frame(images: PosedImages, index: int, folder: Path) -> dict[str, Any]:
+    intrinsics = np.eye(4)
+    intrinsics[:3, :3] = images.intrinsics[index]
+    name = f"{index:06d}"
+    frame: dict[str, Any] = {
+        "rgb_path": f"{name}_rgb.png",
+        "camtoworld": images.T_world_camera[index].tolist(),
+        "intrinsics": intrinsics.tolist(),
+    }
+    Image.fromarray(images.colors[index]).save(folder / frame["rgb_path"])
+    if images.depths is not None:
+        frame["sensor_depth_path"] = f"{name}_depth.npy"
+        np.save(folder / frame["sensor_depth_path"], images.depths[index])
+    if images.masks is not None:
+        frame["foreground_mask"] = f"{name}_mask.png"
+        Image.fromarray(images.masks[index].astype(np.uint8) * 255).save(folder / frame["foreground_mask"])
+    return frame
+
+
+def _written_metadata(images: PosedImages, frames: list[dict[str, Any]]) -> dict[str, Any]:
+    height, width = images.size
+    metadata: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "height": height,
+        "width": width,
+        "has_sensor_depth": images.depths is not None,
+        "has_foreground_mask": images.masks is not None,
+        "scene_box": _scene_box(images),
+    }
+    if images.T_metric_world is not None:
+        metadata["worldtogt"] = images.T_metric_world.tolist()
+    metadata["instances"] = [write_instance(instance) for instance in images.instances]
+    metadata["frames"] = frames
+    return metadata
+
+
+def _scene_box(images: PosedImages) -> dict[str, Any]:
+    """``near`` and ``far`` hold every point of the bounds from every camera; regnf itself reads ``aabb`` alone."""
+    lower, upper = images.bounds
+    positions = images.T_world_camera[:, :3, 3]
+    outside = np.maximum(np.maximum(lower - positions, positions - upper), 0.0)
+    farthest = np.maximum(np.abs(positions - lower), np.abs(positions - upper))
+    radius = float(np.linalg.norm(upper - lower)) / 2.0
+    return {
+        "aabb": images.bounds.tolist(),
+        "near": max(float(np.linalg.norm(outside, axis=1).min()), 0.01 * radius),
+        "far": float(np.linalg.norm(farthest, axis=1).max()),
+        "radius": radius,
+        "collider_type": "box",
+    }
+
 
 __all__ = ["METADATA", "check_target", "load_dataset", "write_dataset"]

@@ -11,10 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from regnf_core.fields.geometry_mlp import GeometryMlp
+from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_core.fields.positional_encoding import PositionalEncoding
+from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
 from regnf_fit.options import NetworkOptions
 
 GRID_RADIUS = 2.0

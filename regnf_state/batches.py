@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_state.blobs.base import BlobEntry, BlobStore
-from regnf_state.pages import Page, Position
-from regnf_state.record_format import FORMAT, check_json_format
-from regnf_state.records import UnreadableRecordError
+from regnf_state.record_store import Page, Position
+from regnf_state.records import FORMAT, UnreadableRecordError, check_json_format
 
 _ALL = "batches"
 _PROBLEM_BYTES = 1024

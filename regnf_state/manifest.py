@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from regnf_state.blobs.base import BlobStore
-from regnf_state.record_format import FORMAT, check_json_format
-from regnf_state.records import UnreadableRecordError
+from regnf_state.records import FORMAT, UnreadableRecordError, check_json_format
 
 _BINARY = "application/octet-stream"
 EDITED_FIELD = "edited.safetensors"

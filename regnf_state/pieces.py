@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
+from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
 from regnf_state.blobs.base import BlobEntry, BlobStore
 from regnf_state.settings import Settings
 
@@ -112,3 +113,17 @@ def _unfinished(folder: str, entries: Sequence[BlobEntry]) -> Unfinished:
     held = sum(entry.bytes for entry in entries)
     modified = max((entry.modified for entry in entries), default=0.0)
     return Unfinished(folder, offset, total, len(entries), held, modified)
+
+
+# Where the mesh and the picture of a field lie, which workers make once the field is ready.
+
+
+def view_key(reference: str, name: str) -> str:
+    """Where what people look at of a field lies."""
+    return f"fields/{reference}/{name}"
+
+
+def delete_views(blobs: BlobStore, reference: str) -> None:
+    """Delete what people look at of a field."""
+    for name in (PICTURE_NAME, *MESH_NAMES):
+        blobs.delete(view_key(reference, name))

@@ -9,7 +9,7 @@ ends, deletes or reports is never refused here. Counts stand for bytes: transiti
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,126 @@ from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.originals import Originals, delete_upload
-from regnf_state.records import RecordsFullError, StaleAttemptError, UnreadableRecordError
+from regnf_state.record_store import RecordStore
+from regnf_state.records import ORIGINAL_UNTIL, FieldRecord, RecordsFullError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
-from regnf_state.redis.owners import Owners
+from regnf_state.redis.counters import Owners
 from regnf_state.settings import Settings
+
+# Uploads that stay for a while after their import: a question of the import is then answered without a second upload.
+#
+# The record says until when, in its error or its report; the bytes count towards the caller's quota, and go for a new
+# upload that needs their room. Of each caller so many bytes are kept at most, the latest.
+
+QUESTIONS = frozenset(
+    {
+        "LAYOUT_AMBIGUOUS",
+        "HASH_GRID_NOT_RECOGNIZED",
+        "TRUNCATION_UNKNOWN",
+        "LATENT_MISSING",
+        "FIELD_IMPLAUSIBLE",
+        "SETTINGS_CONTRADICT_TENSORS",
+        "INVALID_DESCRIPTION",
+        "FAMILY_NOT_SUPPORTED",
+        "NO_ZERO_LEVEL",
+    }
+)
+"""Reasons of a rejection that another description of the same bytes may mend."""
+_MOST = 64
+"""Uploads of one caller."""
+
+
+def original_key(reference: str) -> str:
+    """Where the uploaded bytes lie until the import has ended, or for as long as they are kept."""
+    return f"fields/{reference}/original"
+
+
+def settings_key(reference: str, sha256: str) -> str:
+    """Where the trainer's settings, or the cameras, that came with them lie, for as long."""
+    return f"fields/{reference}/settings-{sha256}"
+
+
+def candidates_prefix(reference: str) -> str:
+    """Where the pictures lie of what a rejected field may be; they go with its upload."""
+    return f"fields/{reference}/candidates"
+
+
+def candidate_key(reference: str, number: int) -> str:
+    """The picture of the ``number``-th candidate, counted from 1."""
+    return f"{candidates_prefix(reference)}/{number}.png"
+
+
+def delete_upload(blobs: BlobStore, field: FieldRecord) -> None:
+    """Delete what was uploaded, but nothing that was made of it."""
+    blobs.delete(original_key(field.sha256))
+    for file in field.beside:
+        blobs.delete(settings_key(field.sha256, file.sha256))
+
+
+def delete_all_but_upload(blobs: BlobStore, field: FieldRecord) -> None:
+    """Delete what was made of an upload, and files that came with it and are no longer its own."""
+    own = {original_key(field.sha256), *(settings_key(field.sha256, file.sha256) for file in field.beside)}
+    for key in list(blobs.list(f"fields/{field.sha256}")):
+        if key not in own:
+            blobs.delete(key)
+
+
+class Originals:
+    """The uploads that are kept. Any number of processes may use it at once. Methods raise RedisError, OSError."""
+
+    def __init__(self, records: RecordStore, blobs: BlobStore, settings: Settings) -> None:
+        self._records = records
+        self._blobs = blobs
+        self._choice = settings.keep_originals
+        self._kept_s = settings.keep_originals_s
+        self._most_bytes = settings.keep_originals_bytes
+
+    def keep_with(self, values: Mapping[str, Any], rejected: bool) -> dict[str, Any]:
+        """A field's error (``rejected``) or report, saying until when its upload is kept, if it is."""
+        kept = self._choice == "all" if not rejected else self._choice != "none" and values.get("reason") in QUESTIONS
+        plain = {name: value for name, value in values.items() if name != ORIGINAL_UNTIL}
+        return plain | {ORIGINAL_UNTIL: round(self._records.now() + self._kept_s, 3)} if kept else plain
+
+    def trim(self, owner: str) -> int:
+        """Let go of those whose time is over, and of the oldest beyond what is kept; how many."""
+        kept = self._kept(owner)
+        now, room, gone = self._records.now(), self._most_bytes, 0
+        for number, field in enumerate(reversed(kept)):
+            until = field.original_until or 0.0
+            room -= field.upload_bytes
+            if until <= now or room < 0 or number >= _MOST:
+                gone += self.drop(field)
+        return gone
+
+    def free(self, owner: str) -> bool:
+        """Let go of an owner's oldest; False when there is none."""
+        return any(self.drop(field) for field in self._kept(owner))
+
+    def bytes_of(self, owner: str) -> int:
+        """How many bytes an owner's kept uploads have: room that a new upload can have."""
+        return sum(field.upload_bytes for field in self._kept(owner))
+
+    def _kept(self, owner: str) -> list[FieldRecord]:
+        """Those whose time is over first, first."""
+        return self._records.fields_with_original(owner)
+
+    def drop(self, field: FieldRecord) -> bool:
+        """Let go of the upload of a field whose import has ended; False when it has changed meanwhile.
+
+        The record first: what it says is kept is there. An upload of the same bytes in between keeps its own."""
+        holder, said = ("error", field.error) if field.state == "rejected" else ("report", field.report)
+        without = {name: value for name, value in (said or {}).items() if name != ORIGINAL_UNTIL}
+        try:
+            self._records.update_field(field.sha256, attempt=field.attempt, **{holder: without})
+        except StaleAttemptError:
+            return False
+        now = self._records.get_field(field.sha256)
+        if now is None or (now.attempt == field.attempt and now.state != "validating"):
+            delete_upload(self._blobs, field)
+            self._blobs.delete_prefix(candidates_prefix(field.sha256))
+            logger.info("the upload of field %s is no longer kept", field.sha256)
+        return True
+
 
 _AT_ONCE = 32
 """Evictions for one request."""

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
-from regnf_state.blobs.open import open_blobs
+from regnf_state.blobs.local import open_blobs
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.queue import JobQueue
-from regnf_state.redis.address import redis_address
 from regnf_state.redis.bounded_client import connect_bounded
-from regnf_state.redis.client import connect
+from regnf_state.redis.client import connect, redis_address
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 

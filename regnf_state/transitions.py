@@ -5,16 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from regnf_state.records import (
-    ACTIVE,
-    DRAWINGS,
-    FINISHED,
-    VIEWS,
-    FieldRecord,
-    JobRecord,
-    QuotaError,
-    StaleAttemptError,
-)
+from regnf_state.records import ACTIVE, DRAWINGS, FINISHED, VIEWS, FieldRecord, JobRecord, QuotaError, StaleAttemptError
 
 MAX_WEBHOOKS = 16
 """How many addresses one job tells of its end."""

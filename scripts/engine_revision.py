@@ -4,7 +4,7 @@
     python -m scripts.engine_revision --raise    # the results change where no golden registration looks
 
 Same results: the digest of the engine's code is recorded anew, and nothing else changes. Other results: they are
-recorded, and the revision is raised in regnf_core/engine_revision.py, so that no service returns a result of the older
+recorded, and the revision is raised in regnf_core/version.py, so that no service returns a result of the older
 engine. What changed is printed, for the changelog. Both files belong into the commit that changes the engine.
 """
 
@@ -26,7 +26,7 @@ from tests.golden.cases import Case, cases
 from tests.golden.records import RECORDED, Recorded, differences, record_of
 
 ROOT = Path(__file__).resolve().parents[1]
-REVISION_FILE = ROOT / "regnf_core" / "engine_revision.py"
+REVISION_FILE = ROOT / "regnf_core" / "version.py"
 _STATEMENT = re.compile(r"^ENGINE_REVISION = (\d+)$", re.MULTILINE)
 
 

@@ -19,8 +19,7 @@ from typing import Any
 
 from regnf_core.batch import register_batch
 from regnf_core.fields.build import open_field
-from regnf_core.library import search_library
-from regnf_core.registration import register
+from regnf_core.library import register, search_library
 
 ENTRIES = tuple(function.__module__ for function in (open_field, register, register_batch, search_library))
 """Where a registration starts, and where the fields that it evaluates come from."""

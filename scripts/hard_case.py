@@ -20,13 +20,10 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.robust.depth_camera import looking
 from benchmarks.robust.one_view_field import DepthImage, OneViewField, directions
 from regnf_core import OrientedBox, RegistrationResult, Sim3, open_field, register
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.composite import BoxField, UnionField
-from regnf_core.fields.transformed import TransformedField
-from regnf_core.geometry.metrics import errors_against_truth
-from regnf_core.geometry.points import gaps
-from regnf_core.surface.cameras import Rays
-from regnf_core.surface.sphere_tracing import clip_to_region, first_hits
+from regnf_core.fields.composite import BoxField, TransformedField, UnionField
+from regnf_core.fields.observation import SdfField
+from regnf_core.geometry.metrics import errors_against_truth, gaps
+from regnf_core.surface.sphere_tracing import Rays, clip_to_region, first_hits
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR
 from regnf_core.viewing.splats import Surfels, render, view_from
 

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_mesh
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_fit.mesh.fit import fit_field
-from regnf_fit.mesh.options import FitOptions
+from regnf_fit.mesh import fit_field
+from regnf_fit.options import FitOptions
 
 OBJECT_UNITS_PER_METER = 0.625
 """1.25 object units a scene unit: the scale that the registration has to find."""

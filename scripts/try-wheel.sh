@@ -24,8 +24,8 @@ wanted=$wheel
 cd "$work"
 case $extra in
     all) venv/bin/regnf demo --exit ;;
-    engine) venv/bin/python -c 'import regnf_core.registration' ;;
-    service) venv/bin/python -c 'import regnf_service.app' ;;
+    engine) venv/bin/python -c 'import regnf_core.library' ;;
+    service) venv/bin/python -c 'import regnf_service.server' ;;
     *) venv/bin/regnf --version ;;
 esac
 echo "The wheel works with: $extra"

@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from regnf_service.app import create_app
 from regnf_service.http.contract import contract_yaml
+from regnf_service.server import create_app
 from regnf_state.settings import Settings
 
 TARGET = Path(__file__).resolve().parents[1] / "openapi.yaml"

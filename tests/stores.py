@@ -15,8 +15,7 @@ from redis import Redis
 from regnf_service.services import Services
 from regnf_service.webhooks.service import webhooks_of
 from regnf_state.blobs.local import LocalBlobStore
-from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.journal.journaled_records import JournaledRecordStore, Rebuilder
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.client import connect
 from regnf_state.redis.documents import RedisDocuments, text

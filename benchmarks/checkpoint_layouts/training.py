@@ -11,12 +11,11 @@ from torch import Tensor
 
 from benchmarks.checkpoint_layouts.settings import Settings
 from benchmarks.checkpoint_layouts.shapes import random_shape
-from regnf_core.fields.geometry_mlp import GeometryMlp
+from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.grid_mlp import GridMlpFunction
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_core.fields.positional_encoding import PositionalEncoding
-from regnf_core.schema.kinds.neus_facto import SKIP_LAYER
+from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
+from regnf_core.schema.kinds import SKIP_LAYER
 
 _BATCH = 1024
 _INITIAL = 1e-4

@@ -19,18 +19,16 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.editing.scenes import Found, found, overview, pairs_of
+from benchmarks.random_worlds.mesh import ExactScene, ExactView, Mesh
 from benchmarks.robust.cases import Pair
 from benchmarks.robust.symmetries import declared
 from regnf_core import Insertion, Removal, RenderOptions, SdfField, Sim3, Substitution, compose, open_field
-from regnf_core.editing.measured_matter import without_unseen
-from regnf_core.fields.counting import CountingField
+from regnf_core.editing.region import without_unseen
 from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.metrics import mssd
-from regnf_core.rendering.camera import Camera
-from regnf_core.rendering.paths import Orbit
+from regnf_core.rendering.camera import Camera, Orbit
 from regnf_core.rendering.render import render, render_frames
-from regnf_data.worlds.exact import ExactScene, ExactView
-from regnf_data.worlds.mesh import Mesh
 from scripts import make_demo_fields as demo
 
 SIZE = (160, 120)

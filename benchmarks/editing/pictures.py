@@ -31,10 +31,9 @@ from regnf_core import (
     compose,
     open_field,
 )
-from regnf_core.editing.measured_matter import without_unseen
-from regnf_core.rendering.camera import Camera
-from regnf_core.rendering.files import strip
-from regnf_core.rendering.paths import Orbit
+from regnf_core.editing.region import without_unseen
+from regnf_core.rendering.camera import Camera, Orbit
+from regnf_core.rendering.job import strip
 from regnf_core.rendering.render import render
 
 ROOMS = ("ac-room", "atbl-room", "mix-room")

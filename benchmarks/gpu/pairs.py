@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.robust.cases import KINDS, load_pairs
 from regnf_core import OrientedBox, SdfField, open_field
-from regnf_core.robust.model.object_model import ObjectModel, model_object
+from regnf_core.robust.model import ObjectModel, model_object
 
 DEMO = Path(__file__).parents[2] / "examples" / "data"
 _OFF = 0.03

@@ -15,13 +15,10 @@ from benchmarks.gpu.pairs import Pair, batch_of, field_at, model_at
 from benchmarks.gpu.report import Section
 from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, WarmStart
 from regnf_core.batch import BatchOutcome, ModeledObject, register_batch
-from regnf_core.registration import register
+from regnf_core.library import register
 
 MOST_APART = 1e-4
 """Diameters. Largest distance between the CPU's pose and the device's."""
-MEMORY = {"cpu": 16 * 2**20}
-"""Bytes for a batch on the CPU, where small parts are faster; elsewhere the default."""
-MEMORY_ELSEWHERE = 256 * 2**20
 POINTS = 100_000
 ORDER_PAIRS = 6
 DEVIATIONS_APART = 0.1
@@ -86,8 +83,7 @@ def batches(pairs: Sequence[Pair], device: torch.device, sizes: Sequence[int], d
         good = sum(one.result is not None and one.result.verdict == "registered" for one in found)
         rows.append([str(size), f"{1e3 * seconds / size:.0f}", f"{good} of {size}", _peak(device)])
     head = ("pairs", "ms a pair", "registered", "peak memory of the device, MiB")
-    memory = MEMORY.get(device.type, MEMORY_ELSEWHERE)
-    notes.append(f"`robust.batch_memory`: {memory // 2**20} MiB. The memory includes the fields.")
+    notes.append("The memory includes the fields.")
     return Section("Batches", head, rows, notes)
 
 
@@ -212,9 +208,7 @@ def _batch(pairs: Sequence[Pair], device: torch.device, seed: int = 0) -> list[B
     objects = [ModeledObject(field_at(path, str(device)), model_at(path, str(device))) for path in paths]
     numbers = [(number, paths.index(pair.object)) for number, pair in enumerate(pairs)]
     scene, boxes = field_at(pairs[0].room, str(device)), [pair.detection for pair in pairs]
-    memory = MEMORY.get(device.type, MEMORY_ELSEWHERE)
-    options = replace(ALONE, robust=replace(ALONE.robust, batch_memory=memory))
-    return register_batch(scene, boxes, objects, numbers, options, seed=seed, clouds=False)
+    return register_batch(scene, boxes, objects, numbers, ALONE, seed=seed, clouds=False)
 
 
 def _median_seconds(task: Any, repeats: int) -> float:

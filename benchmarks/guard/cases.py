@@ -16,9 +16,8 @@ import torch
 
 from regnf_core import OrientedBox, WarmStart, open_field
 from regnf_core.batch import register_batch
-from regnf_core.library import LibraryObject, search_library
-from regnf_core.registration import register
-from regnf_core.robust.model.object_model import model_object
+from regnf_core.library import LibraryObject, register, search_library
+from regnf_core.robust.model import model_object
 
 POINTS = 5_000
 OBJECTS = 512

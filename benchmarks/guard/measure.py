@@ -56,7 +56,7 @@ def main() -> None:
     import torch
 
     import regnf_core
-    from regnf_core import registration  # noqa: F401
+    from regnf_core import library  # noqa: F401
 
     imported = time.process_time() - begun
     if not Path(regnf_core.__file__).is_relative_to(tree):

@@ -8,9 +8,9 @@ from typing import Protocol
 
 from benchmarks.robust.cases import Case
 from regnf_core import OrientedBox, SdfField, Sim3
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField
+from regnf_core.geometry.metrics import Symmetries
 from regnf_core.geometry.surface_samples import SurfaceSamples
-from regnf_core.geometry.symmetry import Symmetries
 from regnf_core.options import SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene
 

@@ -36,10 +36,9 @@ from torch import Tensor
 from benchmarks.peers.disturbance import keypoints, rigid_fit
 from benchmarks.peers.interface import PeerCase, PeerResult
 from regnf_core import SdfField, Sim3
-from regnf_core.fields.base import differentiable_signed_distance
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField, differentiable_signed_distance
 from regnf_core.geometry.exponential_map import rotation_exp
-from regnf_core.paper.kernel import AdaptiveKernel
+from regnf_core.paper.optimization import AdaptiveKernel
 
 STEPS = 10_000
 _KEYPOINTS, _KEYPOINT_NOISE = 5, 0.01  # noise in diameters

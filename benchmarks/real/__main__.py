@@ -29,7 +29,7 @@ from benchmarks.real.scenes import Thing, scene_names, scene_of
 from benchmarks.real.sequence import Recording, open_recording
 from benchmarks.real.table import line, tables
 from benchmarks.robust.runs import Run
-from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.options import ReconstructionOptions
 
 
 def _fuse(recording: Recording, work: Work, voxel_m: float) -> None:

@@ -13,7 +13,7 @@ from benchmarks.real.objects import open_object
 from benchmarks.real.scenes import Thing, placement
 from benchmarks.robust.cases import Case
 from regnf_core import SdfField, Sim3
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.composite import TransformedField
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from benchmarks.real.scenes import Thing
 from benchmarks.real.sequence import Floats, Recording, posed_images
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.fit import FitFiles, reconstruct
-from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.options import ReconstructionOptions
 
 _ROOM_IMAGES, _OBJECT_IMAGES = 125, 40
 _LOOKED_AT = 8

@@ -11,12 +11,10 @@ import torch
 from benchmarks.real.fusion import open_fused, surface
 from benchmarks.real.sequence import Floats, Recording, posed_images
 from regnf_core import SdfField, Sim3
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import Observation, ObservedField
-from regnf_core.fields.transformed import TransformedField
 from regnf_core.loading import open_field
-from regnf_fit.images.depth_normals import local_planes
-from regnf_fit.images.depth_spread import depth_spread
-from regnf_fit.images.observing import observe
+from regnf_fit.images.observing import depth_spread, local_planes, observe
 
 MAPS = ("fused", "fit")
 OBSERVATIONS = ("frames", "file", "none")

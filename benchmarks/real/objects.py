@@ -11,7 +11,7 @@ import torch
 from benchmarks.real.fusion import open_fused, surface, voxel_of
 from benchmarks.real.scenes import Thing
 from benchmarks.real.sequence import Floats
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.loading import open_field
 
 KINDS = ("points", "grid", "fit")

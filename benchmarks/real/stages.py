@@ -10,15 +10,15 @@ import torch
 from benchmarks.robust.cases import Case
 from benchmarks.robust.judging import SUCCESS
 from regnf_core import RegistrationOptions, RegnfError, Sim3
-from regnf_core.fields.counting import CountingField
-from regnf_core.geometry.pose_distance import displacement
+from regnf_core.fields.observation import CountingField
+from regnf_core.geometry.metrics import displacement
 from regnf_core.robust.constants import SEARCH
-from regnf_core.robust.model.object_model import model_object
+from regnf_core.robust.model import model_object
 from regnf_core.robust.pipeline import geometric_seeds, refine_poses, search_poses
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.scene.scene_view import view_scene
-from regnf_core.robust.search.features import feature_seeds
-from regnf_core.robust.search.rotations import start_rotations
+from regnf_core.robust.scene import view_scene
+from regnf_core.robust.search.bounds import start_rotations
+from regnf_core.robust.search.distance_grid import feature_seeds
 from regnf_core.robust.verdict.evaluation import evaluate_candidates
 
 _NEAR = 0.1

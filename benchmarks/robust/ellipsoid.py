@@ -9,8 +9,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from regnf_core import Sim3
-from regnf_core.geometry.metrics import mssd
-from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.geometry.metrics import Symmetries, mssd
 
 FREEDOM = 7
 LIMIT = float(chi2.ppf(0.95, FREEDOM))

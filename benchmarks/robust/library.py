@@ -18,7 +18,7 @@ from regnf_core import WarmStart, register
 from regnf_core import open_field as open_safe_field
 from regnf_core.library import LibraryObject, LibrarySearch, read_object_model, search_library
 from regnf_core.robust.library_search import rank_by_signature
-from regnf_core.robust.scene.scene_view import view_scene
+from regnf_core.robust.scene import view_scene
 
 NAME = "library"
 SIZES = (8, 64)

@@ -11,8 +11,7 @@ import torch
 from benchmarks.robust.cases import Case
 from benchmarks.robust.runs import Run
 from regnf_core import RegistrationResult, Sim3
-from regnf_core.geometry.metrics import euler_rmse, scale_error, surface_displacement, translation_rmse
-from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.geometry.metrics import Symmetries, euler_rmse, scale_error, surface_displacement, translation_rmse
 
 _POINTS = 500
 """Surface points, about, by which the nearest of the equal poses is chosen."""

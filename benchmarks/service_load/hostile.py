@@ -46,11 +46,11 @@ from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
 from benchmarks.service_load.webhook_receiver import SECRET
-from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
+from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
 from regnf_core.library_entries import EntryNotes
 from regnf_state.blobs.local import LocalBlobStore
-from regnf_state.field_views import view_key
 from regnf_state.ownership import reference_of
+from regnf_state.pieces import view_key
 from regnf_state.records import FieldRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore

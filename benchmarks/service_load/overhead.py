@@ -29,7 +29,7 @@ import psutil
 from benchmarks.api_process import api_process
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from regnf_cli.local_service import running_service
+from regnf_cli.demo import running_service
 from regnf_cli.remote import RemoteService
 from tests.processes import descendants_of, processor_seconds
 

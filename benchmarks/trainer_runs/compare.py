@@ -16,7 +16,7 @@ import torch
 from benchmarks.trainer_runs.write import FACTS, REFERENCE
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
-from regnf_core.fields.color import has_color
+from regnf_core.fields.observation import has_color
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.gate import FIELD_NAME, import_field
 from regnf_core.importing.gate.reading import Companions

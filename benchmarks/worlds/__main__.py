@@ -28,6 +28,8 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before torch loads, here and in the workers
 
+from benchmarks.random_worlds.models import PARTS, part_of_world, seeds_of  # noqa: E402
+from benchmarks.random_worlds.walks import LENGTHS  # noqa: E402
 from benchmarks.worlds import covariance, tables, training  # noqa: E402
 from benchmarks.worlds.cases import OBSERVED_BY  # noqa: E402
 from benchmarks.worlds.evidence import ASKED, TRAINED, Gathering, evidence_of_world  # noqa: E402
@@ -36,9 +38,7 @@ from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
 from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
 from benchmarks.worlds.worst import picture_of, worst_of  # noqa: E402
-from regnf_core.robust.verdict.probability import ProbabilityModel  # noqa: E402
-from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
-from regnf_data.worlds.walks import LENGTHS  # noqa: E402
+from regnf_core.robust.verdict.answer import ProbabilityModel  # noqa: E402
 
 
 def main() -> None:

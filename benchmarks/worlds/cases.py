@@ -19,10 +19,10 @@ from benchmarks.worlds.making import SCENE, WORLD, read_cameras, read_observatio
 from benchmarks.worlds.observing import observation_of_cameras
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core.fields.build import open_field
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import ObservedField, observation_of, stored_observation
-from regnf_core.fields.transformed import TransformedField
-from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.geometry.metrics import Symmetries
 
 ObservedBy = Literal["images", "cameras", "map", "nothing"]
 """What tells what was seen of a scene: the walk's images, where its cameras stood alone, the map's own file, or

@@ -16,20 +16,19 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from benchmarks.random_worlds.models import part_of_world
 from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
 from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.similar_objects import similar_object
 from benchmarks.worlds.stages import NearestTruth, Recording, recorded
 from regnf_core import RegistrationOptions, RegnfError, Sim3, register
-from regnf_core.geometry.points import NearestNeighbors, diameter
+from regnf_core.geometry.metrics import NearestNeighbors, diameter
 from regnf_core.robust import pipeline
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.verdict.answer import choose
+from regnf_core.robust.verdict.answer import apart, choose
 from regnf_core.robust.verdict.evaluation import held_out_of
-from regnf_core.robust.verdict.lead import apart
-from regnf_data.worlds.split import part_of_world
 
 Row = dict[str, Any]
 Asked = Literal["right", "other", "look-alike", "similar"]

@@ -11,11 +11,11 @@ import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from benchmarks.random_worlds.mesh import Array, Mesh, block, together
 from benchmarks.worlds.cases import WorldCase
 from benchmarks.worlds.making import WORLD, read_object_mesh
 from regnf_core import Sim3
 from regnf_core.fields.mesh import MeshField
-from regnf_data.worlds.mesh import Array, Mesh, block, together
 
 LOOK_ALIKE = "look-alike"
 _PART = (0.03, 0.4)

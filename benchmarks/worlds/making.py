@@ -13,23 +13,21 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from benchmarks.random_worlds.fusing import fuse
+from benchmarks.random_worlds.mesh import Array, Mesh, together
+from benchmarks.random_worlds.models import part_of_world, read_catalog
+from benchmarks.random_worlds.placing import draw_box
+from benchmarks.random_worlds.walks import LENGTHS, Length, World, make_world
 from benchmarks.robust.library_objects import GIVEN
 from benchmarks.worlds.objects import ObjectKind, ObjectMaker
 from benchmarks.worlds.observing import cameras_of_walk, observation_of_walk
 from benchmarks.worlds.recipe import FROM_IMAGES, RENDERED, Scene, Seen, see
 from regnf_core.errors import RegnfError
 from regnf_core.geometry.pinhole import PinholeCameras
-from regnf_core.schema.observation_grid import ObservationGrid
-from regnf_data.worlds.detections import draw_box
-from regnf_data.worlds.fusing import fuse
-from regnf_data.worlds.mesh import Array, Mesh, together
-from regnf_data.worlds.models import read_catalog
-from regnf_data.worlds.rooms import World, make_world
-from regnf_data.worlds.split import part_of_world
-from regnf_data.worlds.walks import LENGTHS, Length
+from regnf_core.schema.description import ObservationGrid
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.fusion import fuse_images
-from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.options import ReconstructionOptions
 
 WORLD, SCENE, CAMERAS = "world.json", "scene.safetensors", "cameras.npz"
 MAX_CASES = 8

@@ -11,20 +11,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.random_worlds.fusing import Fusion, capture, draw_matter, fuse, write_dense
+from benchmarks.random_worlds.mesh import Array, ExactScene
+from benchmarks.random_worlds.models import Model
+from benchmarks.random_worlds.symmetries import measure_symmetries
+from benchmarks.random_worlds.walks import World
 from benchmarks.worlds.recipe import Seen, orbit_sensor, see
 from regnf_core.errors import RegnfError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
-from regnf_data.bad_view import half_view
+from regnf_core.fields.observation import SdfField
+from regnf_data.composing import half_view
 from regnf_data.trajectories import orbit
-from regnf_data.worlds.capture import capture
-from regnf_data.worlds.exact import ExactScene
-from regnf_data.worlds.fusing import Fusion, fuse, write_dense
-from regnf_data.worlds.mesh import Array
-from regnf_data.worlds.models import Model
-from regnf_data.worlds.rooms import World
-from regnf_data.worlds.sensors import draw_matter
-from regnf_data.worlds.symmetries import measure_symmetries
 
 ObjectKind = Literal["mesh", "orbit", "cut"]
 OBJECT_KINDS: tuple[ObjectKind, ...] = ("mesh", "orbit", "cut")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.observation import Observation
+from benchmarks.random_worlds.fusing import Capture
+from benchmarks.random_worlds.mesh import Array
+from regnf_core.fields.observation import Observation, SdfField
 from regnf_core.geometry.pinhole import PinholeCameras
-from regnf_core.schema.observation_grid import SURFACE
+from regnf_core.schema.description import SURFACE
 from regnf_core.surface.observing import observe_by_cameras
-from regnf_data.worlds.capture import Capture
-from regnf_data.worlds.mesh import Array
 from regnf_fit.images.observing import observe
 
 _CARVING = 36

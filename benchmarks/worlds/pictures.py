@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.random_worlds.mesh import Array, ExactScene
+from benchmarks.random_worlds.walks import World
 from regnf_data.rendering import Size, intrinsics_of
 from regnf_data.trajectories import look_at
-from regnf_data.worlds.exact import ExactScene
-from regnf_data.worlds.mesh import Array
-from regnf_data.worlds.rooms import World
 
 _SIZE: Size = (480, 640)
 _FIELD_OF_VIEW_DEG = 72.0

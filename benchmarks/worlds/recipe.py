@@ -8,16 +8,22 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from benchmarks.random_worlds.fusing import (
+    LARGEST_DENSE,
+    Capture,
+    Fusion,
+    RandomSensor,
+    capture,
+    draw_drift,
+    draw_matter,
+    draw_sensor,
+    drifted,
+    rendered_sensor,
+)
+from benchmarks.random_worlds.mesh import Array, ExactScene
+from benchmarks.random_worlds.walks import LENGTHS, Length, World, walk
 from regnf_core.errors import DatasetError
 from regnf_data.rendering import Size
-from regnf_data.worlds.capture import Capture, capture
-from regnf_data.worlds.drift import draw_drift, drifted
-from regnf_data.worlds.exact import ExactScene
-from regnf_data.worlds.fusing import LARGEST_DENSE, Fusion
-from regnf_data.worlds.mesh import Array
-from regnf_data.worlds.rooms import World
-from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor, rendered_sensor
-from regnf_data.worlds.walks import LENGTHS, Length, walk
 
 Scene = Literal["tsdf", "rendered", "fused", "rendered-fused", "fit", "rendered-fit", "under-trained", "mesh", "bent"]
 SCENES: tuple[Scene, ...] = get_args(Scene)

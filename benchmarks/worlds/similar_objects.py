@@ -13,12 +13,12 @@ import torch
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from benchmarks.random_worlds.mesh import Array, Mesh
+from benchmarks.random_worlds.models import BIG_M, Catalog
 from benchmarks.worlds.cases import WorldCase
 from benchmarks.worlds.making import WORLD, read_object_mesh, similarity
 from regnf_core import Sim3
 from regnf_core.fields.mesh import MeshField
-from regnf_data.worlds.mesh import Array, Mesh
-from regnf_data.worlds.models import BIG_M, Catalog
 
 SIMILAR = "similar"
 _DRAWN = 24

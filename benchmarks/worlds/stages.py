@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from regnf_core import RegistrationOptions, Sim3
-from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.geometry.metrics import Symmetries
 from regnf_core.robust import pipeline
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates

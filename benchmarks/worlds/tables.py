@@ -9,9 +9,9 @@ from typing import Any
 
 from scipy.stats import beta
 
+from benchmarks.random_worlds.walks import LENGTHS
 from benchmarks.robust.ellipsoid import calibration
 from benchmarks.robust.judging import SUCCESS
-from regnf_data.worlds.walks import LENGTHS
 
 Run = dict[str, Any]
 _CONFIDENCE = 0.95

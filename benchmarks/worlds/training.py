@@ -31,8 +31,8 @@ from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.reliability import reliability_diagram
 from benchmarks.worlds.similar_objects import SIMILAR
 from regnf_core.robust.constants import VERDICT
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG, ProbabilityModel
+from regnf_core.robust.verdict.answer import LEAD, SPEAKS_FOR_AMONG, ProbabilityModel
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 Array = NDArray[np.float64]
 LeftOut = Literal["world", "part"]
@@ -183,7 +183,7 @@ def _group(row: dict[str, Any], left_out: LeftOut) -> str | int:
 
 
 def _leads(rows: Sequence[dict[str, Any]], odds: Array) -> Array:
-    """(N,) as :func:`regnf_core.robust.verdict.lead.leads` has them, from each row's score and ``others``."""
+    """(N,) as :func:`regnf_core.robust.verdict.answer.leads` has them, from each row's score and ``others``."""
     merits = odds - VERDICT.log_odds_per_score * np.array([row["score"] for row in rows])
     best = [max((merits[number + step] for step in row["others"]), default=-np.inf) for number, row in enumerate(rows)]
     return np.clip(merits - np.array(best), -VERDICT.most_lead, VERDICT.most_lead)

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from benchmarks.random_worlds.mesh import Array
 from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.cases import WorldCase, cases_of
 from benchmarks.worlds.making import WORLD
 from benchmarks.worlds.running import Run, Way
 from regnf_core import RegnfError, Sim3, register
-from regnf_core.robust.sampling import sample_scene_surface
-from regnf_data.worlds.mesh import Array
+from regnf_core.robust.working_frame import sample_scene_surface
 
 _PANEL = 340
 """Pixels along a panel's edge."""

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
+from typing import Literal
 
-from regnf_cli.checks.finding import Finding
-from regnf_cli.extras import MODULES
+from regnf_cli.guard import MODULES
 from regnf_core import __version__
+
+# What a check has found.
+
+State = Literal["ok", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """subject: what was looked at · state: a warning leaves regnf usable, an error does not · hint: how to mend it."""
+
+    subject: str
+    state: State
+    found: str
+    hint: str | None = None
+
 
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)(?:\[[^\]]*\])?\s*([^;]*)(?:;(.*))?$")
 _EXTRA = re.compile(r"extra\s*==\s*['\"](\w+)['\"]")
@@ -113,3 +133,48 @@ def _load(module: str) -> Finding:
     missing = next((package for library, package in _SYSTEM.items() if library in last), None)
     hint = f"apt-get install {missing}" if missing else f"Install it again: pip install --force-reinstall {module}"
     return Finding(module, "error", last, hint)
+
+
+# The GPU: whether torch can use one that is there.
+
+_ASK = (
+    "import torch; print(torch.cuda.get_device_name(0) if torch.cuda.is_available() else '', torch.version.cuda or '')"
+)
+_S = 120
+
+
+def check_gpu() -> Finding:
+    """regnf needs none; a GPU that lies idle is a warning."""
+    if find_spec("torch") is None:
+        return Finding("gpu", "ok", "not looked for: torch is not installed")
+    done = subprocess.run([sys.executable, "-c", _ASK], capture_output=True, text=True, timeout=_S, check=False)
+    name, _, cuda = done.stdout.strip().rpartition(" ") if done.returncode == 0 else ("", "", "")
+    if name:
+        return Finding("gpu", "ok", f"{name}, CUDA {cuda}")
+    if shutil.which("nvidia-smi") is None:
+        return Finding("gpu", "ok", "none; everything runs on the processor")
+    hint = "Install a torch that is built for your CUDA: pytorch.org has the command. regnf works without it, slower."
+    return Finding("gpu", "warning", "there is an NVIDIA driver, but torch cannot use the GPU", hint)
+
+
+# The native evaluator: whether fields are evaluated by compiled code or with torch.
+
+_SUBJECT = "evaluator"
+_SLOWER = "Registrations take 30 to 50 percent longer than with it."
+_BUILD = "With a C compiler (apt-get install gcc libc6-dev) it is built when regnf is installed."
+
+
+def check_native() -> Iterator[Finding]:
+    """One finding where the engine is installed. To be without compiled code is no fault."""
+    if importlib.util.find_spec("torch") is None:
+        return
+    from regnf_core.fields.native.library import NOT_BUILT, SWITCH, load
+
+    found = load()
+    if os.environ.get(SWITCH) == "0":
+        yield Finding(_SUBJECT, "ok", f"torch: compiled code is off, {SWITCH} is 0", _SLOWER)
+    elif found.fastest is None:
+        hint = f"{_SLOWER} {_BUILD}" if found.fault == NOT_BUILT else _SLOWER
+        yield Finding(_SUBJECT, "ok", f"torch: compiled code {found.fault}", hint)
+    else:
+        yield Finding(_SUBJECT, "ok", f"compiled code, {found.fastest.name}")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import httpx
 
-from regnf_cli.checks.finding import Finding
+from regnf_cli.checks.libraries import Finding
 from regnf_state.settings import Settings
 
 _GIB = 1 << 30

@@ -8,12 +8,11 @@ from pathlib import Path
 
 from redis.exceptions import RedisError
 
-from regnf_cli.checks.finding import Finding
+from regnf_cli.checks.libraries import Finding
 from regnf_cli.embedded_redis import server_binary
 from regnf_core.errors import RegnfError
-from regnf_state.blobs.open import open_blobs
-from regnf_state.redis.address import redis_address
-from regnf_state.redis.client import connect
+from regnf_state.blobs.local import open_blobs
+from regnf_state.redis.client import connect, redis_address
 from regnf_state.settings import Settings
 
 _WAIT_S = 2.0

@@ -5,8 +5,7 @@ Torch-free: the command line and the HTTP interface check a box before any field
 
 from __future__ import annotations
 
-from regnf_core.detections.bounds import Bounds, require_in_scene
-from regnf_core.detections.detection import Detection
+from regnf_core.detections.bounds import Bounds, Detection, require_in_scene
 from regnf_core.detections.parsing import parse_detection
 
 __all__ = ["Bounds", "Detection", "parse_detection", "require_in_scene"]

@@ -15,29 +15,223 @@ height along z) and its rotation is w, x, y, z.
 
 from __future__ import annotations
 
+import math
+import os
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
-from regnf_core.detections.detection import Detection
-from regnf_core.detections.names import (
-    CANONICAL,
-    FORMS,
-    INSTEAD,
-    NUSCENES_EXTRA,
-    NUSCENES_LABELS,
-    NUSCENES_NAMES,
-    NUSCENES_SCORES,
-    OPEN3D_EXTRA,
-    OPEN3D_NAMES,
-    ROTATIONS,
+from regnf_core.detections.bounds import Detection, Place, edges, fault, number, numbers, point, shown
+from regnf_core.errors import InvalidDetectionError, suggestion
+from regnf_core.library_entries import LABEL_PATTERN
+from regnf_core.rotations import IDENTITY, Quaternion, determinant, orthonormality_error, quaternion_of
+
+# The names that a detection's members have in the wild: those that are taken, and what to write for the others.
+
+CANONICAL = {
+    "center": "center",
+    "centre": "center",
+    "size": "size",
+    "extent": "size",  # Open3D
+    "extents": "size",  # trimesh
+    "rotation": "rotation",
+    "R": "rotation",  # Open3D
+    "rotation_matrix": "rotation",
+    "rotation_quaternion_xyzw": "rotation_quaternion_xyzw",
+    "rotation_quaternion_wxyz": "rotation_quaternion_wxyz",
+    "min": "min",
+    "min_bound": "min",  # Open3D
+    "max": "max",
+    "max_bound": "max",  # Open3D
+    "label": "label",
+    "score": "score",
+}
+"""Each name that is taken, and the member that it stands for."""
+
+ROTATIONS = ("rotation", "rotation_quaternion_xyzw", "rotation_quaternion_wxyz")
+
+OPEN3D_NAMES = frozenset({"extent", "R", "min_bound", "max_bound"})
+OPEN3D_EXTRA = frozenset({"class_name", "color", "version_major", "version_minor"})
+"""Members of Open3D's documents that say nothing about the box."""
+
+NUSCENES_NAMES = frozenset({"translation", "size", "rotation"})
+"""Together they name nuScenes' form."""
+NUSCENES_LABELS = ("detection_name", "tracking_name", "category_name")
+NUSCENES_SCORES = ("detection_score", "tracking_score")
+NUSCENES_EXTRA = frozenset(
+    {
+        "token",
+        "sample_token",
+        "instance_token",
+        "visibility_token",
+        "attribute_tokens",
+        "attribute_name",
+        "tracking_id",
+        "velocity",
+        "ego_translation",
+        "num_pts",
+        "num_lidar_pts",
+        "num_radar_pts",
+        "prev",
+        "next",
+    }
 )
-from regnf_core.detections.numbers import Place, edges, fault, number, point, shown
-from regnf_core.detections.rotation_forms import read_quaternion, read_rotation
-from regnf_core.detections.several import chosen
-from regnf_core.hints import suggestion
-from regnf_core.labels import LABEL_PATTERN
-from regnf_core.rotations import IDENTITY, Quaternion
+"""Members of nuScenes' records that say nothing about the box."""
+
+_ORDER = (
+    "Say the order of the quaternion: `rotation_quaternion_xyzw` (ROS, SciPy) or `rotation_quaternion_wxyz` (Eigen's "
+    "constructor, nuScenes, COLMAP)."
+)
+_TURN = "A rotation by the angle a about z is `rotation_quaternion_xyzw`: [0, 0, sin(a/2), cos(a/2)]."
+_HALF = "Write `size`: the full edge lengths, twice these."
+_CORNERS = "Write the lowest and the highest corner: `min`: [x, y, z] and `max`: [x, y, z]."
+INSTEAD = {
+    "quaternion": _ORDER,
+    "rotation_quaternion": _ORDER,
+    "orientation": _ORDER,
+    "quat": _ORDER,
+    "qvec": _ORDER,
+    "yaw": _TURN,
+    "heading": _TURN,
+    "rotation_y": _TURN,
+    "rotation_z": _TURN,
+    "angle": _TURN,
+    "euler": "Write `rotation` as a 3x3 matrix: Euler angles do not say their order.",
+    "half_extents": _HALF,
+    "half_extent": _HALF,
+    "half_size": _HALF,
+    "dimensions": "Datasets order dimensions differently. Write `size`: [x, y, z], the full edge lengths.",
+    "wlh": "Write `size`: [x, y, z], the full edge lengths; for nuScenes' boxes that is [length, width, height].",
+    "lwh": "Write `size`: [x, y, z], the full edge lengths along the box's own axes.",
+    "hwl": "Write `size`: [x, y, z], the full edge lengths along the box's own axes.",
+    "bounds": _CORNERS,
+    "bbox": _CORNERS,
+    "box": _CORNERS,
+    "aabb": _CORNERS,
+    "corners": _CORNERS,
+    "vertices": _CORNERS,
+    "lower": "Did you mean `min`?",
+    "upper": "Did you mean `max`?",
+    "position": "Did you mean `center`?",
+    "location": "Did you mean `center`?",
+    "translation": "Did you mean `center`? nuScenes' form has `translation`, `size` [width, length, height] and "
+    "`rotation` [w, x, y, z], all three.",
+    "class": "Did you mean `label`?",
+    "name": "Did you mean `label`?",
+    "category": "Did you mean `label`?",
+    "confidence": "Did you mean `score`?",
+    "probability": "Did you mean `score`?",
+}
+"""What to write for names that are not taken: most of them do not say enough."""
+
+FORMS = (
+    'Write {"min": [x, y, z], "max": [x, y, z]} or {"center": [x, y, z], "size": [x, y, z], "rotation": [[3], [3], '
+    "[3]]}, in the scene's frame and units. docs/api.md lists every form."
+)
+
+
+# A detection's rotation: a 3x3 matrix, or a quaternion that says its order.
+
+MAX_COMPONENT = 1e3
+MAX_ORTHONORMALITY_ERROR = 1e-3
+"""Largest entry of |R R^T - I|: matrices written with four digits pass."""
+_MIN_NORM = 1e-6
+_ROWS = "Write three rows of three numbers; the columns are the box's axes in the scene."
+
+
+def read_quaternion(value: Any, place: Place, order: str) -> Quaternion:
+    """A quaternion whose components come in ``order``, as x, y, z, w."""
+    components = dict(zip(order, numbers(value, place, order, MAX_COMPONENT), strict=True))
+    if math.hypot(*components.values()) < _MIN_NORM:
+        raise fault(place, "is zero, expected a quaternion with a direction", "Leave it out for an upright box.")
+    return components["x"], components["y"], components["z"], components["w"]
+
+
+def read_rotation(value: Any, place: Place) -> Quaternion:
+    """The quaternion (x, y, z, w) of `rotation`: three rows, or an object {x, y, z, w}."""
+    if isinstance(value, Mapping):
+        return read_quaternion(value, place, "xyzw")
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise fault(place, f"is {shown(value)}, expected a 3x3 matrix", _ROWS)
+    if len(value) == 4 and not any(isinstance(part, Sequence) for part in value):
+        raise _either_order(value, place)
+    if len(value) != 3 or not all(isinstance(row, Sequence) and len(row) == 3 for row in value):
+        raise fault(place, f"is {shown(value)}, expected a 3x3 matrix", _ROWS)
+    rows = [[number(part, (*place, i, j), MAX_COMPONENT) for j, part in enumerate(row)] for i, row in enumerate(value)]
+    _require_rotation(rows, place)
+    identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    return IDENTITY if rows == identity else quaternion_of(rows)
+
+
+def _either_order(value: Sequence[Any], place: Place) -> Exception:
+    listed = ", ".join(f"{number(part, (*place, i), MAX_COMPONENT):g}" for i, part in enumerate(value))
+    hint = (
+        f"Write `rotation_quaternion_xyzw`: [{listed}] if the last number is w, "
+        f"`rotation_quaternion_wxyz`: [{listed}] if the first one is."
+    )
+    return fault(place, f"is four numbers, [{listed}]: a quaternion of unknown order", hint)
+
+
+def _require_rotation(rows: Sequence[Sequence[float]], place: Place) -> None:
+    error = orthonormality_error(rows)
+    if error > MAX_ORTHONORMALITY_ERROR:
+        hint = "Its rows must be perpendicular and of length 1: keep the scale in `size`, and write more digits."
+        raise fault(place, f"is no rotation: R R^T differs from the identity by {error:.2g}", hint)
+    if determinant(rows) < 0:
+        hint = "Negate one column: a box looks the same, and its axes are right-handed then."
+        raise fault(place, "is a reflection, of determinant -1, expected a rotation, of determinant 1", hint)
+
+
+# A document with several detections: which one is meant is asked, never guessed.
+
+_LISTS = ("detections", "boxes", "objects", "predictions", "results")
+_MAX_LISTED = 5
+
+
+def chosen(values: Any, index: int | None) -> Any:
+    """The one detection of a document: all of it, or the entry ``index`` of its list. Raises InvalidDetectionError."""
+    name, entries = _entries(values)
+    if entries is None:
+        if index is not None:
+            raise fault((), f"is a single box, and the entry {index} was asked for", "Leave the index out.")
+        return values
+    if not entries:
+        raise fault((name,) if name else (), "is an empty list, expected a box", FORMS)
+    if index is None:
+        raise _ambiguous(name, entries)
+    if not 0 <= index < len(entries):
+        last = len(entries) - 1
+        raise fault((name,) if name else (), f"has no entry {index}", f"Choose one of 0 to {last}.")
+    return entries[index]
+
+
+def _entries(values: Any) -> tuple[str | None, list[Any] | None]:
+    """The list of detections in a document, and the member that holds it."""
+    if isinstance(values, list) and (not values or any(isinstance(entry, Mapping) for entry in values)):
+        return None, values
+    if isinstance(values, Mapping):
+        for name in _LISTS:
+            if isinstance(values.get(name), list):
+                return name, values[name]
+    return None, None
+
+
+def _ambiguous(name: str | None, entries: Sequence[Any]) -> InvalidDetectionError:
+    listed = ", ".join(f"{number}: {_summary(entry)}" for number, entry in enumerate(entries[:_MAX_LISTED]))
+    more = f" and {len(entries) - _MAX_LISTED} more" if len(entries) > _MAX_LISTED else ""
+    count = "1 detection" if len(entries) == 1 else f"{len(entries)} detections"
+    hint = f"Give the entry alone, without the list; at the command line --detection-index chooses it. {listed}{more}"
+    return fault((name,) if name else (), f"is a list of {count}, expected one box", hint)
+
+
+def _summary(entry: Any) -> str:
+    if not isinstance(entry, Mapping):
+        return shown(entry)
+    label = next((entry[key] for key in ("label", "detection_name", "class", "name") if key in entry), None)
+    score = next((entry[key] for key in ("score", "detection_score", "confidence") if key in entry), None)
+    words = [shown(value) for value in (label, score) if isinstance(value, str | int | float)]
+    return " ".join(words) or "a box"
+
 
 _MAX_LABEL = 200
 _LABEL = re.compile(LABEL_PATTERN)
@@ -158,3 +352,76 @@ def _labels(found: Mapping[str, Any]) -> dict[str, Any]:
         hint = "Divide a percentage by 100." if 1 < score <= 100 else None
         raise fault(("score",), f"is {shown(score)}, expected a number from 0 to 1", hint)
     return {"label": label, "score": None if score is None else float(score)}
+
+
+# Boxes as other libraries have them: read by their attributes, so that none of these is needed here.
+
+_ORIENTED = ("center", "extent", "R")
+_ALIGNED = ("min_bound", "max_bound")
+
+
+class HasDetection(Protocol):
+    """A box of this library."""
+
+    def to_detection(self) -> Detection: ...
+
+
+class Open3DOrientedBox(Protocol):
+    """Open3D's OrientedBoundingBox."""
+
+    @property
+    def center(self) -> Any: ...
+    @property
+    def extent(self) -> Any: ...
+    @property
+    def R(self) -> Any: ...  # noqa: N802 -- Open3D's name
+
+
+class Open3DAlignedBox(Protocol):
+    """Open3D's AxisAlignedBoundingBox."""
+
+    @property
+    def min_bound(self) -> Any: ...
+    @property
+    def max_bound(self) -> Any: ...
+
+
+BoxLike = (
+    HasDetection
+    | Open3DOrientedBox
+    | Open3DAlignedBox
+    | Detection
+    | Mapping[str, Any]
+    | Sequence[Any]
+    | os.PathLike[str]
+)
+"""A box, an Open3D box, a detection's JSON in any of its forms or its file's path, or a lowest and a highest corner."""
+
+
+def detection_of(box: Any) -> Detection:
+    """The detection that a box of any kind stands for. Raises InvalidDetectionError with what to write instead."""
+    if isinstance(box, Detection):
+        return box
+    if callable(getattr(box, "to_detection", None)):
+        found: Detection = box.to_detection()
+        return found
+    for names in (_ORIENTED, _ALIGNED):
+        if _is_open3d(box, names):
+            return parse_detection({name: getattr(box, name) for name in names})
+    return parse_detection(box)
+
+
+def open3d_detection(box: Any) -> Detection:
+    """The same of an Open3D box alone. Raises InvalidDetectionError for anything else."""
+    if isinstance(box, Mapping) or not any(
+        all(hasattr(box, name) for name in names) for names in (_ORIENTED, _ALIGNED)
+    ):
+        hint = (
+            "Give an OrientedBoundingBox or an AxisAlignedBoundingBox; OrientedBox.from_dict takes a detection's JSON."
+        )
+        raise InvalidDetectionError(f"a {type(box).__name__} is no box of Open3D", hint=hint)
+    return detection_of(box)
+
+
+def _is_open3d(box: Any, names: Sequence[str]) -> bool:
+    return not isinstance(box, Mapping) and all(hasattr(box, name) for name in names)

@@ -2,19 +2,220 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, label
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from regnf_core.editing.ground import Ground, ground_of
-from regnf_core.editing.neighbors import kept_neighbors, near_thing
-from regnf_core.editing.placed_object import PlacedObject
-from regnf_core.editing.region import GridDistance, box_distance
-from regnf_core.editing.support import support_planes
-from regnf_core.fields.base import SdfField
+from regnf_core.editing.region import GridDistance, Mask, RegionGrid, box_distance
+from regnf_core.editing.support import PlacedObject, SupportPlane, support_planes
+from regnf_core.fields.observation import SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.schema.description import SURFACE
+
+# The surface of a support, as heights above its plane: as the scene has it, and continued where a thing stood.
+
+Heights = NDArray[np.float64]
+_ALONG = 64
+"""Cells along the longer side of the box's footprint."""
+_TOLERANCE = 0.02
+"""Of the box's diagonal: heights beyond it are no longer the support's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Heights over a plane in a rectangle round a box's footprint.
+
+    origin: (3,), the middle of the first cell, on the plane · axes: (2, 3) unit, within it · cell: edge · heights:
+    (A, B) float32 · missing: (A, B) distance to where the support goes on, 0 or less there; scene units.
+    """
+
+    plane: SupportPlane
+    origin: Tensor
+    axes: Tensor
+    cell: float
+    heights: Tensor
+    missing: Tensor
+
+    def distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N,) of points (N, 3) to the support's matter, about, and the gradient (N, 3)."""
+        at = (points - self.origin.to(points)) @ self.axes.to(points).T / self.cell
+        height, slope = _sampled(self.heights, at)
+        missing, away = _sampled(self.missing, at)
+        above = self.plane.height(points) - height
+        gradient = self.plane.normal.to(points) - (slope / self.cell) @ self.axes.to(points)
+        beside = missing > above
+        gradient = torch.where(beside[:, None], (away / self.cell) @ self.axes.to(points), gradient)
+        return torch.maximum(above, missing), gradient
+
+
+def ground_of(
+    scene: SdfField, plane: SupportPlane, box: OrientedBox, belongs: Callable[[Tensor], Tensor] | None
+) -> Ground | None:
+    """The support in and round ``box``; None where the scene has nothing of it there.
+
+    belongs: tells of points (N, 3) whether they are of the thing, or so near to it that the surface there may be its
+    own; None: that is not known. Heights are known where the scene's surface is near the plane, nothing stands on it,
+    and it is not the thing's; between, they solve Laplace's equation: a membrane fixed at what is known. A place that
+    is free at the plane, and not enclosed by known ones, has no support: a table's top ends.
+    """
+    origin, axes, cell, counts = _rectangle(plane, box)
+    index = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) for n in counts))
+    points = (origin + cell * index @ axes).float()
+    distance = scene.signed_distance(points.to(scene.device)).double().cpu().numpy().reshape(counts)
+    low, high = scene.bounds
+    outside = ~((points >= low) & (points <= high)).all(-1).numpy().reshape(counts)
+    own = np.zeros(counts, bool) if belongs is None else belongs(points).cpu().numpy().reshape(counts)
+    tolerance = max(_TOLERANCE * box.diagonal, 4.0 * plane.roughness)
+    above = (points + 1.5 * tolerance * plane.normal.float()).to(scene.device)
+    bare = (scene.signed_distance(above) >= 0.75 * tolerance).cpu().numpy().reshape(counts)
+    known = (np.abs(distance) <= tolerance) & bare & ~own & ~outside
+    if known.sum() < 0.02 * known.size:
+        return None
+    free = (distance > tolerance) & ~own
+    there = binary_fill_holes(~free) & ~outside
+    heights = _membrane(np.where(known, -distance, 0.0), known)
+    missing = np.full(counts, -1e3 * cell) if there.all() else _signed(there, cell)
+    tensors = (torch.from_numpy(values.astype(np.float32)) for values in (heights, missing))
+    return Ground(plane, origin, axes, cell, *tensors)
+
+
+def _rectangle(plane: SupportPlane, box: OrientedBox) -> tuple[Tensor, Tensor, float, tuple[int, int]]:
+    """Origin (3,), axes (2, 3), cell and counts of a grid on the plane that covers the box seen along its normal."""
+    n = plane.normal
+    along = box.rotation[:, int((box.rotation.T @ n).abs().argmin())]
+    first = torch.nn.functional.normalize(along - (along @ n) * n, dim=0)
+    axes = torch.stack([first, torch.linalg.cross(n, first)])
+    corners = box.corners() @ axes.T
+    low, high = corners.amin(0), corners.amax(0)
+    cell = float((high - low).max()) / (_ALONG - 4)
+    low, high = low - 2 * cell, high + 2 * cell
+    a, b = (int(count) + 1 for count in ((high - low) / cell).ceil().tolist())
+    return plane.offset * n + low @ axes, axes, cell, (a, b)
+
+
+def _signed(there: Mask, cell: float) -> Heights:
+    signed: Heights = (distance_transform_edt(~there) - distance_transform_edt(there)) * cell
+    return signed - 0.5 * cell * np.sign(signed)
+
+
+def _membrane(values: Heights, known: Mask) -> Heights:
+    """Values (A, B) where known; elsewhere each is the mean of its neighbors."""
+    number = np.full(values.shape, -1)
+    unknown = ~known
+    number[unknown] = np.arange(int(unknown.sum()))
+    if not unknown.any():
+        return values
+    rows, columns, weights = [], [], []
+    right = np.zeros(int(unknown.sum()))
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        inside = np.ones(values.shape, bool)
+        inside[(slice(None),) * axis + ((-1 if step == 1 else 0),)] = False
+        here = unknown & inside
+        there = np.roll(number, -step, axis)[here]
+        me = number[here]
+        between = there >= 0
+        rows += [me, me[between]]
+        columns += [me, there[between]]
+        weights += [np.ones(len(me)), -np.ones(int(between.sum()))]
+        np.add.at(right, me[~between], np.roll(values, -step, axis)[here][~between])
+    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+    matrix = coo_matrix(entries, shape=(len(right), len(right))).tocsr()
+    solved = values.copy()
+    solved[unknown] = spsolve(matrix, right)
+    return solved
+
+
+def _sampled(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear values (N,) at places (N, 2) in cells, and their slopes (N, 2) a cell; constant beyond the grid."""
+    values = values.to(at.device)
+    most = torch.tensor(values.shape, device=at.device) - 1
+    within = at.clamp_min(0.0).minimum(most.to(at))
+    low = within.floor().long().minimum(most - 1)
+    x, y = low.unbind(-1)
+    u, v = (within - low).unbind(-1)
+    a, b, c, d = values[x, y], values[x + 1, y], values[x, y + 1], values[x + 1, y + 1]
+    value = (1 - u) * (1 - v) * a + u * (1 - v) * b + (1 - u) * v * c + u * v * d
+    slope = torch.stack([(1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)], dim=-1)
+    return value, slope
+
+
+# What reaches into a thing's box without being of it: a table's top over a chair, a wall, a thing beside it.
+
+_ALONG_THE_SURFACE, _AROUND = 72, 1.3
+"""Cells along the longest edge, and how much larger than the box their region is."""
+_LEAST_CELLS = 24
+_LEAST_OUTSIDE = 0.3
+"""Share of a component outside of the box from which on it is a neighbor, where the box alone says what is removed."""
+_KEPT_AROUND = 2
+"""Cells round a neighbor's surface that are kept with it."""
+
+
+def kept_neighbors(
+    scene: SdfField, box: OrientedBox, planes: Sequence[SupportPlane], of_thing: Callable[[Tensor], Tensor] | None
+) -> GridDistance | None:
+    """The signed distance to what is kept in ``box``, negative there; None where nothing is.
+
+    of_thing: tells of points (N, 3) whether they are near the thing's known surface; None: it is not known.
+    The scene's matter is divided into connected components, without supports and without what is the thing's. Those
+    that go on outside of the box are neighbors; the rest is taken for the thing's, or for noise. Where the scene knows
+    what was observed, only what was measured counts: unobserved matter behind a thing is not kept.
+    """
+    around = OrientedBox(box.center, box.size * _AROUND, box.rotation)
+    grid = RegionGrid.over(around, _ALONG_THE_SURFACE)
+    points = grid.points()
+    distance = grid.cube(scene.signed_distance(points.to(scene.device)))
+    matter = (distance < 0.25 * grid.cell) & (distance > -_KEPT_AROUND * 2 * grid.cell)
+    thickness = 1.5 * grid.cell
+    for plane in planes:
+        matter &= grid.cube(plane.height(points)) > max(thickness, 4.0 * plane.roughness)
+    if of_thing is not None:
+        matter &= ~_mask(grid, of_thing(points))
+    measured = _measured(scene, grid, points)
+    if measured is not None:
+        matter &= measured
+    inside = _mask(grid, box_distance(box, points) < 0.0)
+    kept = _going_out(matter, inside, 1e-9 if of_thing is not None else _LEAST_OUTSIDE)
+    if not (kept & inside).any():
+        return None
+    return grid.distance_to(binary_dilation(kept, iterations=_KEPT_AROUND))
+
+
+def _mask(grid: RegionGrid, values: Tensor) -> Mask:
+    found: Mask = values.cpu().numpy().reshape(grid.shape)
+    return found
+
+
+def _measured(scene: SdfField, grid: RegionGrid, points: Tensor) -> Mask | None:
+    """Cells near a place where a surface was measured; None where that is not known."""
+    observation = observation_of(scene)
+    if observation is None:
+        return None
+    near = _mask(grid, observation.at(points) == SURFACE)
+    reach = max(1, round(observation.voxel / grid.cell))
+    return np.asarray(binary_dilation(near, iterations=reach))
+
+
+def _going_out(matter: Mask, inside: Mask, least_outside: float) -> Mask:
+    """The components of ``matter`` of which at least this share lies outside of the box."""
+    labels, count = label(matter, structure=np.ones((3, 3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    outside = np.bincount(labels[~inside], minlength=count + 1)
+    neighbor = (sizes >= _LEAST_CELLS) & (outside >= np.maximum(1, least_outside * sizes))
+    neighbor[0] = False
+    return np.asarray(neighbor[labels])
+
+
+def near_thing(thing: SdfField, margin: float) -> Callable[[Tensor], Tensor]:
+    """Tells of points (N, 3) whether they are in ``thing`` or nearer to it than ``margin``."""
+    return lambda points: thing.signed_distance(points.to(thing.device)).to(points.device) < margin
+
 
 _BOX_MARGIN = 0.05
 """How far beyond a thing's box its copy in the scene may reach, as a share of the box's diagonal."""

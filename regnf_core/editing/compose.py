@@ -2,27 +2,189 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from regnf_core.editing.clearing import Clearing, clear_box, clear_thing
 from regnf_core.editing.edited_scene import EditedScene
-from regnf_core.editing.edits import Edit, Insertion, Removal, Replacement, Substitution
-from regnf_core.editing.observed import observation_after
-from regnf_core.editing.overlap import Occupied, require_apart
-from regnf_core.editing.parts import Part, PartedField, Tint
-from regnf_core.editing.placed_object import PlacedObject
-from regnf_core.editing.standing import standing_alike
+from regnf_core.editing.edits import (
+    Edit,
+    Insertion,
+    Match,
+    Part,
+    PartedField,
+    Removal,
+    Replacement,
+    Substitution,
+    Tint,
+    invalid_edit,
+)
+from regnf_core.editing.support import PlacedObject
 from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.observation import observation_of
-from regnf_core.fields.transformed import near_origin
+from regnf_core.fields.composite import near_origin
+from regnf_core.fields.observation import Observation, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.surface.surface_bounds import surface_bounds
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
+from regnf_core.surface.sphere_tracing import axis_vector, surface_bounds
+
+if TYPE_CHECKING:
+    from regnf_core.editing.edited_scene import EditedScene
+
+
+# What counts as observed after the edits: there, everything does.
+
+
+def observation_after(known: Observation, edited: EditedScene) -> Observation:
+    """``known`` with the voxels of cleared places and of objects told from the edited scene: surface, free, or within
+    matter, which nobody sees."""
+    states = known.states.clone()
+    boxes = [clearing.box for clearing in edited.clearings] + [thing.box for _, thing in edited.objects]
+    for box in boxes:
+        index = _voxels_of(known, box)
+        if not len(index):
+            continue
+        points = _middles(known, index)
+        distance = edited.signed_distance(points.float()).double().cpu()
+        voxel = known.voxel if known.T_grid_frame is None else known.voxel / float(known.T_grid_frame.scale)
+        state = torch.where(distance > 0, FREE, UNSEEN)
+        state = torch.where(distance.abs() <= 0.5 * 3**0.5 * voxel, SURFACE, state).to(states.dtype)
+        x, y, z = index.unbind(-1)
+        states[x, y, z] = state
+    return replace(known, states=states)
+
+
+def _voxels_of(known: Observation, box: OrientedBox) -> Tensor:
+    """(M, 3) int64, the voxels whose middles lie in ``box`` of the scene's frame."""
+    corners = box.corners()
+    if known.T_grid_frame is not None:
+        corners = known.T_grid_frame.apply(corners)
+    cells = (corners - known.low) / known.voxel
+    low = cells.amin(0).floor().long().clamp_min(0)
+    high = torch.minimum(cells.amax(0).ceil().long(), torch.tensor(known.states.shape))
+    if bool((high <= low).any()):
+        return torch.zeros(0, 3, dtype=torch.int64)
+    index = torch.cartesian_prod(*(torch.arange(int(a), int(b)) for a, b in zip(low, high, strict=True)))
+    return index[box.contains(_middles(known, index))]
+
+
+def _middles(known: Observation, index: Tensor) -> Tensor:
+    """(M, 3) float64, the voxels' middles in the scene's frame."""
+    points = known.low + known.voxel * (index.double() + 0.5)
+    return points if known.T_grid_frame is None else known.T_grid_frame.inverse().apply(points)
+
+
+# Edits of one scene must not meddle with each other: each changes a place of its own.
+
+_POINTS = 12
+"""Along each edge of a box, to tell how much of two solids is common."""
+_MOST_COMMON = 0.05
+"""Share of the smaller of two objects' matter that may lie in the other: things touch, and poses are not exact."""
+_MOST_OF_BOX = 0.5
+"""Share of a thing's matter that may lie in a box that another edit clears."""
+
+Place = PlacedObject | OrientedBox
+
+
+@dataclass(frozen=True, eq=False)
+class Occupied:
+    """What one edit takes away and what it puts in."""
+
+    removed: Place | None
+    placed: PlacedObject | None
+
+
+def require_apart(edits: Sequence[Occupied]) -> None:
+    """Raises InvalidInputError (EDITS_OVERLAP): two edits take away the same thing, or put matter in one place."""
+    for (first, one), (second, other) in combinations(enumerate(edits), 2):
+        for a, b in _rivals(one, other):
+            most = _MOST_COMMON if isinstance(a, PlacedObject) and isinstance(b, PlacedObject) else _MOST_OF_BOX
+            if _common(a, b) > most:
+                message = f"edits {first} and {second} change the same place"
+                hint = "Leave one of them out, or make one after the other: an edited scene can be edited again."
+                raise InvalidInputError(message, reason="EDITS_OVERLAP", hint=hint)
+
+
+def _rivals(one: Occupied, other: Occupied) -> Iterator[tuple[Place, Place]]:
+    if one.removed is not None and other.removed is not None:
+        yield one.removed, other.removed
+    if one.placed is not None and other.placed is not None:
+        yield one.placed, other.placed
+
+
+def _common(a: Place, b: Place) -> float:
+    """The larger of the shares of each one's matter that lies in the other."""
+    if not _near(a, b):
+        return 0.0
+    return max(_share_within(a, b), _share_within(b, a))
+
+
+def _share_within(a: Place, b: Place) -> float:
+    points = _points(a)
+    return float(_within(b, points).float().mean()) if len(points) else 0.0
+
+
+def _points(place: Place) -> Tensor:
+    """Points (N, 3) spread over the matter of an object, or over a box."""
+    box = place.box if isinstance(place, PlacedObject) else place
+    steps = (torch.arange(_POINTS, dtype=torch.float64) + 0.5) / _POINTS - 0.5
+    points = (box.center + (torch.cartesian_prod(steps, steps, steps) * box.size) @ box.rotation.T).float()
+    if isinstance(place, OrientedBox):
+        return points
+    distance = place.signed_distance(points).cpu()
+    thin = float((box.size / _POINTS).norm()) / 2.0  # legs and plates fall between the points
+    return points[distance < (0.0 if int((distance < 0).sum()) >= _POINTS else thin)]
+
+
+def _within(place: Place, points: Tensor) -> Tensor:
+    if isinstance(place, OrientedBox):
+        return place.contains(points)
+    return place.signed_distance(points).cpu() < 0.0
+
+
+def _near(a: Place, b: Place) -> bool:
+    boxes = [place.box if isinstance(place, PlacedObject) else place for place in (a, b)]
+    distance = float((boxes[0].center - boxes[1].center).norm())
+    return distance <= 0.5 * (boxes[0].diagonal + boxes[1].diagonal)
+
+
+# Where a replacement stands: on the base of what stood there, upright, turned alike, as large.
+
+
+def standing_alike(
+    here: OrientedBox, replacement: OrientedBox, up_here: str, up_replacement: str, match: Match = "height"
+) -> Sim3:
+    """T_replacement_object: the middles of both bases coincide, and so do the verticals.
+
+    here, replacement: the boxes of both surfaces, each in its own frame, axis-aligned · match: which length becomes
+    equal, that along the vertical or that of the boxes' diagonals. Both keep their heading: the axis that follows the
+    vertical in the order x, y, z, x is taken to mean the same in both. Raises InvalidInputError (EDIT_INVALID).
+    """
+    frames = [_upright(up_here), _upright(up_replacement)]
+    sizes = [frame.abs().T @ box.size for frame, box in zip(frames, (here, replacement), strict=True)]
+    lengths = [float(size[2] if match == "height" else size.norm()) for size in sizes]
+    scale = torch.tensor(lengths[1] / lengths[0], dtype=torch.float64)
+    bases = [
+        box.center - frame[:, 2] * size[2] / 2.0
+        for box, frame, size in zip((here, replacement), frames, sizes, strict=True)
+    ]
+    rotation = frames[1] @ frames[0].T
+    return Sim3(scale, rotation, bases[1] - scale * (rotation @ bases[0]))
+
+
+def _upright(up: str) -> Tensor:
+    """(3, 3), columns: two level axes and the vertical, right-handed."""
+    if up.removeprefix("-") not in ("x", "y", "z"):
+        raise invalid_edit(f"the vertical is x, y or z, also with -, not {up[:20]!r}")
+    sign = -1.0 if up.startswith("-") else 1.0
+    first = axis_vector("xyz"[("xyz".index(up[-1]) + 1) % 3])
+    vertical = sign * axis_vector(up[-1])
+    return torch.stack([first, torch.linalg.cross(vertical, first), vertical], dim=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from regnf_core.editing.clearing import Clearing
-from regnf_core.editing.parts import SCENE_PART, Part, PartedField
-from regnf_core.editing.placed_object import PlacedObject
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.color import has_color, inverse_deviation_of
-from regnf_core.fields.observation import Observation
+from regnf_core.editing.edits import SCENE_PART, Part, PartedField
+from regnf_core.editing.support import PlacedObject
+from regnf_core.fields.observation import Observation, SdfField, has_color, inverse_deviation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 

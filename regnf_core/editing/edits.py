@@ -3,14 +3,60 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
-from regnf_core.editing.parts import Tint
+from torch import Tensor
+
+from regnf_core.detections import Detection
+from regnf_core.editing.request import (
+    EditRequest,
+    InsertionRequest,
+    RemovalRequest,
+    ReplacementRequest,
+    SubstitutionRequest,
+)
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
+
+# Fields that are made of several: whose matter is at a point.
+
+SCENE_PART = 0
+Tint = tuple[float, float, float]
+"""sRGB, each 0..1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One of the fields. T_field_scene: from the edited scene's frame to the field's own; None: the same · tint: what
+    it is colored with, None: its own colors · name: for people."""
+
+    field: SdfField
+    T_field_scene: Sim3 | None
+    tint: Tint | None = None
+    name: str | None = None
+
+
+@runtime_checkable
+class PartedField(Protocol):
+    """A field that knows which of its parts a point belongs to."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The scene, then an edit's object each; an edit that has none (a removal) has the scene's field."""
+        ...
+
+    def part_at(self, points: Tensor) -> Tensor:
+        """(N,) int64, which part's surface is nearest to points (N, 3)."""
+        ...
+
+    def signed_distance_and_part(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) at points (N, 3), and which part's surface is nearest (N,) int64."""
+        ...
+
 
 Match = Literal["height", "diagonal"]
 
@@ -119,3 +165,60 @@ class Insertion:
 
 
 Edit = Substitution | Replacement | Removal | Insertion
+
+
+# From a request's edits, with names, to edits with fields.
+
+
+def open_edits(requests: Sequence[EditRequest], open_object: Callable[[str], SdfField]) -> list[Edit]:
+    """The edits in the same order; ``open_object`` opens each named field once. Raises what it raises."""
+    opened: dict[str, SdfField] = {}
+
+    def field(name: str) -> SdfField:
+        if name not in opened:
+            opened[name] = open_object(name)
+        return opened[name]
+
+    return [_opened(request, field) for request in requests]
+
+
+def _opened(request: EditRequest, field: Callable[[str], SdfField]) -> Edit:
+    match request:
+        case SubstitutionRequest():
+            return Substitution(field(request.object), _transform(request.T_object_scene), **_common(request))
+        case ReplacementRequest():
+            known = request.T_replacement_object
+            return Replacement(
+                field(request.object),
+                _transform(request.T_object_scene),
+                field(request.replacement),
+                None if known is None else _transform(known),
+                request.match,
+                request.up_object,
+                request.up_replacement,
+                **_common(request),
+            )
+        case RemovalRequest():
+            known = request.T_object_scene
+            return Removal(
+                _box(request.detection),
+                None if request.object is None else field(request.object),
+                None if known is None else _transform(known),
+                request.residual,
+                request.name,
+            )
+        case InsertionRequest():
+            placed = _transform(request.T_object_scene)
+            return Insertion(field(request.object), placed, request.tint, request.name)
+
+
+def _common(request: SubstitutionRequest | ReplacementRequest) -> dict[str, Any]:
+    return {"residual": request.residual, "tint": request.tint, "name": request.name}
+
+
+def _transform(rows: list[list[float]]) -> Sim3:
+    return Sim3.from_matrix(rows)
+
+
+def _box(detection: Detection | None) -> OrientedBox | None:
+    return None if detection is None else OrientedBox.from_detection(detection)

@@ -1,6 +1,6 @@
 """Edits as a request says them, in plain (JSON) values. Torch-free: checked before any work begins.
 
-Objects and detections have names here; :mod:`regnf_core.editing.opening` turns a request's edits into those of
+Objects and detections have names here; :mod:`regnf_core.editing.edits` turns a request's edits into those of
 :mod:`regnf_core.editing.edits`.
 """
 
@@ -14,8 +14,8 @@ from pydantic import AfterValidator, BeforeValidator, Discriminator, FiniteFloat
 
 from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError
-from regnf_core.geometry.similarity_check import similarity_fault
 from regnf_core.rgb import Rgb
+from regnf_core.rotations import similarity_fault
 
 MOST_EDITS = 64
 _CONFIG: dict[str, Any] = {"extra": "forbid"}

@@ -12,14 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.color import ColoredField, has_color
-from regnf_core.fields.observation import observation_of
-from regnf_core.fields.transformed import near_origin
-from regnf_core.schema.color import COLOR, VALUES, ValueColor, color_tensors
-from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.fields.composite import near_origin
+from regnf_core.fields.observation import ColoredField, SdfField, has_color, observation_of
+from regnf_core.schema.description import COLOR, OBSERVATION, VALUES, ValueColor, color_tensors, moved_box, shift_rows
 from regnf_core.schema.safe_format import write_safe_field
-from regnf_core.schema.similarity import moved_box, shift_rows
 from regnf_core.surface.isosurface import Lattice
 
 _SLAB_POINTS = 1 << 18

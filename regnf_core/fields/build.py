@@ -4,42 +4,266 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from safetensors import safe_open
 from torch import Tensor
 
 from regnf_core.errors import InvalidOptionsError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.color_head import build_color_head
-from regnf_core.fields.feature_volumes import build_feature_volumes
-from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.grid_mlp import build_grid_mlp
-from regnf_core.fields.grid_network import build_grid_network
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.grid_mlp import BoxExtension, build_grid_mlp, build_grid_network
 from regnf_core.fields.mlp import build_mlp
 from regnf_core.fields.neural_points import build_neural_points
 from regnf_core.fields.neus_facto import build_neus_facto
-from regnf_core.fields.observation import ObservedField, stored_observation
+from regnf_core.fields.neus_facto_function import GeometryMlp
+from regnf_core.fields.observation import (
+    ColorFunction,
+    Observation,
+    ObservedField,
+    SdfField,
+    color_in_unit,
+    has_color,
+    inverse_deviation_of,
+    observation_of,
+    stored_observation,
+)
 from regnf_core.fields.onnx.graph import build_onnx
-from regnf_core.fields.scaled import ScaledField
-from regnf_core.fields.transformed import TransformedField
-from regnf_core.fields.voxel_blocks import build_voxel_blocks
-from regnf_core.fields.voxel_grid import build_voxel_grid
+from regnf_core.fields.user_fields import FunctionField
+from regnf_core.fields.voxel_blocks import (
+    build_voxel_blocks,
+    corner_offsets,
+    interpolate,
+    interpolate_colors,
+    interpolate_with_derivative,
+)
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.color import VALUES, NetworkColor, split_color
-from regnf_core.schema.description import FieldDescription
-from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription
-from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
-from regnf_core.schema.kinds.grid_network import GridNetworkDescription
-from regnf_core.schema.kinds.mesh import MeshDescription
-from regnf_core.schema.kinds.mlp import MlpDescription
-from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
-from regnf_core.schema.kinds.neus_facto import NeusFactoDescription
-from regnf_core.schema.kinds.onnx import OnnxDescription
-from regnf_core.schema.kinds.voxel_blocks import VoxelBlocksDescription
-from regnf_core.schema.kinds.voxel_grid import VoxelGridDescription
-from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.schema.description import OBSERVATION, VALUES, FieldDescription, NetworkColor, split_color
+from regnf_core.schema.kinds import (
+    FeatureVolumesDescription,
+    GridMlpDescription,
+    GridNetworkDescription,
+    MeshDescription,
+    MlpDescription,
+    NeuralPointsDescription,
+    NeusFactoDescription,
+    OnnxDescription,
+    VoxelBlocksDescription,
+    VoxelGridDescription,
+    count_volumes,
+)
 from regnf_core.schema.safe_format import read_header
+
+# Volumes of features from coarse to fine, summed and decoded: NGLOD's fields (Takikawa et al. 2021).
+
+
+@dataclass(frozen=True)
+class FeatureVolumesFunction:
+    """[x, sum of the volumes' features at x] -> ReLU network. Points are taken to be within [-1, 1]^3.
+
+    volumes[i]: (N, N, N, C), float32 or float16, first axis x; the first and last nodes lie on the cube's faces.
+    """
+
+    volumes: tuple[Tensor, ...]
+    mlp: GeometryMlp
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters live."""
+        return self.volumes[0].device
+
+    def to(self, device: torch.device | str) -> FeatureVolumesFunction:
+        """The same function with its parameters on another device."""
+        return replace(self, volumes=tuple(v.to(device) for v in self.volumes), mlp=self.mlp.to(device))
+
+    def value(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) at points (N, 3)."""
+        features = torch.stack([interpolate(*_corners(volume, points)) for volume in self.volumes]).sum(0)
+        return self.mlp(torch.cat((points, features), dim=-1))
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) at points (N, 3) and its gradient (N, 3), in closed form."""
+        width = self.volumes[0].shape[-1]
+        features, jacobian = points.new_zeros(len(points), width), points.new_zeros(3, len(points), width)
+        for volume in self.volumes:
+            level, derivative = interpolate_with_derivative(*_corners(volume, points))
+            features += level
+            jacobian += derivative * ((volume.shape[0] - 1) / 2.0)
+        distance, by_input = self.mlp.with_gradient(torch.cat((points, features), dim=-1))
+        return distance, by_input[:, :3] + (jacobian * by_input[:, 3:]).sum(dim=-1).T
+
+
+def build_feature_volumes(
+    description: FeatureVolumesDescription, tensors: Mapping[str, Tensor]
+) -> FunctionField[BoxExtension[FeatureVolumesFunction]]:
+    """The field of ``description`` with its parameters in ``tensors``, extended beyond the cube [-1, 1]^3.
+
+    Tensors keep their device; they must have passed :meth:`FeatureVolumesDescription.check_tensors`.
+    """
+    volumes = tuple(tensors[f"volumes.{i}"].contiguous() for i in range(count_volumes(tensors)))
+    function = FeatureVolumesFunction(volumes, GeometryMlp.from_tensors(tensors))
+    high = torch.ones(3, device=function.device)
+    bounds = torch.tensor(description.function_bounds, dtype=torch.float64)
+    return FunctionField(BoxExtension(function, -high, high, float(description.sign)), bounds)
+
+
+def _corners(volume: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """The features (2, 2, 2, N, C) at the corners of the points' cells, and the weights (3, N, 1) of the upper ones."""
+    nodes = volume.shape[0]
+    position = (points + 1.0) * ((nodes - 1) / 2.0)
+    cell = position.floor().long().clamp(0, nodes - 2)
+    strides = torch.tensor([nodes * nodes, nodes, 1], device=volume.device)
+    rows = (cell * strides).sum(-1) + (corner_offsets(volume.device) * strides).sum(-1, keepdim=True)  # (8, N)
+    features = volume.view(nodes**3, -1).index_select(0, rows.view(-1)).float()
+    return features.view(2, 2, 2, len(points), -1), (position - cell).T.unsqueeze(-1)
+
+
+# A field in another unit, or with the opposite sign.
+
+
+class ScaledField:
+    """S(x) = sign * scale * f(x / scale): ``scale`` is the length of one unit of f's coordinates, in the new unit.
+
+    Coordinates and distances scale together, so the gradient's norm stays what it was.
+    """
+
+    color: ColorFunction
+    """Only where the field has color."""
+
+    def __init__(self, field: SdfField, scale: float = 1.0, sign: int = 1) -> None:
+        self.field = field
+        self.scale = scale
+        self.sign = sign
+        if has_color(field):
+            self.color = color_in_unit(field, scale)
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64 on the CPU, new unit."""
+        return self.field.bounds * self.scale
+
+    @property
+    def device(self) -> torch.device:
+        """That of the field."""
+        return self.field.device
+
+    @property
+    def observation(self) -> Observation | None:
+        """What was observed, new unit; None where it is not known."""
+        seen = observation_of(self.field)
+        return None if seen is None else seen.seen_in(_scaling(1.0 / self.scale))
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """NeuS's s, per new unit; None where the field has none."""
+        inverse = inverse_deviation_of(self.field)
+        return None if inverse is None else inverse / self.scale
+
+    def to(self, device: torch.device | str) -> ScaledField:
+        """The same field with its parameters on another device."""
+        return ScaledField(self.field.to(device), self.scale, self.sign)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) float32 at points (N, 3), new unit."""
+        return self.field.signed_distance(points / self.scale) * (self.sign * self.scale)
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and its gradient (N, 3) at points (N, 3), new unit."""
+        distance, gradient = self.field.signed_distance_and_gradient(points / self.scale)
+        return distance * (self.sign * self.scale), gradient * self.sign
+
+
+def _scaling(scale: float) -> Sim3:
+    return Sim3(
+        torch.tensor(scale, dtype=torch.float64), torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    )
+
+
+# A field known at the nodes of a regular grid, interpolated between them.
+
+
+@dataclass(frozen=True)
+class VoxelGridFunction:
+    """Trilinear interpolation of values (X, Y, Z), float32 or float16; node (i, j, k) is at origin + spacing (i, j, k).
+
+    origin, spacing: (3,) float32. Points are taken to be within the grid.
+    """
+
+    values: Tensor
+    origin: Tensor
+    spacing: Tensor
+    colors: Tensor | None = None
+    """(X, Y, Z, 3); a node with a negative number has none."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the values live."""
+        return self.values.device
+
+    def to(self, device: torch.device | str) -> VoxelGridFunction:
+        """The same function with its values on another device."""
+        return replace(
+            self,
+            values=self.values.to(device),
+            origin=self.origin.to(device),
+            spacing=self.spacing.to(device),
+            colors=None if self.colors is None else self.colors.to(device),
+        )
+
+    @property
+    def has_color(self) -> bool:
+        """Whether :meth:`color` may be asked."""
+        return self.colors is not None
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) at points (N, 3), trilinear between the nodes that have one; black where none has."""
+        del directions
+        assert self.colors is not None
+        index, weights = self._cells(points)
+        return interpolate_colors(self.colors.view(-1, 3)[index], weights)
+
+    def value(self, points: Tensor) -> Tensor:
+        """Value (N,) at points (N, 3)."""
+        return interpolate(*self._corners(points))
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Value (N,) at points (N, 3) and its gradient (N, 3); on a cell's border, that of the cell beyond."""
+        value, derivative = interpolate_with_derivative(*self._corners(points))
+        return value, derivative.T / self.spacing
+
+    def _corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The values (2, 2, 2, N) at the corners of the points' cells, and the weights (3, N) of the upper ones."""
+        index, weights = self._cells(points)
+        values = self.values.view(-1).index_select(0, index.view(-1)).float()
+        return values.view(2, 2, 2, -1), weights
+
+    def _cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The corners (8, N) of the points' cells among all nodes, and the weights (3, N) of the upper ones."""
+        position = (points - self.origin) / self.spacing
+        last = torch.tensor(self.values.shape, device=self.device) - 2
+        cell = torch.minimum(position.floor().long().clamp_min(0), last)  # (N, 3)
+        _, rows, columns = self.values.shape
+        strides = torch.tensor([rows * columns, columns, 1], device=self.device)
+        index = (cell * strides).sum(-1) + (corner_offsets(self.device) * strides).sum(-1, keepdim=True)  # (8, N)
+        return index, (position - cell).T
+
+
+def build_voxel_grid(
+    description: VoxelGridDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None
+) -> FunctionField[BoxExtension[VoxelGridFunction]]:
+    """The field of ``description`` with its values in ``tensors``, extended beyond the grid. colors: of the nodes.
+
+    The tensors keep their device and type; they must have passed :meth:`VoxelGridDescription.check_tensors`.
+    """
+    values = tensors["values"].contiguous()
+    origin = torch.tensor(description.origin, dtype=torch.float64)
+    spacing = torch.tensor(description.spacing, dtype=torch.float64)
+    high = origin + spacing * (torch.tensor(values.shape) - 1)
+    origin, spacing, high = (corner.to(device=values.device, dtype=torch.float32) for corner in (origin, spacing, high))
+    colors = None if colors is None else colors.contiguous()
+    function = BoxExtension(VoxelGridFunction(values, origin, spacing, colors), origin, high, float(description.sign))
+    return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
 
 
 def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> SdfField:

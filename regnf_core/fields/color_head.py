@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -9,10 +10,108 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.positional_encoding import PositionalEncoding
-from regnf_core.fields.spherical_harmonics import spherical_harmonics
-from regnf_core.schema.color import TABLE, NetworkColor
-from regnf_core.schema.layers import count_layers
+from regnf_core.schema.description import TABLE, NetworkColor
+from regnf_core.schema.hash_grid_config import PositionalEncodingDescription
+from regnf_core.schema.tensor_check import count_layers
+
+# Sine and cosine features of a position, with their derivative.
+
+_A, _B, _C, _D = 0.8506508, 0.5257311, 0.809017, 0.309017
+_ICOSAHEDRON = (
+    *((_A, 0.0, _B), (_C, 0.5, _D), (_B, _A, 0.0), (1.0, 0.0, 0.0), (_C, 0.5, -_D), (_A, 0.0, -_B), (_D, _C, -0.5)),
+    *((0.0, _B, -_A), (0.5, _D, -_C), (0.0, 1.0, 0.0), (-_B, _A, 0.0), (-_D, _C, -0.5), (0.0, _B, _A)),
+    *((-_D, _C, 0.5), (_D, _C, 0.5), (0.5, _D, _C), (0.5, -_D, _C), (0.0, 0.0, 1.0), (-0.5, _D, _C)),
+    *((-_C, 0.5, _D), (-_C, 0.5, -_D)),
+)
+"""Corners and middles of an icosahedron's edges, one of each opposite pair, in the order of mip-NeRF 360's matrix P."""
+
+
+@dataclass(frozen=True)
+class PositionalEncoding:
+    """sin and cos of every coordinate times base_frequency 2^k, k = 0 .. degree-1 (Mildenhall et al. 2020).
+
+    Order: for each axis all frequencies, as sines; then the same block as cosines. ``off_axis``: in place of the three
+    coordinates the lengths along 21 directions, those of an icosahedron (Barron et al. 2022).
+    """
+
+    degree: int
+    base_frequency: float = 1.0
+    """1 as sdfstudio has it, 2 pi as nerfstudio has it."""
+    off_axis: bool = False
+
+    @classmethod
+    def of(cls, description: PositionalEncodingDescription | None) -> PositionalEncoding | None:
+        """The encoding of a description, or None where there is none in use."""
+        if description is None or not description.used or not description.degree:
+            return None
+        frequency = 2.0 * math.pi if description.two_pi else 1.0
+        return cls(description.degree, frequency * description.base_frequency, description.off_axis)
+
+    @property
+    def width(self) -> int:
+        """Number of features of an encoded point."""
+        return 2 * self.degree * (len(_ICOSAHEDRON) if self.off_axis else 3)
+
+    def encode(self, points: Tensor) -> Tensor:
+        """Features (N, 6 degree) at points (N, 3)."""
+        angles = self._angles(points)
+        return torch.cat((angles.sin(), angles.cos()), dim=-1)
+
+    def pull_back(self, encoded: Tensor, gradient: Tensor) -> Tensor:
+        """Gradient (N, 3) with respect to the points, from ``encoded`` and the gradient by it (both (N, 6 degree))."""
+        sines, cosines = encoded.chunk(2, dim=-1)
+        by_sine, by_cosine = gradient.chunk(2, dim=-1)
+        by_angle = by_sine * cosines - by_cosine * sines  # (N, 3 degree)
+        by_axis = by_angle.reshape(*by_angle.shape[:-1], by_angle.shape[-1] // self.degree, self.degree)
+        by_length = (by_axis * self.frequencies(encoded)).sum(dim=-1)
+        return by_length @ self.directions(encoded) if self.off_axis else by_length
+
+    def _angles(self, points: Tensor) -> Tensor:
+        lengths = points @ self.directions(points).T if self.off_axis else points
+        return (lengths.unsqueeze(-1) * self.frequencies(points)).flatten(start_dim=1)
+
+    @staticmethod
+    def directions(like: Tensor) -> Tensor:
+        """Those of ``off_axis`` (21, 3), of the type and on the device of ``like``."""
+        return torch.tensor(_ICOSAHEDRON, dtype=like.dtype, device=like.device)
+
+    def frequencies(self, like: Tensor) -> Tensor:
+        """What the coordinates are multiplied by (degree,), of the type and on the device of ``like``."""
+        return self.base_frequency * 2.0 ** torch.arange(self.degree, dtype=like.dtype, device=like.device)
+
+
+# Real spherical harmonics of a direction, sorted and signed as tiny-cuda-nn has them.
+
+
+def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
+    """(N, degree^2) at unit directions (N, 3): all of orders below ``degree``, which is 1 to 4.
+
+    Orthonormal on the sphere, with the Condon-Shortley sign.
+    """
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    values = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 1:
+        values += [-0.48860251190291987 * y, 0.48860251190291987 * z, -0.48860251190291987 * x]
+    if degree > 2:
+        values += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.94617469575755997 * zz - 0.31539156525251999,
+            -1.0925484305920792 * x * z,
+            0.54627421529603959 * (xx - yy),
+        ]
+    if degree > 3:
+        values += [
+            0.59004358992664352 * y * (yy - 3.0 * xx),
+            2.8906114426405538 * x * y * z,
+            0.45704579946446572 * y * (1.0 - 5.0 * zz),
+            0.3731763325901154 * z * (5.0 * zz - 3.0),
+            0.45704579946446572 * x * (1.0 - 5.0 * zz),
+            1.4453057213202769 * z * (xx - yy),
+            0.59004358992664352 * x * (3.0 * yy - xx),
+        ]
+    return torch.stack(values, dim=-1)
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import field_repr
-from regnf_core.fields.color import ColorFunction
-from regnf_core.schema.kinds.mesh import MeshDescription
+from regnf_core.fields.observation import ColorFunction, field_repr
+from regnf_core.schema.kinds import MeshDescription
 
 _INSIDE = 0.5
 _ON_SURFACE = 1e-9

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from regnf_core.fields.cell_index import CellIndex
-from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.geometry_mlp import GeometryMlp
-from regnf_core.geometry.quaternions import matrix_from_quaternion
-from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
+from regnf_core.fields.neus_facto_function import GeometryMlp
+from regnf_core.fields.user_fields import FunctionField
+from regnf_core.fields.voxel_blocks import CellIndex
+from regnf_core.geometry.exponential_map import matrix_from_quaternion
+from regnf_core.schema.kinds import NeuralPointsDescription
 
 _PRIMES = (73856093, 19349669, 83492791)
 _EPSILON = 1e-15

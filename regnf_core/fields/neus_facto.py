@@ -10,22 +10,19 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from regnf_core.fields.color_head import ColorHead
-from regnf_core.fields.function_field import Evaluator, FunctionField
-from regnf_core.fields.geometry_mlp import GeometryMlp
+from regnf_core.fields.color_head import ColorHead, PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.fields.native.evaluator import native_evaluator
-from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_core.fields.neus_facto_planes import prepared
-from regnf_core.fields.positional_encoding import PositionalEncoding
-from regnf_core.schema.kinds.neus_facto import SKIP_LAYER, NeusFactoDescription
+from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
+from regnf_core.fields.user_fields import Evaluator, FunctionField
+from regnf_core.schema.kinds import SKIP_LAYER, NeusFactoDescription
 
 
 class NeusFactoField(FunctionField[NeusFactoFunction]):
     """A :class:`NeusFactoFunction` as an SdfField."""
 
     def _evaluator(self) -> Evaluator:
-        return native_evaluator(self.function) or prepared(self.function)
+        return native_evaluator(self.function) or self.function
 
 
 def build_neus_facto(

@@ -6,18 +6,135 @@ can say which is which; those that cannot have no observation.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from functools import partial
+from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.color import ColorFunction, has_color, inverse_deviation_of
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.observation_grid import SURFACE, UNSEEN, ObservationGrid
+from regnf_core.library_entries import shown_number
+from regnf_core.schema.description import SURFACE, UNSEEN, ObservationGrid
+
+# What every field offers, whatever made it: signed distance, its gradient, its bounds.
+
+
+@runtime_checkable
+class SdfField(Protocol):
+    """A signed distance field: positive in free space, negative inside matter, in units of its own frame.
+
+    Implementations evaluate without building an autograd graph, in chunks that bound memory, in float32, on ``device``.
+    Use :func:`differentiable_signed_distance` where a loss must flow back to the points.
+    """
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64 on the CPU: lowest and highest corner of the region where the field has meaning, own frame."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field's parameters live; points are moved there."""
+        ...
+
+    def to(self, device: torch.device | str) -> SdfField:
+        """The same field with its parameters on another device."""
+        ...
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) float32 at points (N, 3) in the field's frame."""
+        ...
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and its gradient (N, 3) with respect to the points (N, 3)."""
+        ...
+
+
+def field_repr(field: SdfField) -> str:
+    """A field in a line: its class, and where it has meaning."""
+    low, high = (f"[{', '.join(map(shown_number, corner.tolist()))}]" for corner in field.bounds)
+    return f"<{type(field).__name__}, bounds {low} to {high}, {field.device}>"
+
+
+class _SignedDistance(torch.autograd.Function):
+    """Signed distance whose backward pass uses the field's own gradient: no graph through the network is kept."""
+
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, points: Tensor, field: SdfField) -> Tensor:
+        distance, gradient = field.signed_distance_and_gradient(points.detach())
+        ctx.save_for_backward(gradient)
+        return distance.to(points)
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        return grad_outputs[0].unsqueeze(-1) * gradient.to(grad_outputs[0]), None
+
+
+def differentiable_signed_distance(field: SdfField, points: Tensor) -> Tensor:
+    """Signed distance (N,) at points (N, 3) that autograd can differentiate once with respect to the points."""
+    return _SignedDistance.apply(points, field)  # type: ignore[no-untyped-call, no-any-return]
+
+
+# What a field with color offers, and how a view of a field passes it on.
+
+ColorFunction = Callable[[Tensor, Tensor], Tensor]
+"""What :meth:`ColoredField.color` is."""
+
+
+@runtime_checkable
+class HasInverseDeviation(Protocol):
+    """A field that may know how sharp its surface was when it was trained."""
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """NeuS's s (Wang et al. 2021), per unit of the field's own frame; None where the field has none."""
+        ...
+
+
+@runtime_checkable
+class ColoredField(SdfField, HasInverseDeviation, Protocol):
+    """A field with color. A field without color has no attribute ``color``; :func:`has_color` tells it."""
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) float32 in [0, 1], R, G, B, at points (N, 3) of the field's frame.
+
+        directions: (N, 3), unit, of the field's frame, along the line of sight, away from the camera.
+        """
+        ...
+
+
+def has_color(field: SdfField) -> TypeGuard[ColoredField]:
+    """Whether ``field`` has a color."""
+    return hasattr(field, "color")
+
+
+def inverse_deviation_of(field: SdfField) -> float | None:
+    """The inverse deviation of ``field``, per unit of its own frame; None where it has none."""
+    return field.inverse_deviation if isinstance(field, HasInverseDeviation) else None
+
+
+def color_in_frame(field: ColoredField, T_field_frame: Sim3) -> ColorFunction:
+    """The color of ``field`` for points and directions of another frame, which T_field_frame takes to the field's."""
+    return partial(_color_in_frame, field, T_field_frame)
+
+
+def color_in_unit(field: ColoredField, scale: float) -> ColorFunction:
+    """The color of ``field`` for points in a unit, of which ``scale`` make up one unit of the field's coordinates."""
+    return partial(_color_in_unit, field, scale)
+
+
+def _color_in_frame(field: ColoredField, T_field_frame: Sim3, points: Tensor, directions: Tensor) -> Tensor:
+    moved = T_field_frame.apply(points.double())
+    return field.color(moved, directions @ T_field_frame.rotation.to(directions).T).float()
+
+
+def _color_in_unit(field: ColoredField, scale: float, points: Tensor, directions: Tensor) -> Tensor:
+    return field.color(points / scale, directions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,3 +250,39 @@ def stored_observation(grid: ObservationGrid, words: Tensor) -> Observation:
 def observation_of(field: SdfField) -> Observation | None:
     """The observation of ``field``, its own frame; None where there is none."""
     return field.observation if isinstance(field, Observed) else None
+
+
+# A field that counts its evaluations.
+
+
+class CountingField:
+    """A field that counts the points at which it is evaluated. A value with its gradient counts as one evaluation."""
+
+    def __init__(self, field: SdfField) -> None:
+        self.field = field
+        self.evaluations = 0
+
+    @property
+    def bounds(self) -> Tensor:
+        return self.field.bounds
+
+    @property
+    def device(self) -> torch.device:
+        return self.field.device
+
+    @property
+    def observation(self) -> Observation | None:
+        return observation_of(self.field)
+
+    def to(self, device: torch.device | str) -> CountingField:
+        moved = CountingField(self.field.to(device))
+        moved.evaluations = self.evaluations
+        return moved
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        self.evaluations += points.shape[0]
+        return self.field.signed_distance(points)
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        self.evaluations += points.shape[0]
+        return self.field.signed_distance_and_gradient(points)

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from regnf_core.detections import Detection, parse_detection
-from regnf_core.detections.objects import open3d_detection
+from regnf_core.detections.parsing import open3d_detection
 from regnf_core.errors import InvalidDetectionError
-from regnf_core.geometry.quaternions import matrix_from_quaternion
+from regnf_core.geometry.exponential_map import matrix_from_quaternion
 from regnf_core.rotations import quaternion_of
 
 
@@ -147,3 +147,19 @@ class OrientedBox:
         """(N,) bool: which points (N, 3), scene frame, lie in the box grown by ``margin`` (a share of its size)."""
         half = self.size.to(points) * (0.5 * (1.0 + margin))
         return (self.to_local(points).abs() <= half).all(dim=-1)
+
+
+# Where rays enter and leave an axis-aligned box.
+
+
+def ray_box_interval(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Entry (R,), at least 0, and exit (R,) of rays in multiples of their directions; exit <= entry: the ray misses.
+
+    origins, directions: (R, 3), the directions of any length · low, high: (3,) corners; all in one frame and dtype.
+    A ray that runs within a face counts as inside that face.
+    """
+    first, second = (low - origins) / directions, (high - origins) / directions
+    # 0 / 0, a ray within a face: the face does not cut it off
+    lowest = torch.minimum(first, second).nan_to_num(nan=-torch.inf, posinf=torch.inf, neginf=-torch.inf)
+    highest = torch.maximum(first, second).nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=-torch.inf)
+    return lowest.amax(-1).clamp_min(0.0), highest.amin(-1)

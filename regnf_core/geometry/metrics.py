@@ -8,14 +8,166 @@ symmetries.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from regnf_core.geometry.euler import euler_from_rotation
-from regnf_core.geometry.points import NearestNeighbors, diameter
+from regnf_core.errors import InvalidInputError
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.geometry.symmetry import Symmetries
+
+# Euler angles as the paper learns and reports them: roll, pitch, yaw about the fixed axes x, y, z, in that order.
+#
+# They are singular at pitch +-pi/2 (gimbal lock); the preset ``paper`` uses them because the published method does.
+
+
+def rotation_from_euler(angles: Tensor) -> Tensor:
+    """R = Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3), of angles (..., 3) = (roll, pitch, yaw), radians. Differentiable."""
+    (cr, cp, cy), (sr, sp, sy) = angles.cos().unbind(-1), angles.sin().unbind(-1)
+    rows = [
+        cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr,
+        sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr,
+        -sp, cp * sr, cp * cr,
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*angles.shape[:-1], 3, 3)
+
+
+def euler_from_rotation(R: Tensor) -> Tensor:
+    """(roll, pitch, yaw) (..., 3) in radians, pitch within +-pi/2. Where they are singular, roll is zero."""
+    cosine = torch.hypot(R[..., 2, 1], R[..., 2, 2])
+    pitch = torch.atan2(-R[..., 2, 0], cosine)
+    singular = cosine < 1e-9
+    roll = torch.where(singular, torch.zeros_like(pitch), torch.atan2(R[..., 2, 1], R[..., 2, 2]))
+    yaw = torch.where(singular, torch.atan2(-R[..., 0, 1], R[..., 1, 1]), torch.atan2(R[..., 1, 0], R[..., 0, 0]))
+    return torch.stack([roll, pitch, yaw], dim=-1)
+
+
+# Neighbors, spacing and size of point sets: exact on any device.
+
+_DISTANCES_AT_ONCE = 2**25
+"""Of all points to some of those asked for, where there is no tree: bounds memory, at some 500 MB."""
+
+
+class NearestNeighbors:
+    """A search structure over points (M, 3): a k-d tree on the CPU, all distances elsewhere. Results are not
+    differentiable."""
+
+    def __init__(self, points: Tensor) -> None:
+        self.points = points.detach()
+        self._tree = cKDTree(self.points.numpy()) if points.device.type == "cpu" else None
+
+    def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance (N,) to the nearest point and its index (N,), for points (N, 3)."""
+        distance, index = self.query_several(points, 1)
+        return distance[:, 0], index[:, 0]
+
+    def query_several(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Distances (N, K) to the nearest points, nearest first, and their indices (N, K); K = ``count``, at most M."""
+        count = min(count, len(self.points))
+        if self._tree is None:
+            return nearest_of_all(self.points, points.detach(), count)
+        distance, index = self._tree.query(points.detach().cpu().numpy(), k=range(1, count + 1))
+        return torch.as_tensor(distance).to(points), torch.as_tensor(index, device=points.device)
+
+
+def nearest_of_all(points: Tensor, queries: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Distances (N, K) from queries (N, 3) to the ``count`` nearest of points (M, 3), nearest first, and the indices
+    (N, K): by all distances, in float64, in parts that bound memory. No part of it is read on the CPU."""
+    few = max(1, _DISTANCES_AT_ONCE // len(points))
+    found = []
+    for part in torch.split(queries.double(), few):
+        apart = (part[:, None] - points.double()).square_().sum(-1)
+        found.append(apart.topk(count, dim=1, largest=False))
+    squares, index = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return squares.sqrt().to(queries), index
+
+
+def gaps(points: Tensor) -> Tensor:
+    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbor: how sparse the cloud is there."""
+    distance, _ = NearestNeighbors(points).query_several(points.detach(), 4)  # the nearest is the point itself
+    return distance[:, -1]
+
+
+def diameter(points: Tensor) -> float:
+    """The largest distance between any two of the points (N, 3), N >= 1; found among the convex hull's corners."""
+    array = points.detach().double().cpu().numpy()
+    if array.shape[0] < 2:
+        return 0.0
+    try:
+        array = array[ConvexHull(array).vertices]
+    except QhullError:  # flat or tiny clouds have no hull; their own extreme points are few enough below
+        directions = np.random.default_rng(0).normal(size=(512, 3))
+        heights = array @ directions.T
+        array = array[np.unique(np.concatenate([heights.argmin(0), heights.argmax(0)]))]
+    return float(pdist(array).max(initial=0.0))
+
+
+# An object's declared symmetries, in the form of the BOP benchmark: rotations that leave its shape unchanged.
+
+_STEPS = 315  # BOP's: a point on the rim moves by at most 1 % of the diameter from one step to the next
+
+
+@dataclass(frozen=True)
+class ContinuousSymmetry:
+    """Any turn about ``axis`` (3,) through ``offset`` (3,), object frame."""
+
+    axis: Sequence[float]
+    offset: Sequence[float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Symmetries:
+    """Discrete: rigid 4x4 transforms of the object frame onto itself, identity left out. Continuous: whole axes."""
+
+    discrete: Sequence[Sim3] = field(default_factory=list)
+    continuous: Sequence[ContinuousSymmetry] = field(default_factory=list)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Symmetries:
+        """From BOP's ``symmetries_discrete`` (16 numbers each, row-major) and ``symmetries_continuous`` (axis, offset).
+
+        Lengths in object units. Raises InvalidInputError (INVALID_TRANSFORM, INVALID_SYMMETRY).
+        """
+        try:
+            discrete = [
+                Sim3.from_matrix(torch.tensor(numbers, dtype=torch.float64).reshape(4, 4))
+                for numbers in values.get("symmetries_discrete", [])
+            ]
+            continuous = [
+                ContinuousSymmetry(_three(entry["axis"]), _three(entry.get("offset", (0.0, 0.0, 0.0))))
+                for entry in values.get("symmetries_continuous", [])
+            ]
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise InvalidInputError(f"malformed symmetries: {error}", reason="INVALID_SYMMETRY") from error
+        return cls(discrete, continuous)
+
+    def transforms(self, steps: int = _STEPS) -> Sim3:
+        """All symmetries as a batch (K,), the identity first: each discrete one with each step about each axis."""
+        discrete = [Sim3.identity(), *self.discrete]
+        turned = [Sim3.identity()]
+        for symmetry in self.continuous:
+            turned += [_turn(symmetry, 2 * math.pi * k / steps) for k in range(1, steps)]
+        return Sim3.cat([turn @ fixed for fixed in discrete for turn in turned])
+
+
+def _turn(symmetry: ContinuousSymmetry, angle: float) -> Sim3:
+    axis = torch.tensor(list(symmetry.axis), dtype=torch.float64)
+    offset: Tensor = torch.tensor(list(symmetry.offset), dtype=torch.float64)
+    if not axis.norm() > 1e-9:
+        raise InvalidInputError("a symmetry axis must not vanish", reason="INVALID_SYMMETRY")
+    tangent = torch.cat([angle * axis / axis.norm(), torch.zeros(4, dtype=torch.float64)])
+    return Sim3.from_translation(offset) @ Sim3.exp(tangent) @ Sim3.from_translation(-offset)
+
+
+def _three(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
 
 _CHUNK = 64  # symmetries treated at once by MSSD
 
@@ -109,3 +261,38 @@ def errors_against_truth(
         "add_s": nearest,
         "add_s_share": nearest / size,
     }
+
+
+# How far apart poses place an object, and the best poses of a batch that are distinct by this measure.
+
+
+def displacement(T: Sim3, reference: Sim3, points: Tensor) -> Tensor:
+    """Largest distance, target units, between the images of the object points (N, 3) under T^-1 and one reference^-1.
+
+    (H,): how far apart two poses place the object, measured in the frame it is placed in and scaled to its own units.
+    """
+    placed, other = T.inverse().apply(points.double()), reference.inverse().apply(points.double())
+    apart: Tensor = reference.scale * (placed - other).norm(dim=-1).amax(-1)
+    return apart
+
+
+def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) -> Tensor:
+    """Numbers of the best poses (lowest score first), no two of which place ``points`` closer together than ``apart``.
+
+    points: (N, 3) of the object; a handful of its extreme points is enough. One pose decides on the next: that is done
+    on the CPU, whatever device T (H,) and scores (H,) are on; the numbers (K,) are on the CPU too.
+    """
+    T, scores, points = T.on("cpu"), scores.cpu(), points.cpu()
+    order = scores.argsort()
+    placed = T[order].inverse().apply(points.double()).mT.contiguous()  # (H, 3, N)
+    reach = (apart / T.scale[order].double()).square().tolist()
+    numbers: list[int] = order.tolist()
+    chosen: list[int] = []
+    left = torch.arange(len(order))
+    while len(left) and len(chosen) < limit:
+        best, others = int(left[0]), placed[1:]
+        chosen.append(numbers[best])
+        squares = (others - placed[0]).square().sum(1).amax(-1)
+        far = (~(squares < reach[best])).nonzero().squeeze(-1)
+        left, placed = left[1:][far], others[far]
+    return torch.tensor(chosen, dtype=torch.long)

@@ -11,8 +11,14 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.geometry.exponential_map import exp_parts, log_parts, rotation_exp, split_tangent
-from regnf_core.geometry.quaternions import matrix_from_quaternion, quaternion_from_matrix
+from regnf_core.geometry.exponential_map import (
+    exp_parts,
+    log_parts,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotation_exp,
+    split_tangent,
+)
 
 _SIMILARITY_TOLERANCE = 1e-4  # float32 matrices from other tools come with about 1e-6
 

@@ -13,7 +13,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, s
 from regnf_core.importing.families.facing import Asked
 from regnf_core.importing.families.triangles import solid_of
 from regnf_core.importing.meshes import MESH_READERS, read_mesh
-from regnf_core.importing.meshes.geometry import Geometry, malformed
+from regnf_core.importing.meshes.triangle_files import Geometry, malformed
 
 
 def load_solid(path: str | os.PathLike[str], asked: Asked = None) -> tuple[MeshField, tuple[str, ...]]:

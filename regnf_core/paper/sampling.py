@@ -10,14 +10,22 @@ from itertools import islice
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, SamplingOptions
-from regnf_core.surface.cameras import Rays, axis_vector, camera_positions, cast_rays
 from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
-from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, points_in_order, shortest_step
-from regnf_core.surface.surface_bounds import surface_bounds
+from regnf_core.surface.sphere_tracing import (
+    Rays,
+    axis_vector,
+    camera_positions,
+    cast_rays,
+    clip_to_region,
+    first_hits,
+    points_in_order,
+    shortest_step,
+    surface_bounds,
+)
 
 _BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point

@@ -11,24 +11,108 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
+from PIL import Image
 
 from regnf_core.editing.compose import compose
 from regnf_core.editing.edited_scene import EditedScene
-from regnf_core.editing.measured_matter import without_unseen
-from regnf_core.editing.opening import open_edits
+from regnf_core.editing.edits import open_edits
+from regnf_core.editing.region import without_unseen
 from regnf_core.editing.storing import write_field
-from regnf_core.errors import CancelledError
-from regnf_core.fields.base import SdfField
+from regnf_core.errors import CancelledError, atomic_path
+from regnf_core.fields.composite import near_origin
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.rendering.camera import Camera
-from regnf_core.rendering.colored_mesh import write_colored_mesh
-from regnf_core.rendering.files import depth_unit, strip, write_animation, write_color, write_depth, write_normal
-from regnf_core.rendering.frame import Frame
-from regnf_core.rendering.options import RenderOptions
-from regnf_core.rendering.paths import Orbit, Station
+from regnf_core.rendering.camera import Camera, Frame, Orbit, Station
 from regnf_core.rendering.render import Progress, render_frames
-from regnf_core.rendering.request import OrbitRequest, RenderRequest
+from regnf_core.rendering.request import OrbitRequest, RenderOptions, RenderRequest
+from regnf_core.rendering.volume_mode import Painter
+from regnf_core.surface.exporting import glb_of
+from regnf_core.surface.isosurface import extract_surface
+
+# The surface of a field as a mesh with a color at each vertex.
+
+_AT_ONCE = 1 << 16
+
+
+def write_colored_mesh(
+    field: SdfField,
+    path: Path,
+    resolution: int,
+    options: RenderOptions,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """The zero level as .glb, in the field's frame and unit; returns how many triangles it has.
+
+    A vertex has its part's own color, seen from before the surface, or its tint, or one plain color: no shading.
+    Raises NoSurfaceError and InvalidInputError (FIELD_NOT_FINITE, COLORS_MISSING).
+    """
+    field, origin = near_origin(field)
+    surface = extract_surface(field, resolution, progress)
+    painter = Painter.of(field, torch.tensor([0.0, 0.0, 1.0]), options)
+    points, normals = (torch.from_numpy(part).float() for part in (surface.vertices, surface.normals))
+    parts = zip(torch.split(points, _AT_ONCE), torch.split(normals, _AT_ONCE), strict=True)
+    colors = torch.cat([painter.flat_colors(p.to(field.device), -n.to(field.device)).cpu() for p, n in parts])
+    levels = (colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+    shown = np.concatenate([levels, np.full((len(levels), 1), 255, np.uint8)], axis=1)
+    mesh = trimesh.Trimesh(
+        surface.vertices, surface.faces, vertex_normals=surface.normals, vertex_colors=shown, process=False
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(glb_of(mesh, origin.numpy()))
+    return len(surface.faces)
+
+
+# Frames as files.
+
+_GAP = 6
+"""Pixels between the pictures of a strip."""
+_WHITE = 255
+_FRAMES_A_SECOND = 12
+
+
+def write_color(frame: Frame, path: Path) -> None:
+    """PNG, 8 bits a channel, sRGB."""
+    Image.fromarray(frame.color).save(path, format="PNG")
+
+
+def write_normal(frame: Frame, path: Path) -> None:
+    """PNG, 8 bits a channel: 0..255 for -1..1 along the scene's axes; (0, 0, 0) where nothing is met."""
+    levels = np.rint((frame.normal + 1.0) * 127.5).astype(np.uint8)
+    levels[frame.depth <= 0] = 0
+    Image.fromarray(levels).save(path, format="PNG")
+
+
+def write_depth(frame: Frame, png: Path, npy: Path, unit: float) -> None:
+    """The depths as .npy (float32, scene units), and as PNG of 16 bits in ``unit``; 0 where nothing is met."""
+    np.save(npy, frame.depth)
+    levels = np.clip(np.rint(frame.depth / unit), 0, 65535).astype(np.uint16)
+    Image.fromarray(levels).save(png, format="PNG")
+
+
+def depth_unit(largest: float) -> float:
+    """Scene units a level of a depth PNG, so that ``largest`` fits 16 bits: a power of ten, times 1, 2 or 5."""
+    if largest <= 0:
+        return 1.0
+    least = largest / 65000.0
+    power = 10.0 ** np.floor(np.log10(least))
+    return float(next(factor * power for factor in (1, 2, 5, 10) if factor * power >= least))
+
+
+def write_animation(pictures: Sequence[NDArray[np.uint8]], path: Path) -> None:
+    """Animated WebP of pictures (H, W, 3), in a loop."""
+    first, *others = [Image.fromarray(picture) for picture in pictures]
+    duration = round(1000 / _FRAMES_A_SECOND)
+    first.save(path, format="WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=80)
+
+
+def strip(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Pictures (H, W, 3) of one height side by side."""
+    gap = np.full((pictures[0].shape[0], _GAP, 3), _WHITE, np.uint8)
+    parts = [part for picture in pictures for part in (gap, picture)][1:]
+    return np.concatenate(parts, axis=1)
+
 
 _STAGES = {"composing": 0.0, "rendering": 0.1, "rendering before": 0.5, "mesh": 0.9, "field": 0.95, "done": 1.0}
 """The share done when each begins."""

@@ -9,9 +9,74 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le, Len
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
+from regnf_core.cost import Cost, Option, Term
 from regnf_core.editing.request import AnyEdit, Axis, Box, Rows, read_edits
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
-from regnf_core.rendering.options import MOST_FRAMES, RenderOptions, check_extent
+from regnf_core.rgb import Rgb
+
+# What may be chosen of a rendering: plain data, without torch.
+
+MOST_PIXELS = 1 << 24
+"""Of one frame."""
+MOST_FRAMES = 2000
+MOST_PIXELS_IN_ALL = 1 << 30
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Of all frames of one rendering."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "use_attribute_docstrings": True}
+
+    mode: Literal["surface", "volume"] = "surface"
+    """surface: where rays first meet the zero level. volume: NeuS's opacity along the ray; it shows how sharp a field
+    is, and takes three to four times as long."""
+    coloring: Literal["auto", "field", "shaded"] = "auto"
+    """auto: the field's colors where it has some, else shading. field: an error where it has none. shaded: never."""
+    tints: bool = True
+    """Whether what was edited has its tint."""
+    antialias: Annotated[int, Ge(1), Le(4)] = 1
+    """Rays along each side of a pixel, for colors, normals and opacity; depths are of the pixels' middles or beside."""
+    background: Rgb = (1.0, 1.0, 1.0)
+    """Where a ray meets nothing."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    """Where more light comes from, for shading; the scene's frame."""
+    cut_away: bool = False
+    """Whether a camera may stand in matter, as one of an orbit always may: its rays then begin where they leave it.
+    Matter at the bounds is always cut away before a camera outside of them."""
+    inverse_deviation: Annotated[FiniteFloat, Gt(0), Le(1e9)] | None = None
+    """NeuS's s, per scene unit, for mode volume. None: the field's own where it was learned, else 2000 over its
+    bounds' diagonal."""
+    memory_mb: Annotated[int, Ge(16), Le(65536)] = 256
+    """What a tile's rays may take, about. It bounds the size of tiles and changes nothing else."""
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> RenderOptions:
+        """From plain (JSON) values. Raises InvalidOptionsError naming the first faulty one."""
+        try:
+            return _OPTIONS_ADAPTER.validate_python(values)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise InvalidOptionsError(f"options.{where}: {first['msg']}") from error
+
+
+_OPTIONS_ADAPTER = TypeAdapter(RenderOptions)
+
+
+def check_extent(frames: int, pixels: int) -> None:
+    """Raises InvalidInputError (RENDER_TOO_LARGE): too many frames, or too many pixels in one (all of one size)."""
+    if frames > MOST_FRAMES:
+        raise _too_large(f"{frames} frames, at most {MOST_FRAMES} are rendered at once")
+    if pixels > MOST_PIXELS:
+        raise _too_large(f"a frame of {pixels} pixels, at most {MOST_PIXELS} are rendered")
+    if frames * pixels > MOST_PIXELS_IN_ALL:
+        raise _too_large(f"{frames * pixels} pixels in all frames, at most {MOST_PIXELS_IN_ALL} are rendered at once")
+
+
+def _too_large(message: str) -> InvalidInputError:
+    return InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Ask for fewer or smaller frames.")
+
 
 _CONFIG: dict[str, Any] = {"extra": "forbid"}
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -28,7 +93,7 @@ composite.glb · field: the edited scene as a field file."""
 @dataclass(frozen=True)
 class OrbitRequest:
     """Cameras round one thing. edit: the number of an edit, whose object is looked at · detection: a box instead;
-    neither: the first edit, or without edits the scene's bounds. The rest: regnf_core.rendering.paths.Orbit."""
+    neither: the first edit, or without edits the scene's bounds. The rest: regnf_core.rendering.camera.Orbit."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
@@ -164,3 +229,80 @@ def _fault(error: ValidationError) -> InvalidInputError:
 
 _ADAPTER = TypeAdapter(RenderRequest)
 __all__ = ["MOST_FRAMES", "OrbitRequest", "PoseRequest", "RenderRequest", "StationRequest"]
+
+
+# What a rendering costs at most, estimated from its request alone: memory, seconds, and bytes of files. Torch-free.
+#
+# Upper ends for memory and files. Seconds are of one core and right within a factor of ten: the fields decide.
+
+_RAY_S = {"surface": 50e-6, "volume": 200e-6}
+_RAY_BYTES = 4000
+_PIXEL_BYTES = 100
+"""Of the frame that is being rendered: all that is known at a pixel, and its pictures."""
+_KEPT_BYTES = 20
+"""Of each pixel of an animation, which is written once all frames are there."""
+_NODE_BYTES, _NODE_S = 12, 3e-6
+"""Of a node of a lattice that a field is evaluated on."""
+_EDIT_S = 5.0
+_FILE_BYTES = {"color": 3, "depth": 2 + 4, "normal": 3, "animation": 1}
+"""Of each pixel: PNG of bytes that nothing compresses; depth also as .npy."""
+_MESH_FILE_BYTES = 200
+"""Of each cell that the surface passes through."""
+_SIZE: tuple[Option, ...] = (("size",),)
+
+
+@dataclass(frozen=True)
+class RenderCost(Cost):
+    """The estimated cost of one rendering. file_bytes: of all that it writes."""
+
+    file_bytes: int
+
+
+def estimate(request: RenderRequest) -> RenderCost:
+    """The cost of a request whose extent has been checked."""
+    return RenderCost(tuple(_terms(request)), _file_bytes(request))
+
+
+def _terms(request: RenderRequest) -> list[Term]:
+    width, height = request.image_size
+    pixels, options = width * height, request.options
+    frames = request.frames * (2 if request.before and request.edits else 1)
+    tile = min(options.memory_mb * 1_000_000, pixels * _RAY_BYTES)
+    rays = request.rendered_pixels
+    where = *_SIZE, *_cameras(request), ("options", "antialias")
+    terms = [
+        Term("rays", rays, where, 0, rays * _RAY_S[options.mode]),
+        Term("pixels of a frame", pixels, _SIZE, tile + pixels * _PIXEL_BYTES, 0.0),
+        Term("edits", len(request.edits), (("edits",),), 0, len(request.edits) * _EDIT_S),
+    ]
+    if "animation" in request.outputs:
+        kept = frames * pixels
+        terms.append(Term("pixels of the animation", kept, (*_SIZE, *_cameras(request)), kept * _KEPT_BYTES, 0.0))
+    for output in ("mesh", "field"):
+        if output in request.outputs:
+            nodes = (getattr(request, f"{output}_resolution") + 1) ** 3
+            where_ = ((f"{output}_resolution",),)
+            terms.append(Term(f"nodes of the {output}", nodes, where_, nodes * _NODE_BYTES, nodes * _NODE_S))
+    return terms
+
+
+def _cameras(request: RenderRequest) -> tuple[Option, ...]:
+    if request.look_at is not None:
+        return (("look_at",),)
+    return (("poses",),) if request.poses is not None else (("orbit", "frames"),)
+
+
+def _file_bytes(request: RenderRequest) -> int:
+    width, height = request.image_size
+    frames = request.frames * (2 if request.before and request.edits else 1)
+    total = width * height * frames * sum(_FILE_BYTES.get(output, 0) for output in request.outputs)
+    if "mesh" in request.outputs:
+        total += 6 * request.mesh_resolution**2 * _MESH_FILE_BYTES
+    if "field" in request.outputs:
+        total += 4 * (request.field_resolution + 1) ** 3
+    return total
+
+
+# Which revision of the renderer this is: raised by hand whenever the same request gives other files.
+
+RENDERER_REVISION = 3

@@ -11,19 +11,17 @@ from dataclasses import dataclass
 
 import torch
 
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.constants import LIBRARY
-from regnf_core.robust.devices import working_device
-from regnf_core.robust.model.object_model import ObjectModel
-from regnf_core.robust.model.signature import signature
+from regnf_core.robust.model import ObjectModel, signature
 from regnf_core.robust.pipeline import geometric_seeds, refine_poses, search_poses
 from regnf_core.robust.problem import RegistrationProblem, make_problem, pose_bound
-from regnf_core.robust.scene.scene_view import SceneView
-from regnf_core.robust.search.rotations import start_rotations
+from regnf_core.robust.scene import SceneView
+from regnf_core.robust.search.bounds import start_rotations
 from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
+from regnf_core.robust.working_frame import working_device
 
 _MAX_SQUARED_DISTANCE = 4.0  # of two signatures without a common bin
 

@@ -12,31 +12,87 @@ from itertools import count
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.pose_distance import displacement
+from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import RegistrationResult
+from regnf_core.result import STARTS, IterationRecord, RegistrationResult, Run
 from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
-from regnf_core.robust.model.object_model import ObjectModel, model_object
-from regnf_core.robust.model.self_symmetry import SelfSymmetry
+from regnf_core.robust.constants.model import Stage
+from regnf_core.robust.model import ObjectModel, SelfSymmetry, model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.refine.coarse_to_fine import Descent, RefinementContext, coarse_to_fine
-from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.report import result_of
+from regnf_core.robust.refine.levenberg_marquardt import Descent, RefinementContext, coarse_to_fine
+from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
 from regnf_core.robust.residuals import SurfacePair
-from regnf_core.robust.samples import fixed_generator
-from regnf_core.robust.scene.scene_view import SceneView, view_scene
-from regnf_core.robust.search.features import feature_seeds
-from regnf_core.robust.search.pose_bound import PoseBound
-from regnf_core.robust.search.rotations import start_rotations
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
-from regnf_core.robust.search.seeds import seed_poses, seed_poses_around
-from regnf_core.robust.stage import Stage
-from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
-from regnf_core.run import STARTS, Run
+from regnf_core.robust.scene import SceneView, view_scene
+from regnf_core.robust.search.bounds import (
+    ANY_SCALE,
+    PoseBound,
+    ScaleBound,
+    seed_poses,
+    seed_poses_around,
+    start_rotations,
+)
+from regnf_core.robust.search.distance_grid import feature_seeds
+from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates, pose_covariance
+from regnf_core.robust.working_frame import Samples, WorkingFrame, fixed_generator
+
+# From an evaluation to the result that callers get, in the fields' own frames.
+
+_GEMAN_MCCLURE = -2.0
+"""The Geman-McClure kernel as the shape of Barron's general kernel (CVPR 2019)."""
+
+
+def result_of(
+    problem: RegistrationProblem, evaluation: Evaluation, options: RegistrationOptions, seed: int, evaluations: int
+) -> RegistrationResult:
+    """The result of a registration. evaluations: of both fields, in total."""
+    view, model, winner = problem.view, problem.model, evaluation.winner
+    history = evaluation.candidates.history
+    return RegistrationResult(
+        verdict=evaluation.verdict,
+        verdict_reason=evaluation.reason,
+        verdict_limit=evaluation.found.broken,
+        T_object_scene=evaluation.T,
+        T_object_scene_initial=problem.in_field_frames(history[0].T[winner]),
+        scene_samples=_surface(view.foreground, view.frame),
+        object_samples=_surface(model.samples, model.frame),
+        metrics={**evaluation.metrics, "field_evaluations": float(evaluations)},
+        trace=[_record(problem, number, step, winner) for number, step in enumerate(history)],
+        residuals={},
+        seed=seed,
+        options=options.to_dict(),
+        alternatives=evaluation.alternatives,
+        considered=evaluation.considered,
+        center_object=model.frame.center.clone(),
+        covariance=pose_covariance(problem, evaluation),
+        symmetry=model.symmetry.to("cpu").group(),
+    )
+
+
+def _surface(samples: Samples, frame: WorkingFrame) -> SurfaceSamples:
+    return SurfaceSamples(frame.out_of(samples.on_surface()), samples.normals.cpu())
+
+
+def _record(problem: RegistrationProblem, iteration: int, step: Step, winner: int) -> IterationRecord:
+    """One iteration of the pose that won."""
+    size = problem.model.frame.length
+    T = problem.in_field_frames(step.T[winner])
+    return IterationRecord(
+        iteration=iteration,
+        loss=float(step.costs[winner]),
+        residual_scene=float(step.residual_scene[winner]) * size,
+        residual_object=float(step.residual_object[winner]) * size / float(T.scale),
+        regularizer=0.0,
+        kernel_shape=_GEMAN_MCCLURE,
+        kernel_scale=step.width * size,
+        scene_samples=min(step.samples, len(problem.fit.scene_samples)),
+        object_samples=min(step.samples, len(problem.fit.object_samples)),
+        T_object_scene=T,
+    )
+
 
 ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, *REFINEMENT.last_stages))
 """Of the refinement on the fields."""

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
-from regnf_core.robust.devices import working_device
-from regnf_core.robust.model.object_model import ObjectModel
+from regnf_core.robust.model import ObjectModel
 from regnf_core.robust.residuals import SurfacePair
-from regnf_core.robust.samples import fixed_generator, split
-from regnf_core.robust.scene.scene_view import SceneView
-from regnf_core.robust.search.pose_bound import PoseBound
-from regnf_core.robust.search.scale_bound import ScaleBound
+from regnf_core.robust.scene import SceneView
+from regnf_core.robust.search.bounds import PoseBound, ScaleBound
+from regnf_core.robust.working_frame import fixed_generator, split, working_device
 
 
 @dataclass(frozen=True, eq=False)

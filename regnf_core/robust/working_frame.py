@@ -3,19 +3,150 @@ units."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.observation import Observation
+from regnf_core.fields.observation import Observation, SdfField, observation_of
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.metrics import diameter
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.clearance import clearance
-from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.devices import on_host
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.robust.constants import EVIDENCE, OCCLUSION, SAMPLING
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
+from regnf_core.surface.requirements import (
+    MIN_POINTS,
+    require_box_in_scene,
+    require_object_surface,
+    require_scene_surface,
+)
+from regnf_core.surface.result_clouds import project_to_surface
+from regnf_core.surface.surface_cells import Cells, crop_to_surface, surface_cells
+
+# Samples of a surface, and what tells where a scene was not observed.
+
+
+class UnobservedTest(Protocol):
+    """Tells what was not observed of a scene, in the samples' frame."""
+
+    def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
+        """(M,) bool: which of the points (M, 3) were not observed. values: (M,) the signed distances there, object
+        diameters."""
+        ...
+
+    def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(M,) bool: which surface elements at points (M, 3) with unit normals (M, 3) nobody can have seen, because the
+        space in front of them was not seen to be free."""
+        ...
+
+    def to(self, device: torch.device | str) -> UnobservedTest:
+        """The same for points on another device."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32.
+
+    unobserved: where the field shows something that was not observed; None: everything was observed · shares: (N,), the
+    weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same · hidden: (N,) bool,
+    samples of a scene that nobody can have seen from their front; they tell nothing where the object faces another way.
+
+    Where each pose of a batch has samples of its own, all tensors have one more dimension in front.
+    """
+
+    points: Tensor
+    values: Tensor
+    normals: Tensor
+    unobserved: UnobservedTest | None = None
+    shares: Tensor | None = None
+    hidden: Tensor | None = None
+
+    def __len__(self) -> int:
+        return int(self.points.shape[-2])
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        shares, hidden = (None if part is None else part[index] for part in (self.shares, self.hidden))
+        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved, shares, hidden)
+
+    def to(self, device: torch.device | str) -> Samples:
+        """The same samples on another device."""
+        points, values, normals = (part.to(device) for part in (self.points, self.values, self.normals))
+        shares, hidden = (None if part is None else part.to(device) for part in (self.shares, self.hidden))
+        unobserved = None if self.unobserved is None else self.unobserved.to(device)
+        return Samples(points, values, normals, unobserved, shares, hidden)
+
+    def on_surface(self) -> Tensor:
+        """The points (N, 3) moved onto the surface along their normals."""
+        return self.points - self.values.unsqueeze(-1) * self.normals
+
+
+def fixed_generator() -> torch.Generator:
+    """A new generator for what is the same in every registration, whatever its seed."""
+    return torch.Generator().manual_seed(0)
+
+
+def subsample(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
+    """At most ``limit`` of the samples, at random: drawn on the CPU, so that a seed means the same on every device."""
+    if len(samples) <= limit:
+        return samples
+    drawn = torch.randperm(len(samples), generator=generator)[:limit]
+    return samples[drawn.to(samples.points.device)]
+
+
+def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
+    """Two disjoint random parts; the second, a share ``held_out`` (0..1), is for the verdict alone."""
+    order = torch.randperm(len(samples), generator=generator).to(samples.points.device)
+    cut = len(samples) - int(held_out * len(samples))
+    return samples[order[:cut]], samples[order[cut:]]
+
+
+# How far from a measured surface an observation begins to know of free space.
+#
+# Nearer to a measured surface than the noise of the depths, nothing is said to be free. And where depths of one
+# surface scatter, the voxels in which a surface was measured are a layer, and the surface lies within it. What tells
+# whether a surface element was seen from its front must look beyond both.
+
+
+def clearance(observation: Observation) -> float:
+    """Voxels from a voxel with a measured surface to the nearest free one: a quantile of them, within bounds (see
+    ``OCCLUSION``).
+
+    2 for exact depths, more for noisy ones. The same for every call.
+    """
+    states = observation.states
+    drawn = torch.randint(states.numel(), (OCCLUSION.voxels_drawn,), generator=fixed_generator())
+    measured = drawn[states.view(-1)[drawn] == SURFACE][: OCCLUSION.voxels_asked]
+    if len(measured) == 0:
+        return OCCLUSION.min_clearance
+    centers = torch.stack(torch.unravel_index(measured, states.shape), -1)[:, None] + 0.5
+    directions = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)
+    directions = normalize(directions[directions.any(1)])
+    grid = replace(observation, low=torch.zeros(3).double(), voxel=1.0, T_grid_frame=None)
+    nearest = torch.full((len(centers),), OCCLUSION.max_clearance)
+    for step in range(int(OCCLUSION.max_clearance), 0, -1):
+        nearest[(grid.at(centers + step * directions) == FREE).any(1)] = float(step)
+    return max(OCCLUSION.min_clearance, float(nearest.quantile(OCCLUSION.clearance_quantile)))
+
+
+# Which device the work is done on, and what may be asked of it.
+#
+# Search and refinement run where the scene's field is. To read a number there, the CPU waits until all earlier work
+# is done; so nothing is read within an iteration. What one pose decides on the next is decided on the CPU, once a
+# stage.
+
+
+def working_device(field: SdfField) -> torch.device:
+    """Where a registration in this scene computes: the field's device, or the CPU where that has no float64 (mps)."""
+    return torch.device("cpu") if field.device.type == "mps" else field.device
+
+
+def on_host(values: Tensor) -> bool:
+    """Whether to read the values costs nothing."""
+    return values.device.type == "cpu"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +222,7 @@ class VoxelStates:
     """An observation's voxels, looked up in a working frame, or in that of each of H poses.
 
     states: (V,) uint8, z fastest · counts: (3,) int64 · turn: (..., 3, 3) and shift: (..., 3), float32: a point x is in
-    the voxel floor(x turn + shift) · clearance: (...) float32, working units, see :mod:`regnf_core.robust.clearance`.
+    the voxel floor(x turn + shift) · clearance: (...) float32, working units, see above.
     """
 
     states: Tensor
@@ -177,3 +308,103 @@ class WorkingObservation:
 
 def _not_finite() -> InvalidInputError:
     return InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+
+
+# Samples of both surfaces, evenly spread over the surface in the region, with normals and exact field values.
+#
+# No length is absolute: all follow from the detection box and from the object's own extent. A sample is a point close
+# to the surface together with the field's value there, which the residuals take into account; so two gradient
+# evaluations for each point are enough.
+
+
+@dataclass(frozen=True, eq=False)
+class SampledField:
+    """A field, its working frame, and its samples there. spacing: between samples, working units."""
+
+    field: WorkingField
+    frame: WorkingFrame
+    samples: Samples
+    spacing: float
+
+
+def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator) -> SampledField:
+    """At most ``limit`` samples of the object; the working frame has the surface's centroid at 0 and diameter 1.
+
+    Of an object that says what was observed of it, surface that nobody measured, or nobody can have seen from its
+    front, is left out, unless too little else is there: a scan shows such surface where it ends, beneath the object and
+    behind its walls.
+    Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
+    """
+    low, high = obj.bounds
+    rough = _box_frame(low, high)
+    field = WorkingField(obj, rough)
+    low, high = rough.into(low).double(), rough.into(high).double()
+    known = observation_of(obj)
+    observation = None if known is None else WorkingObservation(known, rough)
+    extent = None if observation is None else observation.measured_extent()
+    if extent is not None:
+        low, high = torch.maximum(low, extent[0]), torch.minimum(high, extent[1])
+    inner = crop_to_surface(field.value, low, high, SAMPLING.object_base)
+    cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels)
+    found = _samples_near(field, cells, limit, generator)
+    found = found[space.faces_outside(found.points, found.normals)]
+    inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
+    found = found[inside]
+    if observation is not None:
+        measured = observation.on_surface(found.points)
+        measured &= ~observation.faces_unobserved(found.points, found.normals)
+        found = found[measured] if int(measured.sum()) >= MIN_POINTS else found
+    require_object_surface(len(found))
+    surface = found.on_surface()
+    size = diameter(surface)
+    center = surface.double().mean(0)
+    frame = WorkingFrame(rough.out_of(center[None])[0], rough.length * size)
+    samples = Samples((found.points - center.float()) / size, found.values / size, found.normals)
+    return SampledField(WorkingField(obj, frame), frame, samples, cells.edge / size)
+
+
+def sample_scene_surface(
+    scene: SdfField, detection: OrientedBox, limit: int, generator: torch.Generator
+) -> SampledField:
+    """At most ``limit`` samples of the scene within the grown box; working frame: the box's center, its diagonal 1.
+
+    Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
+    InvalidInputError (FIELD_NOT_FINITE).
+    """
+    require_box_in_scene(scene, detection)
+    frame = WorkingFrame(detection.center.double(), detection.diagonal)
+    field = WorkingField(scene, frame)
+    half = detection.size.double() / detection.diagonal * (SAMPLING.box_growth / 2)
+    rotation = detection.rotation.double()
+
+    def value(local: Tensor) -> Tensor:
+        return field.value(local.to(rotation) @ rotation.T)
+
+    cells, space = surface_cells(value, -half, half, SAMPLING.scene_base, SAMPLING.levels)
+    cells = Cells(cells.centers @ rotation.T, cells.values, cells.edge)
+    found = _samples_near(field, cells, limit, generator)
+    axes = rotation.to(found.points)
+    found = found[space.faces_outside(found.points @ axes, found.normals @ axes)]
+    bounds = frame.into(scene.bounds)
+    found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
+    require_scene_surface(len(found))
+    return SampledField(field, frame, found, cells.edge)
+
+
+def _box_frame(low: Tensor, high: Tensor) -> WorkingFrame:
+    return WorkingFrame(((low + high) / 2).double(), float((high - low).norm()))
+
+
+def _samples_near(field: WorkingField, cells: Cells, limit: int, generator: torch.Generator) -> Samples:
+    """At most ``limit`` samples: one Newton step from the cells' centers to the surface, value and normal at its
+    end."""
+    close = (cells.values.abs() <= SAMPLING.max_cell_distance * cells.edge).nonzero().squeeze(-1)
+    if close.numel() > limit:
+        close = close[torch.randperm(close.numel(), generator=generator)[:limit]]
+    start = cells.centers[close].float()
+    if start.shape[0] == 0:
+        return Samples(start, start[:, 0], start)
+    found = project_to_surface(field.value_and_gradient, start, 1, SAMPLING.min_slope)
+    length = found.gradient.norm(dim=-1)
+    kept = (found.distance.abs() <= SAMPLING.max_sample_distance * cells.edge) & (length >= SAMPLING.min_slope)
+    return Samples(found.points[kept], found.distance[kept], found.gradient[kept] / length[kept, None])

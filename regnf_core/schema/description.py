@@ -2,18 +2,250 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, MaxLen
-from pydantic import AfterValidator, FiniteFloat
+from pydantic import AfterValidator, Field, FiniteFloat
 
-from regnf_core.schema.color import ColorDescription, NetworkColor, ValueColor, split_color
-from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
-from regnf_core.schema.similarity import require_similarity
-from regnf_core.schema.tensor_check import TensorSpec, require
+from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.tensor_check import (
+    INTEGER_TYPES,
+    TensorSpec,
+    check_layers,
+    count_layers,
+    count_rows,
+    layer_tensor_names,
+    require,
+    require_names,
+    require_shape,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+# How a field's color is stored: a small network that follows the geometry's, or colors at vertices and nodes.
+
+COLOR = "color"
+"""The description's entry; the tensors' names begin with it and a dot."""
+VALUES = "values"
+"""The tensor of colors at vertices and nodes, without the beginning."""
+TABLE = "hash_table"
+"""The tensor of the color's own grid, without the beginning."""
+_PREFIX = f"{COLOR}."
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DirectionEncoding:
+    """Of the line of sight. frequency: the direction d, then sines and cosines of 2^k d (times 2 pi), k < degree, each
+    axis by axis. spherical_harmonics: all real ones of orders below ``degree``, as tiny-cuda-nn sorts them."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    encoding: Literal["frequency", "spherical_harmonics"]
+    degree: Annotated[int, Ge(0), Le(24)]
+    two_pi: bool = False
+
+    @property
+    def width(self) -> int:
+        """Columns of the network's input."""
+        return 3 + 6 * self.degree if self.encoding == "frequency" else self.degree**2
+
+
+@dataclass(frozen=True)
+class NetworkColor:
+    """A network after the geometry's; see :class:`regnf_core.fields.color_head.ColorHead`.
+
+    Its input: position, encoded direction, gradient, a hash grid's features, what the geometry's last layer is given.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    form: Literal["network"]
+    position: bool = True
+    """Whether the input has the position, contracted where the geometry's is."""
+    direction: DirectionEncoding | None = None
+    """None: the color is the same from everywhere."""
+    gradient: Literal["raw", "unit"] | None = "raw"
+    """Of the function by the position. unit: divided by its length."""
+    hash: HashGridConfig | None = None
+    """A grid of its own; None: there is none."""
+    grid_radius: Annotated[float, Gt(0), Le(1e6)] = 2.0
+    """It covers [-grid_radius, grid_radius]^3."""
+    output: Literal["sigmoid", "linear"] = "sigmoid"
+    padding: Annotated[float, Ge(0), Le(1)] = 0.0
+    """The result is multiplied by 1 + 2 padding, less the padding."""
+
+    @property
+    def own_width(self) -> int:
+        """Columns of the input before those of the geometry."""
+        encodings = sum(encoding.width for encoding in (self.direction, self.hash) if encoding is not None)
+        return 3 * self.position + encodings + (0 if self.gradient is None else 3)
+
+    def check(self, tensors: Mapping[str, TensorSpec], hidden_width: int) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH).
+
+        tensors: names without their beginning · hidden_width: columns of the geometry's last layer.
+        """
+        layers = count_layers(tensors)
+        require_names(tensors, layer_tensor_names(layers) | ({TABLE} if self.hash is not None else set()))
+        if self.hash is not None:
+            require_shape(tensors, TABLE, (self.hash.entries, self.hash.features_per_level))
+        check_layers(tensors, self.own_width + hidden_width)
+        rows = count_rows(tensors, f"layers.{layers - 1}.weight")
+        require(rows == 3, f"the color's network has {rows} results, expected 3")
+        if self.direction is not None and self.direction.encoding == "spherical_harmonics":
+            require(1 <= self.direction.degree <= 4, "spherical harmonics are known of degrees 1 to 4")
+
+
+@dataclass(frozen=True)
+class ValueColor:
+    """Colors where the kind has its numbers: at a mesh's vertices, at the nodes of a grid or of blocks of voxels."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    form: Literal["values"]
+
+    def check(self, tensors: Mapping[str, TensorSpec], shape: tuple[int, ...]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH). shape: of the vertices or nodes."""
+        require_names(tensors, {VALUES})
+        require_shape(tensors, VALUES, (*shape, 3))
+
+
+ColorDescription = Annotated[NetworkColor | ValueColor, Field(discriminator="form")]
+
+
+def split_color(tensors: Mapping[str, T]) -> tuple[dict[str, T], dict[str, T]]:
+    """The geometry's tensors, and the color's with names without their beginning."""
+    own = {name: value for name, value in tensors.items() if not name.startswith(_PREFIX)}
+    color = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
+    return own, color
+
+
+def color_tensors(tensors: Mapping[str, T]) -> dict[str, T]:
+    """The color's tensors by the names that they have in the file."""
+    return {_PREFIX + name: value for name, value in tensors.items()}
+
+
+# How a field's observation is stored: the grid's place, and its voxels' states in one tensor, sixteen to a number.
+
+OBSERVATION = "observation"
+"""The tensor's name, and the description's entry."""
+UNSEEN, FREE, SURFACE = 0, 1, 2
+"""A voxel's states: unobserved; seen to be free; a surface was measured in it."""
+_BITS, _PER_WORD = 2, 16
+MAX_COUNT = 512
+"""Voxels along an axis, at most."""
+FARTHEST = 1e6
+"""The largest coordinate."""
+_Coordinate = Annotated[float, Ge(-FARTHEST), Le(FARTHEST)]  # which no NaN is
+_Count = Annotated[int, Ge(1), Le(MAX_COUNT)]
+
+
+@dataclass(frozen=True)
+class ObservationGrid:
+    """A grid of cubic voxels, in the coordinates of the kind's function."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    low: tuple[_Coordinate, _Coordinate, _Coordinate]
+    """The lowest corner."""
+    voxel: Annotated[float, Gt(0), Le(1e6)]
+    """A voxel's edge."""
+    counts: tuple[_Count, _Count, _Count]
+
+    @property
+    def voxels(self) -> int:
+        """How many there are."""
+        return self.counts[0] * self.counts[1] * self.counts[2]
+
+    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless the states are stored as this grid asks."""
+        require(OBSERVATION in tensors, f"the description has an {OBSERVATION}, but there is no such tensor")
+        require(tensors[OBSERVATION].dtype in INTEGER_TYPES, f"{OBSERVATION} is not stored as whole numbers")
+        require_shape(tensors, OBSERVATION, (-(-self.voxels // _PER_WORD),))
+
+    def pack(self, states: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """States (X, Y, Z) as stored: two bits each, z fastest, sixteen to a number from its lowest bits up."""
+        flat = np.zeros(-(-self.voxels // _PER_WORD) * _PER_WORD, np.uint32)
+        flat[: self.voxels] = states.ravel()
+        words = flat.reshape(-1, _PER_WORD) << (_BITS * np.arange(_PER_WORD, dtype=np.uint32))
+        packed: NDArray[np.int32] = np.bitwise_or.reduce(words, axis=1).astype("<u4").view("<i4")
+        return packed
+
+    def unpack(self, words: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """States (X, Y, Z) from what :meth:`pack` made. The fourth state that two bits have is read as SURFACE."""
+        octets = np.ascontiguousarray(words, "<i4").view(np.uint8)  # four voxels each: no copy wider than the states
+        states: NDArray[np.uint8] = (octets[:, None] >> np.arange(0, 8, _BITS, dtype=np.uint8)) & np.uint8(3)
+        grid: NDArray[np.uint8] = np.minimum(states.ravel()[: self.voxels], np.uint8(SURFACE)).reshape(self.counts)
+        return grid
+
+
+# Similarities as rows of plain numbers: the check that files and descriptions share. Neither torch nor numpy.
+
+_UNSIMILAR = 1e-4
+"""Of the squared scale: how far a similarity's rows may be from orthogonal and equally long."""
+_NEAR = 8.0
+"""A box within so many of its diagonals of the origin: float32, of 24 bits, keeps places to 5e-7 of the diagonal."""
+_MatrixRows = Sequence[Sequence[float]]
+
+
+def require_similarity(rows: _MatrixRows) -> None:
+    """Raise ValueError unless the 4 x 4 ``rows`` are a rotation times one positive factor, and a shift."""
+    linear = [row[:3] for row in rows[:3]]
+    (a, b, c), (d, e, f), (g, h, i) = linear
+    volume = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    square = max(volume, 0.0) ** (2 / 3)
+    products = [[sum(x * y for x, y in zip(u, v, strict=True)) - square * (u is v) for v in linear] for u in linear]
+    if not 0 < square < 1e300 or not max(abs(value) for row in products for value in row) <= _UNSIMILAR * square:
+        raise ValueError("is not a rotation times one positive factor")
+    if tuple(rows[3]) != (0.0, 0.0, 0.0, 1.0):
+        raise ValueError("its last row is not 0 0 0 1")
+
+
+def moved_box(rows: _MatrixRows, box: _MatrixRows) -> list[list[float]]:
+    """Lowest and highest corner of the box round ``box`` after the similarity."""
+    low, high = [], []
+    for *linear, shift in rows[:3]:
+        ends = [sorted((factor * a, factor * b)) for factor, a, b in zip(linear, *box, strict=True)]
+        low.append(shift + sum(end[0] for end in ends))
+        high.append(shift + sum(end[1] for end in ends))
+    return [low, high]
+
+
+def local_origin(box: _MatrixRows) -> tuple[float, float, float] | None:
+    """The place near the middle of a far ``box`` that is to be subtracted, in float64, before anything is float32.
+
+    It is a multiple of a power of two, so that the subtraction is exact. None: the box lies near the origin.
+    """
+    diagonal = math.dist(*box)
+    reach = max(abs(value) for corner in box for value in corner)
+    if not 0.0 < diagonal < math.inf or reach <= _NEAR * diagonal:
+        return None
+    step = 2.0 ** math.floor(math.log2(diagonal))
+    x, y, z = (step * round((low + high) / 2.0 / step) for low, high in zip(*box, strict=True))
+    return x, y, z
+
+
+def shift_rows(shift: Sequence[float]) -> list[list[float]]:
+    """The 4 x 4 rows of a shift."""
+    return [[*(float(row == column) for column in range(3)), value] for row, value in enumerate(shift)] + [
+        [0.0, 0.0, 0.0, 1.0]
+    ]
+
+
+def product(first: _MatrixRows, second: _MatrixRows) -> list[list[float]]:
+    """The 4 x 4 rows of ``first`` after ``second``."""
+    return [
+        [sum(a * b for a, b in zip(row, column, strict=True)) for column in zip(*second, strict=True)] for row in first
+    ]
+
 
 FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
 Corner = tuple[float, float, float]

@@ -11,10 +11,9 @@ import torch
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from regnf_core.errors import InvalidInputError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.transformed import near_origin
-from regnf_core.files import atomic_path
+from regnf_core.errors import InvalidInputError, atomic_path
+from regnf_core.fields.composite import near_origin
+from regnf_core.fields.observation import SdfField
 from regnf_core.surface.isosurface import Floats, Lattice, Surface, extract_surface
 
 MESH_FORMATS = ("glb", "ply")

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

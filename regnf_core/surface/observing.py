@@ -6,6 +6,7 @@ and what lies behind was not. Surface that a field has invented is behind what w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -13,14 +14,70 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.observation import Observation
+from regnf_core.fields.observation import Observation, SdfField
 from regnf_core.geometry.pinhole import PinholeCameras
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
-from regnf_core.surface.projection import project_to_surface
-from regnf_core.surface.sphere_tracing import finite_distance
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
+from regnf_core.surface.result_clouds import project_to_surface
+from regnf_core.surface.sphere_tracing import Rays, clip_to_region, finite_distance, free_lengths, shortest_step
 from regnf_core.surface.surface_cells import Cells, surface_cells
-from regnf_core.surface.traced_depths import TracedDepths, free_depths, trace_depths
+
+# Coarse depth images of a field, as cameras at given places would have taken them: by sphere tracing.
+
+
+@dataclass(frozen=True, eq=False)
+class TracedDepths:
+    """One image. free: (H, W) float32, depths along the camera's axis up to which its rays are free, 0 where nothing is
+    known · meets: (H, W) bool, whether a surface ends them there."""
+
+    free: Tensor
+    meets: Tensor
+
+    def places(self) -> Tensor:
+        """(H, W, 2) float64, the image coordinates of its rays."""
+        return _places(*self.free.shape)
+
+    def around(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """The least and the largest depth (M,), (M,) of the four rays round image coordinates (M, 2)."""
+        height, width = self.free.shape
+        size = torch.tensor([width, height], dtype=places.dtype)
+        first = (places * size - 0.5).floor().long()
+        column, row = first.unbind(-1)
+        columns = [column.clamp(0, width - 1), (column + 1).clamp(0, width - 1)]
+        rows = [row.clamp(0, height - 1), (row + 1).clamp(0, height - 1)]
+        depths = [self.free.view(-1)[y * width + x] for x in columns for y in rows]
+        least = torch.minimum(torch.minimum(depths[0], depths[1]), torch.minimum(depths[2], depths[3]))
+        largest = torch.maximum(torch.maximum(depths[0], depths[1]), torch.maximum(depths[2], depths[3]))
+        return least, largest
+
+
+def trace_depths(field: SdfField, cameras: PinholeCameras, rays_each: int) -> list[TracedDepths]:
+    """An image a camera, of about ``rays_each`` rays, evenly spread over it. The region is the field's bounds."""
+    return [_image(field, cameras, camera, rays_each) for camera in range(len(cameras))]
+
+
+def _image(field: SdfField, cameras: PinholeCameras, camera: int, count: int) -> TracedDepths:
+    width = max(2, round(math.sqrt(count * float(cameras.aspect[camera]))))
+    height = max(2, round(count / width))
+    places = _places(height, width).view(-1, 2)
+    free, meets = free_depths(field, cameras.positions[camera], cameras.directions(camera, places))
+    return TracedDepths(free.view(height, width), meets.view(height, width))
+
+
+def _places(height: int, width: int) -> Tensor:
+    rows = (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    columns = (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    return torch.stack([columns.expand(height, width), rows[:, None].expand(height, width)], -1)
+
+
+def free_depths(field: SdfField, position: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """How often its direction (M, 3) each ray from ``position`` is free, (M,), and whether it ends at a surface."""
+    lengths = directions.norm(dim=-1)
+    rays = Rays(position.expand_as(directions).float(), (directions / lengths[:, None]).float())
+    low, high = field.bounds
+    entry, exit_ = clip_to_region(rays, low, high)
+    free, meets = free_lengths(field, rays, entry, exit_, shortest_step(float((high - low).norm())))
+    return free / lengths.float(), meets
+
 
 _BASE = 40
 """Voxels along the longest side of what was seen, before they are halved."""

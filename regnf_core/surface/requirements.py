@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from regnf_core.detections import require_in_scene
 from regnf_core.errors import NoSurfaceError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 
 MIN_POINTS = 50

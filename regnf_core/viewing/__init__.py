@@ -1,6 +1,5 @@
 """The files of a registration: result document, point clouds, history, residuals, picture."""
 
-from regnf_core.viewing.artifacts import write_artifacts
-from regnf_core.viewing.document import ranking_document, result_document
+from regnf_core.viewing.document import ranking_document, result_document, write_artifacts
 
 __all__ = ["ranking_document", "result_document", "write_artifacts"]

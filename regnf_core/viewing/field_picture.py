@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.surface.isosurface import Lattice, Progress, Surface, extract_surface
 from regnf_core.viewing.splats import Floats, Surfels, render, view_from
 

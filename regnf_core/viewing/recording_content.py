@@ -27,13 +27,48 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.errors import InvalidInputError
+from regnf_core.errors import InvalidInputError, verdict_hint, verdict_in_words
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.result import Considered, RegistrationResult
-from regnf_core.viewing.artifacts import CONTEXT_COLOR
-from regnf_core.viewing.recording_text import label_of, verdict_text
+from regnf_core.result import Considered, ConsideredPose, RegistrationResult
+from regnf_core.viewing.document import CONTEXT_COLOR
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, residual_colors_of
+
+# The texts of a recording: the verdict as Markdown, and what is said of a pose that was judged.
+
+
+def label_of(one: ConsideredPose) -> str:
+    """Probability and reason, short."""
+    return f"{_percent(one.metrics.get('probability'))}, {one.reason}"
+
+
+def verdict_text(result: RegistrationResult, object_name: str | None = None) -> str:
+    """Verdict, reason, probability, hint, the transform and the poses that were judged, as Markdown."""
+    reason = result.verdict_reason
+    lines = [f"# {result.verdict}", "", f"**{reason}**: {verdict_in_words(reason, result.verdict_limit)}", ""]
+    if hint := verdict_hint(reason, result.options):
+        lines += [hint, ""]
+    if object_name is not None:
+        lines += [f"Object: `{object_name}`", ""]
+    if result.probability is not None:
+        lines += [f"Probability that the answer is right: {_percent(result.probability)}", ""]
+    lines += ["T_scene_object, the object's pose in the scene (object coordinates to scene coordinates):", "", "```"]
+    lines += [" ".join(f"{value: .6f}" for value in row) for row in result.T_scene_object.matrix().tolist()]
+    lines += ["```", ""]
+    if result.considered is not None:
+        lines += ["Poses that were judged (`scene/considered`):", "", "| | probability | reason | |"]
+        lines += ["|---|---|---|---|"]
+        lines += [
+            f"| {number} | {_percent(one.metrics.get('probability'))} | {one.reason} | "
+            f"{verdict_in_words(one.reason, one.limit)} |"
+            for number, one in enumerate(result.considered.poses)
+        ]
+    return "\n".join(lines)
+
+
+def _percent(probability: float | None) -> str:
+    return "no probability" if probability is None else f"{100 * probability:.1f} %"
+
 
 TIMELINE = "step"
 _BOX_COLOR = (0.25, 0.65, 0.35)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
-from regnf_data.sdfstudio_reader import USUAL_BOUNDS
+from regnf_data.sdfstudio import USUAL_BOUNDS
 from regnf_fit.images.agreement import score_of_scale
 
 Floats = NDArray[np.float64]

@@ -5,6 +5,7 @@ The geometry does not change. Where rays meet it is computed once, so that an it
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,14 +13,140 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from regnf_core.fields.color_head import Appearance, ColorHead
+from regnf_core.fields.color_head import Appearance, ColorHead, PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.schema.color import TABLE, DirectionEncoding, NetworkColor, color_tensors
+from regnf_core.schema.description import TABLE, DirectionEncoding, NetworkColor, color_tensors
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_fit.images.held_out import first_hits
-from regnf_fit.images.network import RadianceField
-from regnf_fit.images.rays import PixelRays
-from regnf_fit.network import GRID_RADIUS, random_layers
+from regnf_fit.images.preparation import PixelRays
+from regnf_fit.network import GRID_RADIUS, StartShape, TrainableField, random_layers
+from regnf_fit.options import ReconstructionOptions
+
+# The parameters of a field that is being fitted to images: geometry, color and the opacity's sharpness.
+
+DIRECTION_DEGREE = 4
+COLOR_INPUTS = 3 + (3 + 6 * DIRECTION_DEGREE) + 3
+"""Point, direction with its sines and cosines, normal; the geometry's feature follows."""
+_COLOR_LAYERS = 2
+
+
+class RadianceField(TrainableField):
+    """A trainable field with colors.
+
+    The color's network has the same inputs as that of neus-facto, in its order: point, direction, normal, feature.
+    """
+
+    options: ReconstructionOptions
+
+    def __init__(self, options: ReconstructionOptions, start: StartShape, generator: torch.Generator) -> None:
+        super().__init__(options, start, generator)
+        self._direction_encoding = PositionalEncoding(DIRECTION_DEGREE)
+        width = options.hidden_width
+        feature = torch.randn(options.feature_width, width, generator=generator) * math.sqrt(1.0 / width)
+        self.feature_weight = nn.Parameter(feature)
+        self.feature_bias = nn.Parameter(torch.zeros(options.feature_width))
+        widths = [COLOR_INPUTS + options.feature_width] + [width] * _COLOR_LAYERS + [3]
+        weights, biases = random_layers(widths, generator)
+        self.color_weights, self.color_biases = nn.ParameterList(weights), nn.ParameterList(biases)
+        self.background = nn.Parameter(torch.zeros(3))
+        """Logit of the color behind everything."""
+        self.log_sharpness = nn.Parameter(torch.zeros(()))
+        """Logarithm of the sharpness over the least one that the schedule allows."""
+
+    def feature(self, hidden: Tensor) -> Tensor:
+        """The feature (N, F) that the color depends on, of what the geometry's last layer is given (N, H)."""
+        return torch.addmm(self.feature_bias, hidden, self.feature_weight.T)
+
+    def color(self, points: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
+        """Color (N, 3) in [0, 1] of points seen along unit ``directions`` (N, 3)."""
+        encoded = self._direction_encoding.encode(directions)
+        h = torch.cat((points, directions, encoded, normals, features), dim=-1)
+        for weight, bias in zip(self.color_weights[:-1], self.color_biases[:-1], strict=True):
+            h = torch.relu(torch.addmm(bias, h, weight.T))
+        return torch.sigmoid(torch.addmm(self.color_biases[-1], h, self.color_weights[-1].T))
+
+
+# How well a field agrees with pixels that it was not fitted to.
+
+_STEPS = 64
+_HELD_OUT_CHUNK = 4096
+_SHORTEST = 0.002
+"""Diagonals: the least step; a field that is not an exact distance would otherwise be approached for ever."""
+_BISECTIONS = 6
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Depth errors: field units, of rays that met a surface, where a depth was measured, not before the bounds."""
+
+    depth_error: float | None
+    depth_error_median: float | None
+    eikonal_error: float
+
+
+@dataclass(frozen=True)
+class FirstHits:
+    """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3), not of unit length."""
+
+    depths: Tensor
+    normals: Tensor
+
+
+@torch.no_grad()
+def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
+    """Where rays first enter matter: sphere tracing with a least step, then bisection."""
+    parts = [_traced(field, rays.take(index), size) for index in _chunks(len(rays))]
+    if not parts:
+        empty = torch.zeros(0, 3)
+        return FirstHits(empty[:, 0], empty)
+    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals")))
+
+
+@torch.no_grad()
+def evaluate(field: RadianceField, rays: PixelRays, size: float) -> HeldOutErrors:
+    """The errors at held-out rays, but for those that something before the bounds ends: they show nothing of it."""
+    occluded = (rays.depths > 0.0) & (rays.depths < rays.near)
+    rays = rays.take(~rays.background & ~occluded)
+    hits = first_hits(field, rays, size)
+    met = hits.depths > 0.0
+    both = met & (rays.depths > 0.0)
+    depth_error = (hits.depths - rays.depths).abs()[both]
+    norms = hits.normals[met].norm(dim=1)
+    return HeldOutErrors(
+        depth_error=float(depth_error.mean()) if both.any() else None,
+        depth_error_median=float(depth_error.median()) if both.any() else None,
+        eikonal_error=float((norms - 1.0).abs().mean()) if met.any() else 1.0,
+    )
+
+
+def _chunks(count: int) -> tuple[Tensor, ...]:
+    return tuple(torch.arange(start, min(start + _HELD_OUT_CHUNK, count)) for start in range(0, count, _HELD_OUT_CHUNK))
+
+
+def _traced(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
+    function = field.function()
+    speed = rays.directions.norm(dim=1)
+    before, depth = rays.near.clone(), rays.near.clone()
+    inside = torch.zeros_like(depth, dtype=torch.bool)
+    for _ in range(_STEPS):
+        active = (~inside & (depth <= rays.far)).nonzero()[:, 0]
+        if len(active) == 0:
+            break
+        moving = rays.take(active)
+        distance = function.value(moving.at(depth[active, None])[:, 0])
+        inside[active] = distance < 0.0
+        on = active[distance >= 0.0]
+        before[on] = depth[on]
+        depth[on] += distance[distance >= 0.0].clamp_min(_SHORTEST * size) / speed[on]
+    hit = inside & (depth > rays.near)
+    low, high = before, depth
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2.0
+        matter = function.value(rays.at(middle[:, None])[:, 0]) < 0.0
+        low, high = torch.where(matter, low, middle), torch.where(matter, middle, high)
+    points = rays.at(high[:, None])[:, 0]
+    normals = function.value_and_gradient(points)[1]
+    return FirstHits(torch.where(hit, high, 0.0), normals)
+
 
 _RAYS = 60_000
 """At most so many pixels are fitted to."""

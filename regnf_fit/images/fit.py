@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import math
+import pickle
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,33 +14,184 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
+from numpy.typing import NDArray
+from torch import Tensor
 
-from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
+from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError, atomic_path
 from regnf_core.fields.build import usable_device
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.observation import Observation
-from regnf_core.schema.color import COLOR
-from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.schema.description import COLOR, OBSERVATION, DirectionEncoding, NetworkColor, color_tensors
+from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.capacity import suited
-from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
 from regnf_fit.images.checks import check_bounds
-from regnf_fit.images.color_export import stored_color
-from regnf_fit.images.coloring import SurfaceColor, fit_color
-from regnf_fit.images.held_out import evaluate
+from regnf_fit.images.coloring import COLOR_INPUTS, DIRECTION_DEGREE, RadianceField, SurfaceColor, evaluate, fit_color
+from regnf_fit.images.fusion import MapDistances, ends_of, map_distances, measured_rays, sharp_width
 from regnf_fit.images.held_out_images import held_out_images, likeness
-from regnf_fit.images.map_distances import MapDistances, map_distances
-from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
-from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
-from regnf_fit.images.preparation import PreparedImages, prepare
-from regnf_fit.images.sdfstudio_export import write_sdfstudio
+from regnf_fit.images.preparation import PreparedImages, cells_of, prepare
 from regnf_fit.images.trainer import Trainer
 from regnf_fit.local_frame import LocalFrame
-from regnf_fit.network import GRID_RADIUS
-from regnf_fit.options import FitProgress
+from regnf_fit.network import GRID_RADIUS, POSITION_DEGREE
+from regnf_fit.options import OF_IMAGES, FitProgress, ReconstructionOptions, ReconstructionReport, grid_of_levels
+
+# How large a network images need: a grid as fine as their pixels, with an entry for each cell that shows surface.
+#
+# A hash grid covers [-2, 2]^3, whatever the bounds. In a room of that size a thing is a few per cent of it, and its
+# surface is only one of many that share the table: one size of grid cannot suit a cup and a room alike.
+
+_LEVELS = {512: 8, 1024: 9}
+"""Of a grid with so many nodes along an edge: neighboring levels differ by a factor of about 1.65."""
+_LEAST_LOG2, _MOST_LOG2 = 15, 18
+
+
+def suited(options: ReconstructionOptions, prepared: PreparedImages) -> ReconstructionOptions:
+    """The options with the grid that these images ask for, where none was given."""
+    return replace(options, grid=grid_of(prepared, options.table_log2)) if options.grid is OF_IMAGES else options
+
+
+def grid_of(prepared: PreparedImages, table_log2: int | None = None) -> HashGridConfig:
+    """The grid whose finest cells are about as wide as a pixel of the sharper images at its surface, and whose levels
+    have an entry for every such cell that shows surface; within limits. Without depths: the smallest.
+
+    table_log2: log2 of the entries a level, where they are given.
+    """
+    surface = measured_rays(prepared)
+    if len(surface) == 0:
+        return grid_of_levels(_LEVELS[min(_LEVELS)], min(_LEVELS), table_log2 or _LEAST_LOG2)
+    width = sharp_width(prepared, surface)
+    nodes = 2 ** math.ceil(math.log2(2.0 * GRID_RADIUS / width))
+    nodes = min(max(nodes, min(_LEVELS)), max(_LEVELS))
+    cells = cells_of(ends_of(surface), 2.0 * GRID_RADIUS / nodes)
+    needed = min(max(math.ceil(math.log2(len(cells.counts))), _LEAST_LOG2), _MOST_LOG2)
+    return grid_of_levels(_LEVELS[nodes], nodes, table_log2 or needed)
+
+
+# A fit's state on disk, so that an interrupted fit goes on as if it had not been.
+
+_VERSION = 4
+
+
+def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:
+    """Write a trainer's state atomically. key: of the data and options that it belongs to."""
+    with atomic_path(path, durable=True) as temporary, temporary.open("xb") as file:
+        torch.save({"version": _VERSION, "key": key, "state": state}, file)
+
+
+def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
+    """The state in ``path``. Raises InvalidInputError (CHECKPOINT_INVALID, CHECKPOINT_OF_ANOTHER_FIT)."""
+    try:
+        content = torch.load(path, weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
+        raise InvalidInputError(f"{path.name} is not a checkpoint of a fit", reason="CHECKPOINT_INVALID") from error
+    if not isinstance(content, dict) or content.get("version") != _VERSION:
+        raise InvalidInputError(f"{path.name} is not a checkpoint of a fit", reason="CHECKPOINT_INVALID")
+    if content.get("key") != key:
+        raise InvalidInputError(
+            f"{path.name} belongs to a fit of other data or options", reason="CHECKPOINT_OF_ANOTHER_FIT"
+        )
+    state: dict[str, Any] = content["state"]
+    return state
+
+
+# The color of a fitted field as a safe field keeps it: a network that follows the geometry's.
+
+_FORM = NetworkColor("network", direction=DirectionEncoding("frequency", DIRECTION_DEGREE), gradient="unit")
+
+
+def stored_color(field: RadianceField) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
+    """The description's entry, and the tensors by their names in the file.
+
+    No activation stands between the geometry's feature and the color's first layer: they are one layer of the file.
+    """
+    weights = [_double(weight) for weight in field.color_weights]
+    biases = [_double(bias) for bias in field.color_biases]
+    own, features = weights[0][:, :COLOR_INPUTS], weights[0][:, COLOR_INPUTS:]
+    weights[0] = np.concatenate((own, features @ _double(field.feature_weight)), axis=1)
+    biases[0] = biases[0] + features @ _double(field.feature_bias)
+    layers = {f"layers.{i}.weight": weight.astype(np.float32) for i, weight in enumerate(weights)}
+    layers |= {f"layers.{i}.bias": bias.astype(np.float32) for i, bias in enumerate(biases)}
+    return asdict(_FORM), color_tensors(layers)
+
+
+def _double(tensor: Tensor) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = tensor.detach().double().cpu().numpy()
+    return values
+
+
+# A fitted field in the layout of sdfstudio's neus-facto checkpoints, colors included.
+
+_EMBEDDING = 32
+"""Columns of the color's network for an image's appearance, which our fields do not have: zeros."""
+
+
+def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path, frame: LocalFrame) -> None:
+    """Write a checkpoint {step, pipeline} to ``path`` atomically. bounds: (2, 3), the field's frame · frame: that one;
+    where it is not the images' own, dataparser_transforms.json beside the checkpoint says how it lies in theirs.
+
+    The distances are those of the field before its table is rounded to half precision. What the tensors do not say
+    stands in ``config.yml`` beside it, as sdfstudio names it; a file of that name that is there already stays.
+    """
+    layers = dict(enumerate(zip(field.weights, field.biases, strict=True)))
+    last = len(layers) - 1
+    entries: dict[str, Tensor] = {"aabb": bounds.float(), "encoding.params": field.table.flatten()}
+    for i, (weight, bias) in layers.items():
+        if i == last:  # the feature's rows follow the distance's
+            weight, bias = torch.cat((weight, field.feature_weight)), torch.cat((bias, field.feature_bias))
+        entries |= _normalized(f"glin{i}", weight, bias)
+    colors = zip(field.color_weights, field.color_biases, strict=True)
+    for i, (weight, bias) in enumerate(colors):
+        if i == 0:
+            weight = torch.cat((weight, weight.new_zeros(len(weight), _EMBEDDING)), dim=1)
+        entries |= _normalized(f"clin{i}", weight, bias)
+    # sdfstudio keeps a tenth of the sharpness's logarithm; the density of VolSDF beside it is not used
+    entries["deviation_network.variance"] = torch.tensor([math.log(sharpness) / 10.0])
+    entries["laplace_density.beta"] = torch.tensor([0.1])
+    entries["laplace_density.beta_min"] = torch.tensor([1e-4])
+    entries["embedding_appearance.embedding.weight"] = torch.zeros(1, _EMBEDDING)
+    pipeline = {f"_model.field.{name}": value.detach().cpu().clone() for name, value in entries.items()}
+    with atomic_path(path) as temporary:
+        torch.save({"step": field.options.iterations, "pipeline": pipeline}, temporary)
+    if not frame.same:
+        turn = [[*row, -float(shift)] for row, shift in zip(np.eye(3).tolist(), frame.origin, strict=True)]
+        with atomic_path(path.with_name("dataparser_transforms.json")) as temporary:
+            temporary.write_text(json.dumps({"transform": turn, "scale": frame.scale}), encoding="utf-8")
+    settings = path.with_name("config.yml")
+    if not settings.exists():
+        with atomic_path(settings) as temporary:
+            temporary.write_text(yaml.safe_dump(_settings(field), sort_keys=False), encoding="utf-8")
+
+
+def _settings(field: RadianceField) -> dict[str, Any]:
+    grid = field.options.grid
+    sdf_field = {
+        "num_layers": field.options.hidden_layers,
+        "hidden_dim": field.options.hidden_width,
+        "use_grid_feature": True,
+        "encoding_type": "hash",
+        "num_levels": grid.levels,
+        "max_res": round(grid.scales()[-1]) + 1,
+        "base_res": grid.base_resolution,
+        "log2_hashmap_size": grid.log2_table_size,
+        "hash_features_per_level": grid.features_per_level,
+        "hash_smoothstep": grid.interpolation == "smoothstep",
+        "position_encoding_max_degree": POSITION_DEGREE,
+        "use_position_encoding": True,
+    }
+    return {"method_name": "neus-facto", "pipeline": {"model": {"sdf_field": sdf_field}}}
+
+
+def _normalized(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:
+    """A layer with weight normalization: W = g v / |v|, row by row; here v = W."""
+    return {
+        f"{name}.weight_g": weight.norm(dim=1, keepdim=True),
+        f"{name}.weight_v": weight,
+        f"{name}.bias": bias,
+    }
+
 
 _REPORT_EVERY = 25
 _CHECKPOINTS = 10

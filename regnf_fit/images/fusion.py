@@ -5,27 +5,121 @@ Where depths are good, such a map holds fine parts better than a network that is
 
 from __future__ import annotations
 
+import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors.numpy import load_file
+from torch import Tensor
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.schema.safe_format import read_description, write_safe_field
-from regnf_data.fusing import Progress
+from regnf_data.fusing import BlockGrid, DepthImages, Progress, fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
-from regnf_fit.images.measured import ends_of, measured_rays
-from regnf_fit.images.measured_map import MapSize, map_grid, write_map
 from regnf_fit.images.observing import attach_observation
-from regnf_fit.images.preparation import prepare
-from regnf_fit.images.rays import PixelRays
+from regnf_fit.images.preparation import PixelRays, PreparedImages, cells_of, in_boxes, measured_within, prepare, uneven
 from regnf_fit.local_frame import LocalFrame
+
+# The surface that depth images measured, and how wide their pixels are at it.
+
+_SHARP = 0.25
+"""The share of the pixels that are no wider at their surface than :func:`sharp_width`."""
+
+
+def measured_rays(prepared: PreparedImages) -> PixelRays:
+    """The training rays whose depth lies within the bounds."""
+    return prepared.training.take(measured_within(prepared.training))
+
+
+def ends_of(rays: PixelRays) -> Tensor:
+    """(R, 3), where rays with depths end."""
+    return rays.at(rays.depths[:, None])[:, 0]
+
+
+def sharp_width(prepared: PreparedImages, rays: PixelRays) -> float:
+    """The width of a pixel of the sharper images at its surface, field units; of at least one ray."""
+    return prepared.pixel * float(np.quantile(rays.depths.numpy(), _SHARP))
+
+
+# The map of truncated distances that posed depth images fuse to: how wide its voxels are, and what is fused.
+#
+# The distances are averaged over the images (Curless and Levoy 1996) and kept in blocks of voxels near surfaces
+# alone.
+
+_TRUNCATION = 4.0
+"""Voxels, at least."""
+_SPREADS = 6.0
+"""Truncations, at least, in standard deviations of one image's depths from another's, measured across the surface.
+Depths are left out of voxels farther than a truncation behind them: where it is narrow, those that were read too near
+are left out and those read too far are not, so that surfaces recede; where it is wide, thin parts swell."""
+_LEAST_SPREADS = 0.5
+"""Voxels, at least, in these deviations: smaller ones say no more, and the truncation would have many."""
+_BLOCK, _MOST_BLOCKS = 8.0, 20_000
+"""Voxels along a block's edge, and blocks with measured points at most: voxels that nobody gave grow beyond."""
+_REFUSED = 10
+"""Voxels so many times smaller than a pixel are refused, and so many times the blocks: they would take gigabytes."""
+_GROWTH = 1.1
+
+
+@dataclass(frozen=True)
+class MapSize:
+    """voxel: from node to node, field units; None: as wide as a pixel of the sharper images is at its surface, or as
+    noise and many blocks allow · truncation: voxels; None: 4, or 6 standard deviations of the depths from image to
+    image."""
+
+    voxel: float | None = None
+    truncation: float | None = None
+
+
+def map_grid(prepared: PreparedImages, rays: PixelRays, size: MapSize) -> BlockGrid:
+    """The voxels of a map. rays: those that were measured, at least one.
+
+    Raises InvalidOptionsError for voxels that are too small for the surface that was measured.
+    """
+    width, ends = sharp_width(prepared, rays), ends_of(rays)
+    spread = prepared.spread.median(rays.depths.numpy())
+    voxel = size.voxel or max(width, _LEAST_SPREADS * spread)
+    while (blocks := len(cells_of(ends, _BLOCK * voxel).counts)) > _MOST_BLOCKS and size.voxel is None:
+        voxel *= _GROWTH
+    if voxel < width / _REFUSED or blocks > _REFUSED * _MOST_BLOCKS:
+        raise InvalidOptionsError(f"voxels of {voxel:.3g} are too small for pixels that are {width:.3g} wide there")
+    truncation = size.truncation or max(_TRUNCATION, _SPREADS * spread / voxel)
+    return BlockGrid(voxel, truncation, float(rays.depths.max()))
+
+
+def write_map(
+    images: PosedImages, grid: BlockGrid, path: Path, progress: Progress | None = None, colors: bool = True
+) -> PosedImages:
+    """Write the safe field that ``images``, which have depths, fuse to within their bounds; the images as fused.
+
+    colors: whether the map has colors.
+    """
+    assert images.depths is not None
+    depths = _within(images, images.depths, grid.voxel * grid.truncation)
+    fused = DepthImages(depths, images.intrinsics, images.T_world_camera, images.colors if colors else None)
+    fuse_blocks(fused, grid, path, progress)
+    return replace(images, depths=depths)
+
+
+def _within(images: PosedImages, depths: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
+    """The depths, 0 where they end farther than ``margin`` outside the bounds, or a mask says background."""
+    height, width = images.size
+    places = np.stack([*np.indices((height, width))[::-1] + 0.5, np.ones((height, width))], axis=-1)
+    low, high = images.bounds[0] - margin, images.bounds[1] + margin
+    kept = np.zeros_like(depths)
+    for number, (depth, K, pose) in enumerate(zip(depths, images.intrinsics, images.T_world_camera, strict=True)):
+        ends = (depth[..., None] * (places @ np.linalg.inv(K).T)) @ pose[:3, :3].T + pose[:3, 3]
+        kept[number] = np.where(((ends >= low) & (ends <= high)).all(axis=-1), depth, 0.0)
+    return kept if images.masks is None else np.where(images.masks, kept, np.float32(0.0))
+
 
 _CHECKED = 20_000
 
@@ -97,3 +191,57 @@ def _error(path: Path, rays: PixelRays) -> float:
     """Median distance of the map at points that were measured."""
     chosen = torch.linspace(0, len(rays) - 1, min(len(rays), _CHECKED)).long()
     return float(open_field(path).signed_distance(ends_of(rays.take(chosen))).abs().median())
+
+
+# Signed distances near the measured surface, from the map that all depths fuse to (:mod:`.measured_map`).
+#
+# A ray tells the distance along itself, with its own noise; the map has the mean of all rays that pass a place. Its
+# places are drawn evenly over the surface, so that near surfaces and far ones count alike.
+
+_POOL = 2_000_000
+_ON_SURFACE = 0.25
+"""The share of the places that lie where a depth ended; the others lie up to ``_REACH`` beside it, along each axis."""
+_REACH = 0.75
+"""Truncations: what is farther from the map's surface is left out."""
+_AT_ONCE = 1 << 17
+
+
+@dataclass(frozen=True)
+class MapDistances:
+    """points: (P, 3), field units · distances: (P,) there · detailed: (D,) indices of those at detail."""
+
+    points: Tensor
+    distances: Tensor
+    detailed: Tensor
+
+    def to(self, device: torch.device) -> MapDistances:
+        """The same on another device."""
+        return MapDistances(self.points.to(device), self.distances.to(device), self.detailed.to(device))
+
+
+def map_distances(images: PosedImages, prepared: PreparedImages, rng: np.random.Generator) -> MapDistances:
+    """Fuse ``images``, which have depths, without the pixels held out, and draw places near their surface."""
+    assert images.depths is not None
+    rays = measured_rays(prepared)
+    grid = map_grid(prepared, rays, MapSize())
+    depths = images.depths.copy()
+    depths.reshape(-1)[prepared.held_out_pixels] = 0.0
+    ends = ends_of(rays)
+    cells = cells_of(ends, grid.voxel)
+    is_detailed = torch.zeros(len(cells.counts), dtype=torch.bool)
+    is_detailed[cells.of[in_boxes(prepared.boxes, ends) | uneven(ends, rays.deviations, prepared.size)]] = True
+    chosen = torch.from_numpy(rng.integers(len(cells.counts), size=_POOL))
+    reach = _REACH * grid.truncation * grid.voxel
+    beside = reach * (2.0 * rng.random((_POOL, 3), np.float32) - 1.0)
+    beside[rng.random(_POOL) < _ON_SURFACE] = 0.0
+    points = cells.means(ends).float()[chosen] + torch.from_numpy(beside)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.safetensors"
+        write_map(replace(images, depths=depths), grid, path, colors=False)
+        distances = _distances(open_field(path), points)
+    near = distances.abs() < reach
+    return MapDistances(points[near], distances[near], is_detailed[chosen[near]].nonzero()[:, 0])
+
+
+def _distances(field: SdfField, points: Tensor) -> Tensor:
+    return torch.cat([field.signed_distance(part) for part in torch.split(points, _AT_ONCE)])

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.coloring import SurfaceColor, appearance_of
-from regnf_fit.images.held_out import first_hits
-from regnf_fit.images.network import RadianceField
-from regnf_fit.images.rays import PixelRays, measured_within, pixel_axes, rays_of_pixels
+from regnf_fit.images.coloring import RadianceField, SurfaceColor, appearance_of, first_hits
+from regnf_fit.images.preparation import PixelRays, measured_within, pixel_axes, rays_of_pixels
 
 _ONE_OF = 15
 _MOST_IMAGES = 4

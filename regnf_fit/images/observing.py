@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from math import sqrt
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +15,208 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from regnf_core.errors import DatasetError, InvalidOptionsError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
-from regnf_core.fields.observation import Observation
-from regnf_core.schema.observation_grid import FREE, MAX_COUNT, OBSERVATION, SURFACE, UNSEEN
+from regnf_core.fields.observation import Observation, SdfField
+from regnf_core.schema.description import FREE, MAX_COUNT, OBSERVATION, SURFACE, UNSEEN
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.depth_normals import local_planes
-from regnf_fit.images.depth_spread import NO_SPREAD, DepthSpread, depth_spread
+
+# How far depths of one surface lie apart from image to image: the sensor's noise and the poses' errors together.
+#
+# A plane through neighboring pixels shows the noise that differs from pixel to pixel. What the pixels of one image
+# share shows only beside other images: errors of its pose, and of a sensor's calibration.
+
+Floats = NDArray[np.float64]
+
+_PAIRS, _SPREAD_PIXELS = 600, 500
+"""Pairs of images that are drawn, and pixels of the first that are looked up in the second."""
+_SAME_SURFACE = 0.04
+"""Depths that differ by a larger share lie on different surfaces, as in depth_normals.py."""
+_BINS, _LEAST_IN_BIN = 8, 200
+_MAD_TO_DEVIATION = 1.4826
+_REACH = 3.0
+"""Deviations that count as the same surface, once the deviation is known."""
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class DepthSpread:
+    """The standard deviation (K,) across a surface, world units, of depths about (K,) ascending; none where K = 0."""
+
+    depths: Floats
+    deviations: Floats
+
+    def at(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The deviation at each of the depths (R,), 0 where nothing is known."""
+        if len(self.depths) == 0:
+            return np.zeros_like(depths)
+        return np.interp(depths, self.depths, self.deviations).astype(np.float32)
+
+    def median(self, depths: NDArray[np.float32]) -> float:
+        """The deviation in the median over the depths (R,), at least one."""
+        return float(np.median(self.at(depths)))
+
+
+NO_SPREAD = DepthSpread(np.zeros(0), np.zeros(0))
+"""Nothing is known."""
+
+
+def depth_spread(images: PosedImages, cosines: NDArray[np.float32]) -> DepthSpread:
+    """From pixels of one image that are seen in another too. Deterministic.
+
+    cosines: (N, H, W) between ray and surface normal, 0 where unknown: such pixels are left out. Without overlapping
+    images, or without depths, nothing is known.
+    """
+    if images.depths is None or len(images) < 2:
+        return NO_SPREAD
+    rng = np.random.default_rng(0)
+    pairs = rng.integers(len(images), size=(_PAIRS, 2))
+    found = [_differences(images, cosines, first, second, rng) for first, second in pairs if first != second]
+    return _by_depth(np.concatenate([depth for depth, _ in found]), np.concatenate([apart for _, apart in found]))
+
+
+def _differences(
+    images: PosedImages, cosines: NDArray[np.float32], first: int, second: int, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Depths (M,) in the second image where pixels of the first fall, each the mean of both, and how far the first's
+    lie before or behind, across the surface; those too far off to be of the same surface are left out."""
+    assert images.depths is not None
+    height, width = images.size
+    pixels = rng.integers(height * width, size=_SPREAD_PIXELS)
+    depth = images.depths[first].reshape(-1)[pixels].astype(np.float64)
+    row, column = np.divmod(pixels, width)
+    rays = (
+        np.stack([column + 0.5, row + 0.5, np.ones(_SPREAD_PIXELS)], axis=-1)
+        @ np.linalg.inv(images.intrinsics[first]).T
+    )
+    T = np.linalg.inv(images.T_world_camera[second]) @ images.T_world_camera[first]
+    seen = (rays * depth[:, None])[depth > 0.0] @ T[:3, :3].T + T[:3, 3]
+    seen = seen[seen[:, 2] > 0.0]
+    places = seen @ images.intrinsics[second].T
+    column, row = np.floor(places[:, :2] / places[:, 2:]).astype(np.int64).T
+    shown = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen, column, row = seen[shown], column[shown], row[shown]
+    measured = images.depths[second][row, column].astype(np.float64)
+    cosine = cosines[second][row, column].astype(np.float64)
+    length = np.linalg.norm(seen, axis=1) / seen[:, 2]  # of the ray, a unit of depth
+    same = (cosine > 0.0) & (measured > 0.0) & (np.abs(seen[:, 2] - measured) < _SAME_SURFACE * measured)
+    apart = (seen[:, 2] - measured) * length * cosine
+    # the mean does not depend on the difference, as either depth does: bins of it have the differences of all
+    return ((seen[:, 2] + measured) / 2.0)[same], apart[same]
+
+
+def _by_depth(depths: Floats, apart: Floats) -> DepthSpread:
+    """The deviation of one image's depths: the difference of two has sqrt(2) times as much."""
+    count = min(_BINS, len(depths) // _LEAST_IN_BIN)
+    if count == 0:
+        return NO_SPREAD
+    parts = np.array_split(np.argsort(depths), count)
+    deviations = [_deviation(apart[part]) / sqrt(2.0) for part in parts]
+    return DepthSpread(np.array([np.median(depths[part]) for part in parts]), np.array(deviations))
+
+
+def _deviation(values: Floats) -> float:
+    """The standard deviation of most of the values, whatever the others are."""
+    size = np.abs(values)
+    reach = float(size.max())
+    for _ in range(_ROUNDS):
+        reach = min(reach, _REACH * _MAD_TO_DEVIATION * float(np.median(size[size <= reach])))
+    return reach / _REACH
+
+
+# How steeply each pixel's ray meets the surface, and how noisy its depth is, from the depths around it.
+
+_NORMAL_REACH = 2
+"""Pixels on either side: a window of 5 x 5 is wide enough to average a sensor's noise."""
+"""Depths that differ by a larger share lie on different surfaces: on one seen at 60 degrees a pixel of a common camera
+makes a hundredth."""
+_MIN_PIXELS = 8
+_STEEPEST_NORMAL = 0.1
+_DEPTH_BINS = 20
+
+
+@dataclass(frozen=True)
+class LocalPlanes:
+    """Of N images: cosines (N, H, W) between ray and surface normal, at least .1, 0 where no plane could be laid ·
+    deviations: (N, H, W) standard deviation of a depth's noise, its own units."""
+
+    cosines: NDArray[np.float32]
+    deviations: NDArray[np.float32]
+
+
+def local_planes(depths: NDArray[np.float32], intrinsics: Floats) -> LocalPlanes:
+    """A plane for every pixel.
+
+    depths: (N, H, W) · intrinsics: (N, 3, 3). On a plane 1/z is linear in the pixel's place, and the plane's normal
+    follows from the slopes; they are fitted by least squares over a window, to depths close to the pixel's own: a thin
+    leg keeps its own plane before the wall behind it. The noise at a depth is the median of what the planes at about
+    that depth leave over.
+    """
+    cosines, left_over = np.zeros(depths.shape, np.float32), np.zeros(depths.shape, np.float32)
+    for image, (depth, camera) in enumerate(zip(depths, intrinsics, strict=True)):
+        cosines[image], left_over[image] = _of_one(depth, camera)
+    return LocalPlanes(cosines, _normals_by_depth(depths, left_over, cosines > 0.0))
+
+
+def _normals_by_depth(
+    depths: NDArray[np.float32], left_over: NDArray[np.float32], known: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """The median of ``left_over`` (N, H, W) as a function of the depth, at every pixel."""
+    if not known.any():
+        return np.zeros_like(depths)
+    z, noise = depths[known], left_over[known]
+    edges = np.quantile(z, np.linspace(0.0, 1.0, _DEPTH_BINS + 1))
+    bins = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, _DEPTH_BINS - 1)
+    filled = [i for i in range(_DEPTH_BINS) if (bins == i).any()]
+    middles = [float(np.median(z[bins == i])) for i in filled]
+    medians = [float(np.median(noise[bins == i])) for i in filled]
+    return np.interp(depths, middles, medians).astype(np.float32)
+
+
+def _of_one(depth: NDArray[np.float32], camera: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    rows, columns = np.indices(depth.shape) + 0.5
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera).T  # (H, W, 3)
+    valid = depth > 0.0
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=valid)
+    x, y = rays[..., 0], rays[..., 1]
+    count, sums = _moments(x, y, inverse, valid)
+    known = valid & (count >= _MIN_PIXELS)
+    mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
+    # all relative to the pixel itself, see _moments
+    xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
+    xi, yi, ii = xi - mx * mi, yi - my * mi, ii - mi * mi
+    determinant = xx * yy - xy * xy
+    known &= determinant > 1e-2 * (xx + yy) ** 2
+    determinant = np.where(known, determinant, 1.0)
+    a, b = (yy * xi - xy * yi) / determinant, (xx * yi - xy * xi) / determinant
+    # 1/z = a x + b y + c: the plane's normal is (a, b, c), and its product with the ray (x, y, 1) is 1/z
+    here = inverse + mi - a * mx - b * my
+    normal = np.stack([a, b, here - a * x - b * y], axis=-1)
+    cosine = here / np.maximum(np.linalg.norm(normal, axis=-1) * np.linalg.norm(rays, axis=-1), 1e-12)
+    # three numbers were fitted to each window; a deviation of 1/z is one of z by z squared
+    variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
+    deviation = np.where(known, np.sqrt(variance) * depth.astype(np.float64) ** 2, 0.0)
+    cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
+    return cosine.astype(np.float32), deviation.astype(np.float32)
+
+
+def _moments(x: Floats, y: Floats, inverse: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """How many pixels of each window lie on its middle's surface, (H, W), and sums over them, (9, H, W): of x, y and
+    i = 1/z less the middle's, and of their products xx, yy, xy, xi, yi, ii."""
+    height, width = inverse.shape
+    count = np.zeros(inverse.shape)
+    sums = np.zeros((9, *inverse.shape))
+    for down, right in product(range(-_NORMAL_REACH, _NORMAL_REACH + 1), repeat=2):
+        here = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
+        there = slice(max(0, down), height - max(0, -down)), slice(max(0, right), width - max(0, -right))
+        i = inverse[there] - inverse[here]
+        same = valid[there] & (np.abs(i) < _SAME_SURFACE * inverse[here])
+        dx, dy, i = (np.where(same, each, 0.0) for each in (x[there] - x[here], y[there] - y[here], i))
+        count[(*here,)] += same
+        for k, term in enumerate((dx, dy, i, dx * dx, dy * dy, dx * dy, dx * i, dy * i, i * i)):
+            sums[(k, *here)] += term
+    return count, sums
+
 
 _MARGIN = 1.0
 """Voxels before a measured surface that may be matter as well."""

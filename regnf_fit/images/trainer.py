@@ -5,25 +5,210 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import logsigmoid
 
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_fit.images.camera_poses import CameraPoses, expected_errors
-from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
-from regnf_fit.images.depth_supervision import DepthSupervision, supervise
-from regnf_fit.images.depth_terms import depth_terms
-from regnf_fit.images.map_distances import MapDistances
-from regnf_fit.images.network import RadianceField
-from regnf_fit.images.opacity import least_sharpness
-from regnf_fit.images.options import ReconstructionOptions
-from regnf_fit.images.preparation import PreparedImages
-from regnf_fit.images.rays import PixelRays
+from regnf_core.geometry.exponential_map import rotation_exp
+from regnf_data.posed_images import PosedImages
+from regnf_fit.images.coloring import RadianceField
+from regnf_fit.images.depth_supervision import DepthSupervision, depth_terms, supervise
+from regnf_fit.images.fusion import MapDistances
+from regnf_fit.images.observing import DepthSpread
+from regnf_fit.images.preparation import PixelRays, PreparedImages
 from regnf_fit.network import make_optimizer
+from regnf_fit.options import ReconstructionOptions
+
+# Small corrections of the cameras' poses, learned with the field.
+#
+# As Wang et al. (2021, "NeRF--: Neural Radiance Fields Without Known Camera Parameters") and Azinovic et al. (2022,
+# "Neural RGB-D Surface Reconstruction"), but held to the poses that are given by a prior of the size that the images'
+# own contradictions have: a correction is a rotation about the camera and a shift of it. Their mean is zero, so that
+# the frame is that of all the given poses: that of one image would have the errors of that image.
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Standard deviations that are expected of the given poses. shift: field units · turn: radians."""
+
+    shift: float
+    turn: float
+
+
+def expected_errors(spread: DepthSpread, size: float) -> PoseErrors:
+    """Those that would make depths of one surface contradict each other as much as they do, each by itself.
+
+    size: of the bounds' diagonal; where the spread is not known, a thousandth of it.
+    """
+    if len(spread.depths) == 0:
+        return PoseErrors(1e-3 * size, 1e-3)
+    shift = float(np.median(spread.deviations))
+    return PoseErrors(shift, shift / float(np.median(spread.depths)))
+
+
+class CameraPoses(nn.Module):
+    """A correction for each of N images."""
+
+    def __init__(self, images: int, errors: PoseErrors) -> None:
+        super().__init__()
+        self.steps = nn.Parameter(torch.zeros(images, 6))
+        """Rotation vectors and shifts (N, 6) in world axes, in the deviations that are expected. Their mean does not
+        count."""
+        unit = torch.tensor([errors.turn] * 3 + [errors.shift] * 3, dtype=torch.float32)
+        self.register_buffer("unit", unit)
+
+    def corrections(self) -> tuple[Tensor, Tensor]:
+        """Rotations (N, 3, 3) about the cameras and their shifts (N, 3), world axes."""
+        steps = (self.steps - self.steps.mean(0)) * self.get_buffer("unit")
+        return rotation_exp(steps[:, :3]), steps[:, 3:]
+
+    def correct(self, rays: PixelRays) -> PixelRays:
+        """The rays of the corrected cameras, differentiable."""
+        turns, shifts = self.corrections()
+        directions = (turns[rays.images] @ rays.directions[..., None]).squeeze(-1)
+        return replace(rays, origins=rays.origins + shifts[rays.images], directions=directions)
+
+    @torch.no_grad()
+    def median_shift(self) -> float:
+        """Of all cameras, field units."""
+        return float(self.corrections()[1].norm(dim=1).median())
+
+    def prior(self) -> Tensor:
+        """Mean square of the corrections in the deviations that are expected."""
+        return self.steps.square().mean()
+
+    @torch.no_grad()
+    def corrected(self, images: PosedImages) -> PosedImages:
+        """The images with corrected poses."""
+        turns, shifts = (part.double().cpu().numpy() for part in self.corrections())
+        poses: NDArray[np.float64] = images.T_world_camera.copy()
+        poses[:, :3, :3] = turns @ poses[:, :3, :3]
+        poses[:, :3, 3] += shifts
+        return replace(images, T_world_camera=poses)
+
+
+# Opacity along rays from signed distances (Wang et al. 2021, "NeuS").
+
+
+def render_weights(distances: Tensor, sharpness: Tensor | float) -> tuple[Tensor, Tensor]:
+    """What each of a ray's S - 1 sections counts, (R, S - 1), and what passes all of them, (R,).
+
+    distances: (R, S), signed distances at consecutive points of each ray · sharpness: s of the logistic function, per
+    field unit. Equation 13, alpha_i = max((Phi_s(f_i) - Phi_s(f_i+1)) / Phi_s(f_i), 0), in logarithms, so that a point
+    deep in matter does not divide by zero: what passes sections 1 to i is the product of their 1 - alpha.
+    Weights and rest sum to 1.
+    """
+    logarithm = logsigmoid(sharpness * distances)
+    passed = (logarithm[:, 1:] - logarithm[:, :-1]).clamp_max(0.0).cumsum(dim=1).exp()
+    before = torch.cat((torch.ones_like(passed[:, :1]), passed[:, :-1]), dim=1)
+    return before - passed, passed[:, -1]
+
+
+def least_sharpness(share: float, size: float) -> float:
+    """The sharpness below which the learned one may not fall after ``share`` of the fit, per field unit.
+
+    It grows from 20 to 400 over the diagonal ``size``: blurred at first, so that every section on a ray learns, and at
+    last narrower than a hundredth of the diagonal whatever was learned.
+    """
+    return 20.0 * math.exp(math.log(20.0) * min(max(share, 0.0), 1.0)) / size
+
+
+# Color, depth and opacity of rays, rendered through the field.
+
+_COLORED_SECTIONS = 3
+"""On each ray the color is evaluated in so many sections, those that count most."""
+_FREE_SAMPLES = 5
+_BAND_SAMPLES = 9
+_EVEN_SAMPLES = 24
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Of R rays: colors (R, 3) in [0, 1], as they lie before ``background`` · depths (R,) along the camera's axis,
+    of what is opaque · opacity (R,) in [0, 1]."""
+
+    colors: Tensor
+    depths: Tensor
+    opacity: Tensor
+
+
+def render_rays(
+    field: RadianceField,
+    rays: PixelRays,
+    depths: Tensor,
+    sharpness: Tensor,
+    background: Tensor,
+    geometry_learns: bool = True,
+) -> Rendered:
+    """Render rays through samples at ``depths`` (R, S), ascending; background: (3,) the color behind everything.
+
+    Differentiable by the field's parameters. Normals given to the color's network are not differentiated: the
+    geometry learns from the opacity. geometry_learns: False leaves all of it out, but for the sharpness.
+    """
+    function = field.function()
+    learning = geometry_learns and torch.is_grad_enabled()
+    with torch.set_grad_enabled(learning):
+        distances = function.value(rays.at(depths).flatten(0, 1)).view_as(depths)
+    weights, rest = render_weights(distances, sharpness)
+    middles = (depths[:, 1:] + depths[:, :-1]) / 2.0
+    opacity = 1.0 - rest
+    heaviest = weights.detach().topk(min(_COLORED_SECTIONS, weights.shape[1]), dim=1).indices
+    points = rays.at(middles.gather(1, heaviest))  # (R, K, 3)
+    directions = torch.nn.functional.normalize(rays.directions, dim=1)[:, None].expand_as(points)
+    flat = points.flatten(0, 1)
+    with torch.no_grad():
+        normals = torch.nn.functional.normalize(function.value_and_gradient(flat)[1], dim=1)
+    with torch.set_grad_enabled(learning):
+        hidden = function.mlp.hidden(function.encode(flat))
+    colors = field.color(flat, directions.flatten(0, 1), normals, field.feature(hidden)).view_as(points)
+    chosen = weights.gather(1, heaviest)
+    share = chosen / chosen.sum(dim=1, keepdim=True).clamp_min(1e-6)  # the sections left out are colored alike
+    color = opacity[:, None] * (share[..., None] * colors).sum(dim=1) + rest[:, None] * background
+    depth = (weights * middles).sum(dim=1) / opacity.clamp_min(1e-6)
+    return Rendered(color, depth, opacity)
+
+
+def samples_about_depth(rays: PixelRays, bands: Tensor, generator: torch.Generator) -> Tensor:
+    """(R, S) ascending depths: a few in free space, the others within ``bands`` (R,), field units, of the
+    measured depth."""
+    half = (bands / rays.directions.norm(dim=1))[:, None]
+    measured = rays.depths[:, None]
+    start = torch.minimum(rays.near[:, None], measured - 2.0 * half)
+    free = start + (measured - half - start) * _stratified(len(rays), _FREE_SAMPLES, generator).to(half.device)
+    close = measured - half + 2.0 * half * _stratified(len(rays), _BAND_SAMPLES, generator).to(half.device)
+    return torch.cat((free, close), dim=1)
+
+
+@torch.no_grad()
+def samples_by_weight(
+    function: NeusFactoFunction, rays: PixelRays, sharpness: Tensor, generator: torch.Generator
+) -> Tensor:
+    """(R, S) ascending depths within the bounds: an even half, and a half where the field's own weights are large.
+
+    Importance sampling as in NeuS: the field is its own proposal.
+    """
+    span = (rays.far - rays.near)[:, None]
+    even = rays.near[:, None] + span * _stratified(len(rays), _EVEN_SAMPLES, generator).to(span.device)
+    weights, _ = render_weights(function.value(rays.at(even).flatten(0, 1)).view_as(even), sharpness)
+    edges = torch.nn.functional.pad(torch.cumsum(weights + 1e-4, dim=1), (1, 0))
+    edges = edges / edges[:, -1:]
+    places = _stratified(len(rays), _EVEN_SAMPLES, generator).to(span.device)
+    section = (torch.searchsorted(edges, places, right=True) - 1).clamp(0, weights.shape[1] - 1)
+    low, high = edges.gather(1, section), edges.gather(1, section + 1)
+    start, end = even.gather(1, section), even.gather(1, section + 1)
+    chosen = start + (places - low) / (high - low).clamp_min(1e-9) * (end - start)
+    return torch.cat((even, chosen), dim=1).sort(dim=1).values
+
+
+def _stratified(rays: int, count: int, generator: torch.Generator) -> Tensor:
+    return (torch.arange(count) + torch.rand(rays, count, generator=generator)) / count
+
 
 _SHARPEST = 50.0
 """How far above the least sharpness the learned one may rise."""

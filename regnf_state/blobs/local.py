@@ -14,8 +14,15 @@ from types import TracebackType
 from typing import BinaryIO, TypeVar
 from uuid import uuid4
 
-from regnf_state.blobs.base import BlobEntry, StorageFullError, StorageUnavailableError, check_key
-from regnf_state.blobs.retry import until_available
+from regnf_state.blobs.base import (
+    BlobEntry,
+    BlobStore,
+    StorageFullError,
+    StorageUnavailableError,
+    check_key,
+    until_available,
+)
+from regnf_state.settings import Settings
 
 _TEMPORARY = ".tmp"
 _FULL = {errno.ENOSPC, errno.EDQUOT}
@@ -244,3 +251,20 @@ def _unless_missing(error: OSError) -> None:
     """What os.walk would pass over: a listing must not look complete when a folder could not be read."""
     if not isinstance(error, FileNotFoundError):
         raise error
+
+
+# The blob store that the settings name.
+
+
+def open_blobs(settings: Settings, wait_s: float, existing: bool = False) -> BlobStore:
+    """A local folder or an object store, which is waited for when it is away, ``wait_s`` seconds at most.
+
+    ``existing``: a folder is not made. One that was there a moment ago is away, and another must not take its place.
+    """
+    if settings.storage_url is None:
+        return LocalBlobStore(settings.blob_dir, wait_s, existing)
+    from regnf_state.blobs.base import FileCache
+    from regnf_state.blobs.object_store import ObjectBlobStore
+
+    cache = FileCache(settings.field_cache_dir, settings.field_cache_bytes)
+    return ObjectBlobStore(settings.storage_url, wait_s, cache)

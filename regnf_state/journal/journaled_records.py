@@ -7,16 +7,20 @@ and finds the published result.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from itertools import islice
+from typing import Any, TypeVar
+from uuid import uuid4
 
 from redis import Redis
 
 from regnf_core.library_entries import EntryNotes
 from regnf_state.blobs.base import BlobStore
-from regnf_state.journal.generation import Generation
-from regnf_state.journal.journal import Journal
+from regnf_state.journal.journal import GENERATION_KEY, Journal, claim_storage
+from regnf_state.queue import JobQueue
 from regnf_state.records import (
     FINISHED,
     NO_QUOTA,
@@ -27,11 +31,51 @@ from regnf_state.records import (
     RecordError,
     UnreadableRecordError,
 )
-from regnf_state.redis.documents import Kind
+from regnf_state.redis.documents import Kind, text
 from regnf_state.redis.jobs import JOB, RedisRecordStore
-from regnf_state.redis.keys import PREFIX
-from regnf_state.redis.unreadable import Stored
+from regnf_state.redis.unreadable import PREFIX, Stored
 from regnf_state.transitions import fields_of
+
+# Whether Redis holds what the journal says: it does not after it was emptied, exchanged, or restarted.
+#
+# A key in Redis names the blob store whose journal was read into it, and the run of the server: one that restarts may
+# have lost the last second of its history.
+
+_MARK = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2]) return 1 end return 0"
+
+
+class Generation:
+    """The mark of one blob store in one Redis."""
+
+    def __init__(self, redis: Redis, journal: Journal) -> None:
+        self._redis = redis
+        self._journal = journal
+        self._mark = redis.register_script(_MARK)
+
+    @cached_property
+    def _storage_id(self) -> str:
+        return self._journal.storage_id()
+
+    def _name(self) -> str:
+        server: Any = self._redis.info("server")
+        return f"{self._storage_id}:{server.get('run_id', '')}"
+
+    def is_current(self) -> bool:
+        """Whether everything in the journal is in Redis."""
+        held: Any = self._redis.get(GENERATION_KEY)
+        return held is not None and text(held) == self._name()
+
+    def begin(self) -> str:
+        """Note that the journal will be read now; returns the token for ``end``. Raises StorageMismatchError."""
+        claim_storage(self._redis, self._storage_id)
+        token = f"reading:{uuid4().hex}"
+        self._redis.set(GENERATION_KEY, token)
+        return token
+
+    def end(self, token: str) -> bool:
+        """Note that all of it is in Redis. False when Redis was emptied or another process began in between."""
+        return bool(self._mark(keys=[GENERATION_KEY], args=[token, self._name()]))
+
 
 _USED = f"{PREFIX}fields:used"
 logger = logging.getLogger(__name__)
@@ -216,3 +260,80 @@ def _if_possible(what: str, write: Callable[[], None]) -> None:
         write()
     except OSError as error:
         logger.warning("%s is not in the journal: %s", what, error)
+
+
+# Rebuilding the records from the journal after Redis has lost them.
+
+_AT_ONCE = 16
+_PAGE = 1000
+_Record = TypeVar("_Record")
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """Which records were rebuilt, and how many jobs were found past their time and dropped."""
+
+    jobs: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    dropped: int = 0
+
+
+class Rebuilder:
+    """Safe to run at any time, by several machines at once: what Redis knows is left as it is."""
+
+    def __init__(self, records: JournaledRecordStore, queue: JobQueue, blobs: BlobStore) -> None:
+        self._records = records
+        self._queue = queue
+        self._blobs = blobs
+
+    def run_if_needed(self) -> Rebuilt:
+        """Read the journal unless Redis holds all of it. Raises RedisError, OSError; then the next call begins anew."""
+        if self._records.generation.is_current():
+            return Rebuilt()
+        token = self._records.generation.begin()
+        rebuilt = self._run()
+        if self._records.generation.end(token) and (rebuilt.jobs or rebuilt.fields):
+            logger.warning("from the journal: %d jobs and %d fields", len(rebuilt.jobs), len(rebuilt.fields))
+        return rebuilt
+
+    def _run(self) -> Rebuilt:
+        fields = list(_in_pages(self._records.journal.fields(), self._records.recall_field))
+        for field in fields:
+            if field.state == "validating":
+                self._queue.enqueue_import(field.sha256, field.attempt)
+        jobs = list(_in_pages(self._records.journal.jobs(), self._recall_job))
+        found = [job for job in jobs if isinstance(job, JobRecord)]
+        for job in sorted(found, key=lambda one: (one.updated, one.id)):
+            if job.status == "accepted":
+                self._queue.enqueue_registration(job.id, job.attempt, job.owner, job.is_of_batch)
+        return Rebuilt(
+            tuple(job.id for job in found), tuple(field.sha256 for field in fields), dropped=len(jobs) - len(found)
+        )
+
+    def _recall_job(self, job_id: str) -> JobRecord | str | None:
+        """A record that was rebuilt; the id of a job that was dropped; None where nothing was to be done."""
+        now = self._records.now()
+        job = self._records.journal.recall(job_id, now)
+        if job is None:
+            return None
+        if self._records.has_expired(job, now):
+            if self._is_known(job_id):
+                return None  # it was asked for again
+            self._blobs.delete_prefix(f"jobs/{job_id}")
+            self._records.journal.forget(job_id)
+            return job_id
+        return job if self._records.restore_job(job) else None
+
+    def _is_known(self, job_id: str) -> bool:
+        try:
+            return self._records.get_job(job_id) is not None
+        except UnreadableRecordError:
+            return True
+
+
+def _in_pages(names: Iterable[str], recall: Callable[[str], _Record | None]) -> Iterator[_Record]:
+    """What ``recall`` finds for each name, a page of names at a time, several at once."""
+    left = iter(names)
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        while page := list(islice(left, _PAGE)):
+            yield from (found for found in pool.map(recall, page) if found is not None)

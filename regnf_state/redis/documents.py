@@ -13,12 +13,9 @@ from uuid import uuid4
 from redis import Redis
 from redis.exceptions import ResponseError
 
-from regnf_state.pages import LOOKED_AT, PAGE_BYTES, Page, Position
-from regnf_state.record_format import FORMAT, decoded, encoded
-from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
-from regnf_state.redis.keys import PREFIX
-from regnf_state.redis.mended_script import MENDED
-from regnf_state.redis.unreadable import UNREADABLE, Stored, UnreadableRecords
+from regnf_state.record_store import LOOKED_AT, PAGE_BYTES, Page, Position
+from regnf_state.records import FORMAT, FieldRecord, JobRecord, UnreadableRecordError, decoded, encoded
+from regnf_state.redis.unreadable import MENDED, PREFIX, UNREADABLE, Stored, UnreadableRecords
 
 _PAGE = 100
 _PROBE_KEPT_S = 60

@@ -19,7 +19,7 @@ Keys, below the prefix:  line:{owner}   list of names        owners        sorte
 An entry: owner, kind, since, batch (of one); once taken: cost, taken; while it waits for a field: parked.
 """
 
-from regnf_state.redis.mended_script import MENDED
+from regnf_state.redis.unreadable import MENDED
 
 SCRIPT = (
     MENDED

@@ -2,23 +2,109 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from redis import Redis
 
+from regnf_core import __version__
+from regnf_core.importing.gate.report import OF_THE_FILE
+from regnf_core.library_entries import EntryNotes
+from regnf_core.version import ENGINE_REVISION
 from regnf_state import transitions
 from regnf_state.ownership import owner_of
-from regnf_state.pages import Page, Position
+from regnf_state.record_store import LibraryEntry, NameTakenError, Page, Position, recorded
 from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
-from regnf_state.redis.documents import Cap, Command, Kind, text
-from regnf_state.redis.keys import PREFIX
-from regnf_state.redis.library_index import listed, unlisted
-from regnf_state.redis.owners import OWNERS, Owners
-from regnf_state.redis.rejections import RedisRejections
-from regnf_state.redis.unreadable import Stored
+from regnf_state.redis.counters import OWNERS, Owners
+from regnf_state.redis.documents import Cap, Command, Kind, RedisDocuments, text
+from regnf_state.redis.unreadable import PREFIX, Stored
+
+# Where the entries of callers' libraries are listed in Redis.
+#
+# Keys:  regnf:owner:{owner}:library                sorted by time: references of the fields that are entries
+#        regnf:owner:{owner}:library:{sha256}       the reference of the field whose entry has the name with this
+#   digest
+
+
+def listed_key(owner: str) -> str:
+    """An owner's entries by the time that they were added."""
+    return f"{PREFIX}owner:{owner}:library"
+
+
+def name_key(owner: str, name: str) -> str:
+    """Which field of an owner has an entry of this name."""
+    return f"{listed_key(owner)}:{hashlib.sha256(name.encode()).hexdigest()}"
+
+
+def listed(record: FieldRecord) -> list[Command]:
+    """What lists the entry of a field, if it has one."""
+    if record.library is None:
+        return [("ZREM", listed_key(record.owner), record.sha256)]
+    return [
+        ("SET", name_key(record.owner, record.library["name"]), record.sha256),
+        ("ZADD", listed_key(record.owner), repr(float(record.library["added"])), record.sha256),
+    ]
+
+
+def unlisted(record: FieldRecord) -> list[Command]:
+    """What takes the entry of a field out of the lists."""
+    if record.library is None:
+        return []
+    return [
+        ("DEL", name_key(record.owner, record.library["name"])),
+        ("ZREM", listed_key(record.owner), record.sha256),
+    ]
+
+
+# Why an owner's uploads were rejected, kept after their fields are gone: the same bytes are not imported again for
+# it.
+#
+# Kept is what follows from the bytes, their description and the version of the gate. What a limit, a setting or the
+# machine had its part in (load, memory, storage, a worker's death) may end otherwise next time: it is never kept.
+# Each owner has rejections of its own. Those of others would tell it, by how soon the answer comes, what others have
+# sent.
+
+_KEPT_S = 24 * 3600
+_MOST = 256
+_PUT = """
+redis.call('SET', KEYS[2], ARGV[1], 'EX', ARGV[2])
+redis.call('ZADD', KEYS[1], ARGV[3], KEYS[2])
+redis.call('EXPIRE', KEYS[1], ARGV[2])
+for _, key in ipairs(redis.call('ZRANGE', KEYS[1], 0, -1 - tonumber(ARGV[4]))) do
+  redis.call('DEL', key)
+  redis.call('ZREM', KEYS[1], key)
+end
+"""
+
+
+def _index(owner: str) -> str:
+    return f"{PREFIX}owner:{owner}:rejections"
+
+
+def _key(field: FieldRecord) -> str:
+    asked = json.dumps([field.sha256, field.description, __version__, ENGINE_REVISION], sort_keys=True)
+    return f"{PREFIX}rejection:{hashlib.sha256(asked.encode()).hexdigest()}"
+
+
+class RedisRejections(RedisDocuments):
+    """The part of the record store that is about rejections. Each owner's oldest go first."""
+
+    def remember_rejection(self, field: FieldRecord, error: dict[str, Any]) -> None:
+        """Keep why this upload was rejected, if that lies in the file."""
+        if error.get("reason") not in OF_THE_FILE:
+            return
+        keys = [_index(field.owner), _key(field)]
+        self._redis.eval(_PUT, 2, *keys, json.dumps(error), _KEPT_S, repr(self.now()), _MOST)
+
+    def known_rejection(self, field: FieldRecord) -> dict[str, Any] | None:
+        """Why the same upload was rejected lately."""
+        held: Any = self._redis.get(_key(field))
+        return None if held is None else json.loads(held)
+
 
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
@@ -235,3 +321,61 @@ class RedisFieldRecords(RedisRejections):
         """An owner's rejected fields beyond so many, the oldest first, ``most`` at most."""
         beyond: Any = self._redis.zrange(_rejected_key(owner), 0, -kept - 1)
         return [text(name) for name in beyond[:most]]
+
+
+# Callers' libraries in Redis: entries are parts of field records, found by name and listed by time.
+
+
+class RedisLibrary(RedisFieldRecords):
+    """The part of the record store that is about libraries."""
+
+    def set_entry(self, known: FieldRecord, notes: EntryNotes | None) -> FieldRecord:
+        while True:
+            field, now = self._current_field(known.sha256)
+            if field.library != known.library:
+                raise StaleAttemptError("the entry has changed")
+            added = field.library["added"] if field.library is not None else now
+            said = None if notes is None else recorded(notes, added)
+            changed = replace(field, version=field.version + 1, updated=now, library=said)
+            answer = self._save_field(field.version, changed, *_renaming(field, notes))
+            if answer == "OK":
+                return changed
+            taken = notes is not None and answer == NameTakenError.reason
+            if notes is not None and taken and self.entries_named(known.owner, [notes.name])[0] is not None:
+                raise NameTakenError(notes.name)
+
+    def entries_named(self, owner: str, names: Sequence[str]) -> list[LibraryEntry | None]:
+        keys = [name_key(owner, name) for name in names]
+        references: list[Any] = self._redis.mget(keys) if keys else []
+        held = {key: text(reference) for key, reference in zip(keys, references, strict=True) if reference is not None}
+        fields = dict(zip(held, self._read_each(FIELD, list(held.values())), strict=True))
+        found: list[LibraryEntry | None] = []
+        for name, key in zip(names, keys, strict=True):
+            field = fields.get(key)
+            entry = None if field is None else LibraryEntry.of(field)
+            if key in held and (entry is None or entry.notes.name != name):
+                self._redis.delete(key)  # an earlier release, or damage, has taken the entry away
+                entry = None
+            found.append(entry)
+        return found
+
+    def list_entries(
+        self, owner: str, tag: str | None, part: str | None, limit: int, before: Position | None
+    ) -> Page[FieldRecord]:
+        def wanted(field: FieldRecord) -> bool:
+            said = field.library
+            if said is None or (tag is not None and tag not in said["tags"]):
+                return False
+            return part is None or part.casefold() in said["name"].casefold()
+
+        return self._page(listed_key(owner), FIELD, limit, before, wanted)
+
+
+def _renaming(field: FieldRecord, notes: EntryNotes | None) -> tuple[list[Command], list[Cap]]:
+    """What gives the old name free, and what asks that the new one is nobody's yet."""
+    if field.library is not None and notes is not None and field.library["name"] == notes.name:
+        return [], []
+    taken: list[Cap] = []
+    if notes is not None:
+        taken = [("EXISTS", name_key(field.owner, notes.name), 1, 1, NameTakenError.reason)]
+    return unlisted(field)[:1], taken

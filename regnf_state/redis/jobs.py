@@ -18,7 +18,7 @@ from redis.exceptions import ResponseError
 
 from regnf_state import transitions
 from regnf_state.ownership import ANONYMOUS, owner_of
-from regnf_state.pages import Page, Position
+from regnf_state.record_store import Page, Position
 from regnf_state.records import (
     ACTIVE,
     NO_QUOTA,
@@ -34,12 +34,38 @@ from regnf_state.records import (
 )
 from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
+from regnf_state.redis.counters import OWNERS
 from regnf_state.redis.documents import Cap, Change, Command, Kind, ask, is_wrong_type, stored_in, text
-from regnf_state.redis.events import events_in, start_of
-from regnf_state.redis.keys import PREFIX
-from regnf_state.redis.library import RedisLibrary
-from regnf_state.redis.owners import OWNERS
-from regnf_state.redis.unreadable import Stored
+from regnf_state.redis.fields import RedisLibrary
+from regnf_state.redis.unreadable import PREFIX, Stored
+
+# A job's events in Redis: a stream, read by XREAD.
+
+
+def start_of(after: str | None) -> str:
+    """Where XREAD begins. Raises ValueError when ``after`` is no event id."""
+    return "{}-{}".format(*transitions.parse_event_id(after)) if after is not None else "0-0"
+
+
+def events_in(answer: Any) -> list[JobEvent]:
+    """The events in an answer to XREAD about one stream, in either protocol's shape; none where it is no stream."""
+    if is_wrong_type(answer):
+        return []
+    if isinstance(answer, Exception):
+        raise answer
+    chunks = (
+        [chunk for chunks in answer.values() for chunk in chunks]
+        if isinstance(answer, dict)
+        else [chunk for _, chunk in answer or []]
+    )
+    return [_event(entry) for chunk in chunks for entry in chunk]
+
+
+def _event(entry: tuple[bytes | str, dict[bytes | str, bytes | str]]) -> JobEvent:
+    identifier, fields = entry
+    values = {text(name): text(value) for name, value in fields.items()}
+    return JobEvent(text(identifier), values["name"], json.loads(values["data"]))
+
 
 _CREATED = f"{PREFIX}jobs:created"
 _ACTIVE = f"{PREFIX}jobs:active"

@@ -2,19 +2,107 @@
 
 from __future__ import annotations
 
+import hashlib
+import hmac
+import json
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from redis import Redis
 from rq.command import send_command
+from rq.job import Job, JobStatus
+from rq.serializers import JSONSerializer
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.queue import QUEUE_NAME, Work
 from regnf_state.records import JobRecord
-from regnf_state.redis import payload
 from regnf_state.redis.documents import shown
 from regnf_state.redis.fair_queue import FairQueue, Line, Waiting
+
+# What Redis holds of a piece of work in RQ's shape, a hash: written here, and believed only if written here.
+#
+# RQ itself would import whatever function a hash names, and the callbacks in it, and hand it on to jobs that depend
+# on it. A worker therefore never lets RQ read one. It takes a name from RQ's list, checks here that the hash says
+# exactly what ``written`` writes for this name, and makes the job anew from the name. With a key, the hash must be
+# signed too.
+
+SIGNATURE = "regnf_signature"
+MAX_S = 24 * 3600
+"""What RQ itself would allow a job; workers set the limit that counts from their own settings."""
+_FAILURE_KEPT_S = 60
+_MAX_DATA_BYTES = 4096
+_WRITTEN_BY_RQ = frozenset(
+    {"created_at", "enqueued_at", "started_at", "ended_at", "last_heartbeat", "worker_name", "status", "exc_info"}
+)
+"""What RQ notes down of a job on its way. Nothing of it is used."""
+
+
+class PayloadError(ValueError):
+    """A hash that is not one of ours. Says what is wrong with it, and repeats nothing of it."""
+
+
+def made(work: Work, redis: Redis) -> Job:
+    """RQ's job for a piece of work."""
+    return Job.create(
+        work.function,
+        args=[work.argument],
+        connection=redis,
+        id=work.name,
+        origin=work.queue_name,
+        timeout=MAX_S,
+        result_ttl=0,
+        failure_ttl=_FAILURE_KEPT_S,
+        status=JobStatus.QUEUED,
+        serializer=JSONSerializer,
+        description=f"{work.function} {work.name}",
+    )
+
+
+def signature(work: Work, key: str) -> str:
+    """HMAC-SHA256 over the function and the name, which holds the argument and the attempt."""
+    return hmac.new(key.encode(), f"regnf-queue-1\n{work.function}\n{work.name}".encode(), hashlib.sha256).hexdigest()
+
+
+def written(work: Work, redis: Redis, key: str | None) -> dict[str, Any]:
+    """The hash of a piece of work that waits."""
+    fields: dict[str, Any] = made(work, redis).to_dict()
+    return fields | ({SIGNATURE: signature(work, key)} if key is not None else {})
+
+
+def read(queue_name: str, name: str, held: Mapping[bytes, bytes], redis: Redis, key: str | None) -> Work:
+    """The work that a name and its hash mean. Raises PayloadError unless the hash is as ``written`` makes it."""
+    try:
+        work = Work.named(queue_name, name)
+    except ValueError as error:
+        raise PayloadError(str(error)) from error
+    fields = {field.decode(errors="replace"): value for field, value in held.items()}
+    expected = {field: _bytes(value) for field, value in written(work, redis, None).items()}
+    if _data(fields.pop("data", b"")) != [work.function, None, [work.argument], {}]:
+        raise PayloadError("another function, or other arguments")
+    signed = fields.pop(SIGNATURE, b"")
+    if key is not None and not hmac.compare_digest(signed, signature(work, key).encode()):
+        raise PayloadError("not signed with the key of this service")
+    del expected["data"]
+    for field in fields.keys() | expected.keys():
+        if field not in _WRITTEN_BY_RQ and fields.get(field, b"") != expected.get(field, b""):
+            raise PayloadError(f"another {field}" if field in expected else "a member that is not ours")
+    return work
+
+
+def _bytes(value: Any) -> bytes:
+    return value if isinstance(value, bytes) else str(value).encode()
+
+
+def _data(value: bytes) -> Any:
+    """What the payload names, decompressed up to a limit; None for what is no JSON."""
+    unpacker = zlib.decompressobj()
+    try:
+        plain = unpacker.decompress(value, _MAX_DATA_BYTES)
+        return json.loads(plain) if unpacker.eof else None
+    except (zlib.error, ValueError, RecursionError):
+        return None
 
 
 class RqJobQueue:
@@ -44,8 +132,7 @@ class RqJobQueue:
 
     def _enqueue(self, waiting: Sequence[tuple[Work, str, bool]]) -> None:
         self.fair.enqueue_each(
-            Waiting(work, owner, payload.written(work, self._redis, self._key), of_batch)
-            for work, owner, of_batch in waiting
+            Waiting(work, owner, written(work, self._redis, self._key), of_batch) for work, owner, of_batch in waiting
         )
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:

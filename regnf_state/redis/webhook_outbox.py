@@ -14,11 +14,10 @@ from typing import Any, Literal, cast, get_args
 
 from redis import Redis
 
-from regnf_state.record_format import LAST_TIME
-from regnf_state.records import JobRecord
+from regnf_state.records import LAST_TIME, JobRecord
 from regnf_state.redis.counters import count
 from regnf_state.redis.documents import Command, is_wrong_type, text
-from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.unreadable import PREFIX
 
 logger = logging.getLogger(__name__)
 _LINES = f"{PREFIX}webhooks:lines"

@@ -12,15 +12,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from regnf_core.pair_result import short_result
-from regnf_service.budget import check_budget
+from regnf_core.pairs import short_result
 from regnf_service.fields.ingest import room_for_bytes
-from regnf_service.jobs.lookup import manifest_of, result_of
+from regnf_service.jobs.edits import manifest_of, result_of
 from regnf_service.jobs.submit import FieldLookup, check_fields, future_job_id, start
+from regnf_service.library import check_budget
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch, Pair
-from regnf_state.problems import problem_document, whole_problem
+from regnf_state.reasons import problem_document, whole_problem
 from regnf_state.records import ACTIVE, JobRecord, QuotaError, RecordError, UnreadableRecordError
 from regnf_state.registration_request import RegistrationRequest
 

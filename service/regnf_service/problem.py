@@ -9,8 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from regnf_state.problems import problem_document
-from regnf_state.reasons import REASONS
+from regnf_state.reasons import REASONS, problem_document
 
 RETRY_LATER = {"Retry-After": "5"}
 CLOSE = {"Connection": "close"}

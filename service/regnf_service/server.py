@@ -6,19 +6,222 @@ import asyncio
 import errno
 import gc
 import logging
+import signal
 import socket
 import sys
-from functools import partial
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
+from functools import cache, partial
+from pathlib import Path
+from types import FrameType
 from typing import Any, cast
 
 import uvicorn
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
+from redis.exceptions import RedisError
+from starlette.middleware import Middleware
+from starlette.staticfiles import StaticFiles
 
-from regnf_service.app import create_app
-from regnf_service.descriptors import raise_limit, shared_out
+from regnf_core import __version__
+from regnf_service.concurrency import in_thread, pause
+from regnf_service.http import problems
 from regnf_service.http.connections import ClientClock, Connections
+from regnf_service.http.contract import build_contract
 from regnf_service.http.guarded_protocol import GuardedProtocol
+from regnf_service.http.hosts import OriginGate, allowed_hosts, cors_layer, cors_origins
+from regnf_service.http.middleware import Buckets, RequestContext, RequestGate, TokenGate, TurnGate
+from regnf_service.http.query import refuse_unknown_parameters
+from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter, WriteGate
+from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
+from regnf_service.metrics import Measured, Metrics, raise_limit, served, shared_out
+from regnf_service.services import Services
+from regnf_service.tokens import Callers, read_callers
+from regnf_service.upkeep.housekeeping import Housekeeper
+from regnf_service.upkeep.reaper import Reaper
+from regnf_service.webhooks.service import deliver_until_stopped, webhooks_of
+from regnf_state.journal.journal import StorageMismatchError, claim_storage
+from regnf_state.journal.journaled_records import Rebuilder
 from regnf_state.settings import MIB, Settings
+from regnf_state.stores import Stores, open_stores
+
+# Ending long answers when the process is told to stop.
+#
+# The server waits for open connections before it ends the application, so an event stream that waits for the
+# application's end would never end. Hence we listen to the signals ourselves, and pass them on.
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stopping_on_signals(stopping: asyncio.Event) -> Iterator[None]:
+    """Set ``stopping`` when SIGINT or SIGTERM arrives, before the earlier handler is called."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    loop = asyncio.get_running_loop()
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def listener(earlier: Any) -> Callable[[int, FrameType | None], None]:
+        def listen(number: int, frame: FrameType | None) -> None:
+            loop.call_soon_threadsafe(stopping.set)
+            if callable(earlier):
+                earlier(number, frame)
+
+        return listen
+
+    # a signal without a Python handler keeps its default, which ends the process anyway
+    handled = [number for number in _SIGNALS if callable(before[number])]
+    for number in handled:
+        signal.signal(number, listener(before[number]))
+    try:
+        yield
+    finally:
+        for number in handled:
+            signal.signal(number, before[number])
+
+
+# What the application does beside requests: it finds lost jobs, sends webhooks, serves metrics, and stops in order.
+
+_REAP_EVERY_S = 15.0
+_CLEARING_UP_S = 5.0
+
+
+def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    """The lifespan of an application over these services: starts its background tasks, and stops them in order."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.openapi()  # takes a while, so not during the first request
+        await in_thread(_check_storage, services)
+        reaping = asyncio.create_task(_reap(services))
+        delivering = asyncio.create_task(
+            deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
+        )
+        at = services.settings
+        scrapes = served(metrics.registry, allowed_hosts(at), at.metrics_host, at.metrics_port)
+        with scrapes, stopping_on_signals(services.stopping):
+            yield
+        services.stopping.set()
+        # the server has interrupted the uploads that were running, and does not wait until they are cleaned up
+        await services.uploads.emptied(_CLEARING_UP_S)
+        await delivering
+        await reaping
+        services.redis.close()
+
+    return lifespan
+
+
+def _check_storage(services: Services) -> None:
+    """Raises StorageMismatchError: the start fails. While a store is away nobody can tell, and the reaper will."""
+    try:
+        claim_storage(services.redis, services.records.journal.storage_id(), services.settings.adopt_storage or None)
+    except (RedisError, OSError) as error:
+        logger.warning("whose records Redis holds is looked up later: %s", type(error).__name__)
+    except StorageMismatchError as error:
+        logger.critical("%s: %s", error.reason, error)
+        raise
+
+
+async def _reap(services: Services) -> None:
+    """Look after lost jobs every fifteen seconds until the service stops."""
+    records, queue, redis, blobs = services.records, services.queue, services.redis, services.blobs
+    rebuilder = Rebuilder(records, queue, blobs)
+    housekeeper = Housekeeper(records, blobs, redis, services.settings)
+    reaper = Reaper(records, queue, redis, services.settings, blobs, rebuilder, housekeeper)
+    while not services.stopping.is_set():
+        try:
+            await in_thread(reaper.run_once)
+        except StorageMismatchError as error:
+            logger.critical("%s: %s", error.reason, error)
+            signal.raise_signal(signal.SIGTERM)  # it would mix the jobs of two services
+        except (RedisError, OSError) as error:
+            logger.warning("the reaper: a store does not answer: %s", type(error).__name__)
+        except Exception:
+            logger.exception("an internal error ended this round of the reaper; the next round follows")
+        await pause(_REAP_EVERY_S, services.stopping)
+
+
+# The HTTP application. `create_app` is the factory that servers call; tests hand it their own stores.
+
+_STORAGE_WAIT_S = 10.0
+_STRICT = [Depends(refuse_unknown_parameters)]
+
+
+def create_app(
+    settings: Settings | None = None,
+    stores: Stores | None = None,
+    limiter: RateLimiter | None = None,
+    connections: Connections | None = None,
+) -> FastAPI:
+    """The application over the given stores, or over those that the settings name; ``connections`` are its server's.
+
+    Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable, HostsError likewise.
+    """
+    settings = settings or Settings()
+    callers = read_callers(settings.api_tokens, settings.api_tokens_file)
+    stores = stores or open_stores(settings, retries=None, storage_wait_s=_STORAGE_WAIT_S)
+    if limiter is None and settings.calls_per_s:
+        limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
+    webhooks = webhooks_of(settings, stores.redis)
+    services = Services(settings, stores.redis, stores.records, stores.blobs, stores.queue, webhooks)
+    metrics = Metrics(services, connections)
+    app = FastAPI(
+        title="regnf",
+        version=__version__,
+        openapi_url=None,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,  # the framework's redirects lead to whatever `Host` says
+        generate_unique_id_function=lambda route: route.name,
+        lifespan=lifespan_of(services, metrics),
+        middleware=_middleware(services, callers, metrics, limiter),
+    )
+    app.state.services = services
+    app.state.metrics = metrics
+    _include_routers(app)
+    app.openapi = cache(lambda: build_contract(app))  # type: ignore[method-assign]
+    _include_routers(app, prefix="/v1", include_in_schema=False)
+    app.mount("/static", StaticFiles(directory=Path(__file__).with_name("web")), name="static")
+    problems.install(app)
+    return app
+
+
+def _middleware(
+    services: Services, callers: Callers, metrics: Metrics, limiter: RateLimiter | None
+) -> list[Middleware]:
+    """What every request passes through, outermost first."""
+    settings = services.settings
+    gate = Middleware(
+        TokenGate,
+        needs_token=settings.needs_token,
+        allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
+    )
+    limits = [Middleware(RequestGate, slots=services.requests)]
+    if settings.writes_per_s:
+        limits.append(Middleware(WriteGate, buckets=Buckets(settings.writes_per_s, settings.write_limit_burst)))
+    if limiter is not None:
+        limits.append(Middleware(RateGate, limiter=limiter))
+    origins = cors_origins(settings)
+    hosts = Middleware(OriginGate, hosts=allowed_hosts(settings), origins=origins)
+    turns = Middleware(TurnGate, callers=callers if settings.needs_token else {})
+    return [
+        Middleware(RequestContext),
+        Middleware(Measured, metrics=metrics),
+        turns,
+        hosts,
+        *cors_layer(origins),
+        gate,
+        *limits,
+    ]
+
+
+def _include_routers(app: FastAPI, **how: Any) -> None:
+    for router in ROUTERS:
+        app.include_router(router, dependencies=_STRICT, **how)
+    for router in LENIENT_ROUTERS:
+        app.include_router(router, **how)
+
 
 _DRAIN_S = 5
 """How long open requests may go on once the process is told to stop."""

@@ -9,7 +9,7 @@ import psutil
 import pytest
 
 from benchmarks.api_process import api_process
-from regnf_cli.local_service import running_service
+from regnf_cli.demo import running_service
 from tests.processes import descendants_of
 
 

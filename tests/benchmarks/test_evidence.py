@@ -10,7 +10,7 @@ from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.evidence import Gathering, evidence_of_world
 from benchmarks.worlds.making import Task, make
 from benchmarks.worlds.similar_objects import SIMILAR
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 
 def test_rows_of_the_right_object_and_of_a_similar_one(tmp_path: Path) -> None:

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.random_worlds.mesh import Mesh, block, together
 from benchmarks.robust.cases import Case
 from benchmarks.worlds.cases import WorldCase
 from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
 from benchmarks.worlds.making import WORLD
 from regnf_core import OrientedBox, Sim3
 from regnf_core.fields.mesh import MeshField
-from regnf_core.geometry.symmetry import Symmetries
-from regnf_data.worlds.mesh import Mesh, block, together
+from regnf_core.geometry.metrics import Symmetries
 
 T_OBJECT_MODEL = np.diag([2.0, 2.0, 2.0, 1.0])
 SEAT, CUSHION = block([0.0, 0.0, 0.2], [0.5, 0.5, 0.4]), block([0.0, 0.0, 0.55], [0.3, 0.2, 0.2])

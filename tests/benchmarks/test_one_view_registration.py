@@ -9,7 +9,7 @@ import torch
 from benchmarks.robust.depth_camera import DepthCamera
 from benchmarks.robust.one_view_field import OneViewField
 from benchmarks.simple_meshes import box, together
-from regnf_core.registration import register
+from regnf_core.library import register
 from tests.core.analytic import chair, chair_pose
 from tests.core.robust.shapes import ROBUST, detection, placement_error
 

@@ -19,7 +19,7 @@ from benchmarks.real.scenes import Thing, placement, room_frame, scene_names, sc
 from benchmarks.real.sequence import open_recording, posed_images
 from regnf_core import Sim3
 from regnf_core.fields.observation import observation_of
-from regnf_core.schema.observation_grid import FREE, UNSEEN
+from regnf_core.schema.description import FREE, UNSEEN
 
 BALL, RADIUS, WALL = np.array([0.0, 0.0, 1.5]), 0.2, 2.0
 SMALL, SMALL_RADIUS = np.array([0.2, 0.15, 1.5]), 0.1

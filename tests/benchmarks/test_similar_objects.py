@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.random_worlds.mesh import Mesh, block, together
 from benchmarks.robust.cases import Case
 from benchmarks.worlds.cases import WorldCase
 from benchmarks.worlds.making import WORLD
 from benchmarks.worlds.similar_objects import SIMILAR, similar_object
 from regnf_core import OrientedBox, Sim3
 from regnf_core.fields.mesh import MeshField
-from regnf_core.geometry.symmetry import Symmetries
-from regnf_data.worlds.mesh import Mesh, block, together
+from regnf_core.geometry.metrics import Symmetries
 
 LEG, BRANCH = block([0.0, 0.0, 0.5], [0.1, 0.1, 1.0]), block([0.3, 0.0, 0.9], [0.5, 0.1, 0.1])
 BRACKET = together(LEG, BRANCH)

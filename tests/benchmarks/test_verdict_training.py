@@ -18,8 +18,8 @@ from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.reliability import reliability_diagram
 from benchmarks.worlds.similar_objects import SIMILAR
 from benchmarks.worlds.training import Evidence, train, trained
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import LEAD, ProbabilityModel
+from regnf_core.robust.verdict.answer import LEAD, ProbabilityModel
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 NAMES = list(SPEAKS_FOR)
 

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from benchmarks.random_worlds.models import PARTS, read_catalog
 from benchmarks.worlds.cases import cases_of
 from benchmarks.worlds.making import WORLD, Task, make, read_cameras
 from benchmarks.worlds.recipe import SCENES, Scene, parts_of_name
@@ -17,9 +18,7 @@ from benchmarks.worlds.tables import lost_at, lower_bound, markdown, success, up
 from regnf_core import Sim3
 from regnf_core.errors import DatasetError
 from regnf_core.fields.observation import Observation, observation_of
-from regnf_core.schema.observation_grid import FREE, SURFACE
-from regnf_data.worlds.models import read_catalog
-from regnf_data.worlds.split import PARTS
+from regnf_core.schema.description import FREE, SURFACE
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from regnf_cli import batch_here
+from regnf_cli import batch as batch_here
+from regnf_cli.batch import register_here
 from regnf_cli.batch_file import FilePair, ResultsFile, read_pairs
-from regnf_cli.batch_here import register_here
 from tests.cli.conftest import DATA, Run
 
 QUICK = {"up_axis": "z", "robust": {"rotations": 24, "feature_draws": 0, "scene_samples": 500, "object_samples": 500}}

@@ -10,8 +10,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.field_candidates import Candidate
+from regnf_core.errors import Candidate, FieldFormatError
 from regnf_core.importing.gate import gate
 from tests.cli.conftest import DATA, Run, Serve
 from tests.core.importing.gate.test_candidates import octahedron

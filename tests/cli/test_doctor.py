@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from regnf_cli.checks import libraries, machine, native, stores
-from regnf_cli.checks.finding import Finding
+from regnf_cli.checks import libraries, machine, stores
+from regnf_cli.checks.libraries import Finding
 from regnf_core.fields.native import library
 from regnf_state.settings import Settings
 from tests.cli.conftest import Run
@@ -51,10 +51,10 @@ def test_how_fields_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(library.SWITCH, raising=False)
     for path, said in ((Path("none.so"), "compiled code was not built"), (library.LIBRARY, "compiled code")):
         monkeypatch.setattr(library, "load", partial(load, path))
-        (found,) = native.check_native()
+        (found,) = libraries.check_native()
         assert (found.state, said in found.found) == ("ok", True)
     monkeypatch.setenv(library.SWITCH, "0")
-    (found,) = native.check_native()
+    (found,) = libraries.check_native()
     assert found.found == "torch: compiled code is off, REGNF_NATIVE is 0"
 
 

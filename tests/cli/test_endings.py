@@ -35,11 +35,11 @@ main()
 ROOM, CHAIR, BOX = (str(DATA / name) for name in ("mix-room.safetensors", "armchair.safetensors", "detection.json"))
 PAIR = [ROOM, CHAIR, "--detection", BOX]
 CUT_OFF = [
-    *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "rich", "pydantic", "regnf_cli.console", "numpy")],
+    *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "rich", "pydantic", "regnf_cli.report", "numpy")],
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch", "torch._C", "torch.nn")],
-    *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_core.registration", "scipy.spatial", "PIL.Image")],
+    *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_core.library", "scipy.spatial", "PIL.Image")],
     *[(name, "torch", ["register", *PAIR]) for name in ("SIGTERM", "SIGHUP")],
-    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
+    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.document")],
     *[("SIGINT", name, ["inspect", PAIR[1]]) for name in ("regnf_cli.inspect", "torch")],
     ("SIGINT", "igl", ["convert", PAIR[1], "chair.ply"]),
     ("SIGINT", "igl.pyigl_core", ["convert", PAIR[1], "chair.ply"]),
@@ -49,7 +49,7 @@ CUT_OFF = [
     ("SIGHUP", "regnf_cli.supervisor", ["serve", "--port", "0", "--state-dir", "state"]),
     ("SIGINT", "httpx", ["register", *PAIR, "--server", "http://127.0.0.1:9"]),
     ("SIGINT", "regnf_cli.doctor", ["doctor"]),
-    ("SIGINT", "regnf_cli.batch_here", ["batch", str(DATA / "detection.json")]),
+    ("SIGINT", "regnf_cli.batch", ["batch", str(DATA / "detection.json")]),
     ("SIGINT", "rich.markdown", ["manual", "api"]),
 ]  # fmt: skip
 

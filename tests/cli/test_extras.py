@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_cli.extras import MODULES, require
+from regnf_cli.guard import MODULES, require
 from regnf_core.errors import MissingExtraError
 from tests.cli.conftest import DATA, Run
 

@@ -12,9 +12,8 @@ import pytest
 
 from regnf_cli import main as cli
 from regnf_core.errors import RegnfError
-from regnf_core.library_archive import open_archive, write_archive
 from regnf_core.library_entries import EntryNotes
-from regnf_core.library_folder import INDEX, FolderEntry, LibraryFolder, digest_of
+from regnf_core.library_folder import INDEX, FolderEntry, LibraryFolder, digest_of, open_archive, write_archive
 from tests.live_stack import DATA
 
 CHAIR = DATA / "armchair.safetensors"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from regnf_cli.manual import folder, pages_of
-from regnf_core.hints import HINTS
+from regnf_core.errors import HINTS
 from tests.cli.conftest import Run
 
 ROOT = Path(__file__).parents[2]

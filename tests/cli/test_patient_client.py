@@ -8,9 +8,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from regnf_cli.patient_client import PatientClient
-from regnf_cli.remote import RemoteService
-from regnf_client.errors import ServiceError
+from regnf_cli.remote import PatientClient, RemoteService
+from regnf_client.answers import ServiceError
 from regnf_core.field_source import FieldSource
 
 Handler = Callable[[httpx.Request], httpx.Response]

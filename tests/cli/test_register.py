@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from regnf_cli.options import read_options
 from regnf_cli.report import symmetry_in_words
-from regnf_cli.request_files import read_options
-from regnf_core.errors import InvalidOptionsError
+from regnf_core.errors import VERDICT_REASONS, InvalidOptionsError
 from regnf_core.field_notes import NO_NOTES
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.loading import LoadedField
-from regnf_core.verdicts import VERDICT_REASONS
 from tests.cli.conftest import DATA, Run
 from tests.core.analytic import chair, chair_box, chair_pose, room
 from tests.core.robust.shapes import slab_table, table_room

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from regnf_client.errors import NoWorkerError
-from regnf_client.worker_watch import WorkerWatch
+from regnf_client.answers import NoWorkerError
+from regnf_client.steps import WorkerWatch
 from tests.cli.conftest import Answer, Answers, Run, Serve
 
 

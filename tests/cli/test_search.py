@@ -13,8 +13,8 @@ import pytest
 from regnf_cli.report import show_ranking
 from regnf_core import object_models
 from regnf_core.errors import FieldFormatError, InvalidInputError
+from regnf_core.field_files import library_files
 from regnf_core.field_source import find_source
-from regnf_core.library_files import library_files
 from regnf_core.object_models import object_model
 from regnf_core.options import RobustOptions
 from tests.cli.conftest import DATA, Answer, Run, Serve

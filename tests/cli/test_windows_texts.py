@@ -15,15 +15,14 @@ import pytest
 
 from regnf_cli.batch_file import read_pairs
 from regnf_cli.edit import _edits
-from regnf_cli.field_options import description
-from regnf_cli.request_files import read_detection, read_options, read_transform
+from regnf_cli.options import description, read_detection, read_options, read_transform
 from regnf_core.errors import FieldFormatError, InvalidInputError
-from regnf_core.importing.observing.trajectory_text import read_matrices, read_tum
+from regnf_core.importing.observing.reading import read_matrices, read_tum
 from regnf_core.importing.run.opened import SettingsFile
 from regnf_core.importing.settings.documents import read_documents
 from regnf_core.texts import TextError, decode_text
 from regnf_service.tokens import TokensError, read_callers
-from regnf_state.redis.address import redis_address
+from regnf_state.redis.client import redis_address
 from regnf_state.settings import Settings
 from tests.cli.conftest import DATA, Run
 

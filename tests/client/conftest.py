@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from regnf_client import Client
-from regnf_client.sync_driver import SyncDriver
+from regnf_client.client import SyncDriver
 from tests.client.transports import Handler, Pretended
 from tests.contract.asgi import AppTransport
 from tests.contract.conftest import world, worlds

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from regnf_service.fields.uploads import Upload
-from regnf_service.http.multipart import _Collector
+from regnf_service.http.body import _Collector
 from tests.contract.bad_input import GOOD, PNG, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, make_world
 

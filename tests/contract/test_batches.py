@@ -12,10 +12,10 @@ import pytest
 
 from regnf_service.upkeep.reaper import Reaper
 from regnf_state.blobs.local import LocalBlobWriter
-from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.journal.journaled_records import Rebuilder
 from regnf_state.ownership import reference_of
-from regnf_state.problems import problem_document
 from regnf_state.queue import QUEUE_NAME, Work
+from regnf_state.reasons import problem_document
 from tests.contract.asgi import client_of
 from tests.contract.batch_posts import NDJSON, body_of, document, pairs, post, posted, results, work
 from tests.contract.world import BOX, RESULT, TOKENS, World, assert_refused, field_bytes, sha256

@@ -14,9 +14,9 @@ from typing import Any
 import httpx
 import pytest
 
-from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
+from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
 from regnf_service.http.connections import Connections
-from regnf_state.field_views import view_key
+from regnf_state.pieces import view_key
 from regnf_state.redis.documents import RedisDocuments
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.world import World

@@ -11,7 +11,7 @@ import pytest
 from fastapi import FastAPI
 from redis import Redis
 
-from regnf_service.http.security_headers import SECURITY_HEADERS
+from regnf_service.http.problems import SECURITY_HEADERS
 from tests.contract.world import NOBODY, World, assert_refused, make_world
 
 OWN = "http://localhost"

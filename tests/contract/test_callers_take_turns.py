@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from regnf_service.fields.uploads import Upload
-from regnf_service.http import parsing
+from regnf_service.http import body
 from tests.contract.world import ALICE, BOB, TOKENS, World, field_bytes, sha256
 
 MANY = 60
@@ -123,7 +123,7 @@ def test_bodies_of_one_caller_are_read_beside_those_of_others(shared: World, mon
         return json.dumps({"scene": "0" * 64, "candidates": large, "label": label}).encode()
 
     async def both() -> int:
-        held.hold(monkeypatch, parsing, "read_model", lambda _model, text, *_: b"greedy" in text)
+        held.hold(monkeypatch, body, "read_model", lambda _model, text, *_: b"greedy" in text)
         headers = {"Content-Type": "application/json"}
 
         async def ask(client: httpx.AsyncClient, label: str) -> httpx.Response:

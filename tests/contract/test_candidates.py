@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.field_candidates import Candidate
-from regnf_state.originals import Originals
+from regnf_core.errors import Candidate, FieldFormatError
 from regnf_state.queue import Work
-from regnf_worker.context import Context
+from regnf_state.room import Originals
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.models import Context
 from tests.contract.test_field_changes import ORIGINAL, PLACE, A, change, imported, send
 from tests.contract.world import World, assert_refused, make_world, sha256
 

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from regnf_service.http import parsing
-from regnf_service.http.json_size import MOST_VALUES, count_values
+from regnf_service.http import body as parsing
+from regnf_service.http.middleware import WrongTokens
 from regnf_service.http.schemas import reading
-from regnf_service.http.wrong_tokens import WrongTokens
+from regnf_service.http.strict_json import MOST_VALUES, count_values
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world
 
 ALICE = {"Authorization": "Bearer open-sesame-open-sesame"}

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from regnf_service.http.cross_origin import cors_origins
-from regnf_service.http.hosts import HostsError
+from regnf_service.http.hosts import HostsError, cors_origins
 from regnf_state.settings import Settings
 from tests.contract.world import World, assert_refused
 

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from regnf_service.http.etags import parse_if_none_match
+from regnf_service.http.ranges import parse_if_none_match
 from regnf_state.records import FieldRecord
 from tests.contract.world import World, field_bytes
 

@@ -12,8 +12,8 @@ from redis import Redis
 
 from regnf_core.errors import FieldFormatError
 from regnf_state.queue import Work
-from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.models import Context
 from tests.contract.test_registrations import one_shot
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 from tests.worker.tiny_engine import tiny_importer
@@ -285,7 +285,7 @@ def test_kept_fields_give_way_too(tmp_path: Path, any_redis: Redis) -> None:
 def test_the_same_question_is_asked_at_once_and_its_bytes_are_kept(world: World) -> None:
     place = question(world, "a")
     world.records.ahead_s = 7 * 3600
-    from regnf_state.originals import Originals
+    from regnf_state.room import Originals
 
     assert Originals(world.records, world.blobs, world.settings).trim("anonymous") == 1
     assert world.blobs.blobs == {}

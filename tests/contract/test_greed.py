@@ -11,7 +11,7 @@ import pytest
 
 from regnf_core.importing.gate.report import OF_THE_CIRCUMSTANCES
 from regnf_state.ownership import reference_of
-from regnf_state.problems import problem_document
+from regnf_state.reasons import problem_document
 from regnf_state.records import FieldRecord
 from tests.contract.asgi import client_of
 from tests.contract.world import BOX, World, assert_refused, field_bytes, sha256

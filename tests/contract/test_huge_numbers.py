@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from regnf_core.options import RegistrationOptions
-from regnf_core.rendering.options import RenderOptions
+from regnf_core.rendering.request import RenderOptions
 from tests.contract.world import World, field_bytes, sha256, transform
 
 _CONTRACT: dict[str, Any] = yaml.safe_load((Path(__file__).parents[2] / "openapi.yaml").read_text(encoding="utf-8"))

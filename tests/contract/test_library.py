@@ -9,7 +9,7 @@ import pytest
 
 from regnf_core.library_entries import MAX_TAGS
 from regnf_service.concurrency import in_thread
-from regnf_service.http import by_reference
+from regnf_service.http import batch_intake
 from regnf_state.queue import Work
 from tests.contract.world import World, assert_refused
 
@@ -196,7 +196,7 @@ def test_entries_are_selected_a_page_at_a_time(world: World, monkeypatch: pytest
     chairs = [world.ready_field(f"chair {number}") for number in range(5)]
     for number, field in enumerate(chairs):
         add(world, field, f"chair {number}", tags=["seat"])
-    monkeypatch.setattr(by_reference, "LOOKED_AT", 2)
+    monkeypatch.setattr(batch_intake, "LOOKED_AT", 2)
     pages = 0
 
     async def counted(work: Any, *given: Any) -> Any:
@@ -204,7 +204,7 @@ def test_entries_are_selected_a_page_at_a_time(world: World, monkeypatch: pytest
         pages += 1
         return await in_thread(work, *given)
 
-    monkeypatch.setattr(by_reference, "in_thread", counted)
+    monkeypatch.setattr(batch_intake, "in_thread", counted)
     found = register(world, candidates={"library": {"tags": ["seat"]}}).json()
     assert (set(found["request"]["candidates"]), pages) == (set(chairs), 3)
     register(world, candidates={"library": {"names": ["chair 1"]}})

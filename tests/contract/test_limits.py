@@ -11,10 +11,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from regnf_service.app import create_app
 from regnf_service.http.rate_limits import RedisRateLimiter
 from regnf_service.problem import Problem
-from regnf_service.upload_slots import UploadSlots
+from regnf_service.server import create_app
+from regnf_service.services import UploadSlots
 from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of

@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_core.version import ENGINE_REVISION
 from regnf_service.http.schemas.results import ResultDocument
 from tests.contract.live import Live, eventually
 from tests.contract.test_openapi import validator

@@ -14,8 +14,8 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 
+from regnf_core.errors import VERDICT_REASONS
 from regnf_core.options import RobustOptions
-from regnf_core.verdicts import VERDICT_REASONS
 from regnf_service.http.routes.examples import OBJECT, OTHER, REGISTER_EXAMPLES, RENDER_EXAMPLES, SCENE
 from regnf_state.reasons import REASONS
 from tests.contract.world import World

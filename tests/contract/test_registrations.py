@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from regnf_service.jobs.identity import job_id_of
+from regnf_service.jobs.submit import job_id_of
 from regnf_state.records import FieldRecord
 from regnf_state.registration_request import RegistrationRequest
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from regnf_service.http.schemas.renderings import MOST_CAMERAS
-from regnf_state.job_request import request_of
-from regnf_state.rendering_request import RenderingRequest
+from regnf_service.http.schemas.scenes import MOST_CAMERAS
+from regnf_state.registration_request import RenderingRequest, request_of
 from tests.contract.test_openapi import validator
 from tests.contract.world import ALICE, BOB, BOX, RESULT, TOKENS, World, assert_refused, field_bytes, sha256, transform
 from tests.stores import expire

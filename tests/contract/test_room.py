@@ -142,7 +142,7 @@ def test_rounds_bring_all_callers_within_their_bounds(tmp_path: Path, redis: Red
 def test_idempotency_keys_and_attempts_of_deleted_fields_are_bounded(
     tmp_path: Path, redis: Redis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("regnf_state.redis.owners.SHORT_LIVED", 5)
+    monkeypatch.setattr("regnf_state.redis.counters.SHORT_LIVED", 5)
     world = served(tmp_path, redis, max_upload_bytes=4096)
     with world.client:
         request = ready(world, "greedy")

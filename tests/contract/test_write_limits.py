@@ -9,9 +9,9 @@ import httpx
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
-from regnf_service.http import write_limits
-from regnf_service.http.buckets import Buckets
-from regnf_service.http.write_limits import WriteGate
+from regnf_service.http import rate_limits
+from regnf_service.http.middleware import Buckets
+from regnf_service.http.rate_limits import WriteGate
 from regnf_state.settings import Settings
 from tests.contract.live import Live, live_service
 from tests.contract.world import ALICE, BOB, NOBODY, TOKENS, World, assert_refused, field_bytes, sha256
@@ -181,7 +181,7 @@ def test_refusals_that_come_too_often_are_held_back(monkeypatch: pytest.MonkeyPa
     async def nothing(*_given: object) -> None:
         return None
 
-    monkeypatch.setattr("regnf_service.http.write_limits.asyncio.sleep", hold)
+    monkeypatch.setattr("regnf_service.http.rate_limits.asyncio.sleep", hold)
     gate = WriteGate(nothing, Buckets(0.01, 1))
     scope: Scope = {"type": "http", "method": "POST", "path": "/register", "headers": []}
 
@@ -192,4 +192,4 @@ def test_refusals_that_come_too_often_are_held_back(monkeypatch: pytest.MonkeyPa
     assert [ask("alice") for _ in range(21)][-1] == 0, "the first ones at once"
     assert [ask("alice") for _ in range(3)] == [1, 2, 3]
     assert [ask("bob") for _ in range(2)][-1] == 3, "another caller's are its own"
-    assert set(held) == {write_limits._HELD_S}
+    assert set(held) == {rate_limits._HELD_S}

@@ -14,7 +14,7 @@ from fastapi import FastAPI
 from redis import Redis
 from starlette.routing import BaseRoute
 
-from regnf_service.app import create_app
+from regnf_service.server import create_app
 from regnf_state.queue import Work
 from regnf_state.records import JobRecord
 from regnf_state.settings import Settings

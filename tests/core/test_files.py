@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.files import atomic_path
+from regnf_core.errors import atomic_path
 
 
 @pytest.mark.parametrize("durable", [False, True])

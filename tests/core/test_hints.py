@@ -15,12 +15,11 @@ import pytest
 import typer
 
 from regnf_cli.commands import app_of
-from regnf_core.errors import InvalidOptionsError
-from regnf_core.geometry.similarity_check import similarity_fault
-from regnf_core.hints import _FAMILIES, HINTS, hint_of, verdict_hint
+from regnf_core.errors import _FAMILIES, HINTS, InvalidOptionsError, hint_of, verdict_hint
 from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.options import RegistrationOptions, _names
-from regnf_core.rendering.options import RenderOptions
+from regnf_core.rendering.request import RenderOptions
+from regnf_core.rotations import similarity_fault
 from regnf_state.reasons import REASONS
 from regnf_state.settings import Settings
 
@@ -34,7 +33,7 @@ HAVE_IT_IN_THEIR_MESSAGE = {"EXTRA_MISSING", "USAGE", "CANCELLED"}
 @cache
 def texts() -> list[tuple[Path, str]]:
     """Every literal text of the code that is a hint: of the table, or given by the name ``hint``."""
-    found = [(ROOT / "regnf_core/hints.py", text) for text in (*HINTS.values(), *_FAMILIES.values())]
+    found = [(ROOT / "regnf_core/errors.py", text) for text in (*HINTS.values(), *_FAMILIES.values())]
     for path in (path for top in (*PACKAGES, "service") for path in sorted((ROOT / top).rglob("*.py"))):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             is_hint = isinstance(node, ast.keyword) and node.arg == "hint"

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.library import LibraryObject, model_object, search_library
 from regnf_core.options import RegistrationOptions
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, sphere, table

@@ -11,13 +11,12 @@ import pytest
 import torch
 
 from regnf_core.errors import CancelledError, InitializationError, InvalidInputError, InvalidOptionsError
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.library import model_object
+from regnf_core.library import WarmStart, model_object, register
 from regnf_core.options import OptimizationOptions, RegistrationOptions
-from regnf_core.registration import WarmStart, register
 from regnf_core.result import Phase
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere, table
 from tests.core.conftest import QUICK, ChairRun
@@ -151,7 +150,7 @@ import torch
 torch.set_num_threads(1)
 from tests.core.analytic import chair, chair_box, chair_pose, room
 from tests.core.test_registration import BRIEF
-from regnf_core.registration import register
+from regnf_core.library import register
 T = chair_pose()
 result = register(room(T), chair(), chair_box(T), BRIEF, seed=7)
 print(result.T_object_scene.matrix().numpy().tobytes().hex())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.errors import VERDICT_REASONS
 
 CORE = Path(__file__).resolve().parents[2] / "regnf_core"
 

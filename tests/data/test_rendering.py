@@ -13,8 +13,19 @@ from PIL import Image
 
 from benchmarks.simple_meshes import revolved
 from regnf_core.fields.mesh import MeshField
-from regnf_data.mesh_scene import MeshScene, PaintedMesh, Thing, box_thing, load_thing
-from regnf_data.paint import TexturePaint, TilePaint, VertexPaint, paint_of, to_linear, to_srgb
+from regnf_data.mesh_scene import (
+    MeshScene,
+    PaintedMesh,
+    TexturePaint,
+    Thing,
+    TilePaint,
+    VertexPaint,
+    box_thing,
+    load_thing,
+    paint_of,
+    to_linear,
+    to_srgb,
+)
 from regnf_data.rendering import Shading, intrinsics_of, render
 from regnf_data.trajectories import look_at
 

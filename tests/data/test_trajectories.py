@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
 from regnf_core.fields.composite import SurfaceSource
-from regnf_data.bad_view import bad_view, half_view, seen_points
-from regnf_data.mesh_scene import MeshScene, Thing, box_thing
-from regnf_data.paint import TilePaint
+from regnf_data.composing import bad_view, half_view, seen_points
+from regnf_data.mesh_scene import MeshScene, Thing, TilePaint, box_thing
 from regnf_data.rendering import intrinsics_of
-from regnf_data.trajectories import check_free, long_walk, look_at, orbit, pass_by, short_walk
-from regnf_data.walking import WalkingGround
+from regnf_data.trajectories import WalkingGround, check_free, long_walk, look_at, orbit, pass_by, short_walk
 
 SIZE = (60, 80)
 INTRINSICS = intrinsics_of(SIZE, 60.0)

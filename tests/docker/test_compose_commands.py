@@ -7,8 +7,7 @@ import subprocess
 
 import pytest
 
-from regnf_cli.listening import check_access
-from regnf_cli.start_errors import StartError
+from regnf_cli.embedded_redis import StartError, check_access
 from regnf_state.settings import Settings
 from scripts.images.commands import ComposeCommand, documented_commands
 from scripts.images.compose import Service, render

@@ -15,8 +15,7 @@ from redis import Redis
 from redis.exceptions import AuthenticationError, NoPermissionError
 
 from regnf_cli.embedded_redis import answers
-from regnf_state.redis.address import RedisPasswordError, redis_address
-from regnf_state.redis.client import connect
+from regnf_state.redis.client import RedisPasswordError, connect, redis_address
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings

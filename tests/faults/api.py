@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import uvicorn
 
-from regnf_service import app, lifespan
+from regnf_service import server
 from regnf_service.upkeep import reaper
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.logs import configure_logging
@@ -38,8 +38,8 @@ class DyingQueue(RqJobQueue):
 
 def shorten_waits() -> None:
     """What no setting shortens."""
-    lifespan._REAP_EVERY_S = 0.5
-    app._STORAGE_WAIT_S = 0.7
+    server._REAP_EVERY_S = 0.5
+    server._STORAGE_WAIT_S = 0.7
     reaper._UNHELD_FOR_S = 2.0
     reaper._LEADS_FOR_S = 3
     object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S
@@ -48,8 +48,8 @@ def shorten_waits() -> None:
 def serve(descriptor: int) -> None:
     settings = Settings()
     kind = DyingQueue if "REGNF_TEST_DIE" in os.environ else RqJobQueue
-    stores = app.open_stores(settings, retries=None, storage_wait_s=app._STORAGE_WAIT_S)
-    application = app.create_app(settings, replace(stores, queue=kind(stores.redis)))
+    stores = server.open_stores(settings, retries=None, storage_wait_s=server._STORAGE_WAIT_S)
+    application = server.create_app(settings, replace(stores, queue=kind(stores.redis)))
     config = uvicorn.Config(application, log_config=None, access_log=False, lifespan="on", timeout_graceful_shutdown=2)
     uvicorn.Server(config).run(sockets=[socket.socket(fileno=descriptor)])
 

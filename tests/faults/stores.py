@@ -10,7 +10,7 @@ from typing import Protocol
 import obstore
 from obstore.store import S3Store
 
-from regnf_state.blobs.object_client import object_client
+from regnf_state.blobs.object_store import object_client
 from tests.listing import files_below
 from tests.object_store import ObjectServer, environment
 

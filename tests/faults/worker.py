@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from regnf_core.field_views import FieldViews
+from regnf_core.field_notes import FieldViews
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.blobs.base import BlobStore
 from regnf_state.logs import configure_logging
@@ -21,15 +21,15 @@ from regnf_state.manifest import Manifest
 from regnf_state.queue import Kind
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
-from regnf_worker import artifacts
 from regnf_worker import attempt as attempts
+from regnf_worker import settle
 from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
-from regnf_worker.drawing import draw_field
 from regnf_worker.engine import Made
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.jobs import draw_field
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context
 from regnf_worker.process import Function, RegnfWorker
-from regnf_worker.scratch import Scratch
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
 
@@ -68,7 +68,7 @@ class HeldEngine(TinyEngine):
 
 
 def publish(blobs: BlobStore, manifest: Manifest) -> bool:
-    published = artifacts.publish(blobs, manifest)
+    published = settle.publish(blobs, manifest)
     wait_while("hold-end")
     return published
 

@@ -12,8 +12,8 @@ from redis import Redis
 
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import MIB, ImportLimits
-from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.models import Context
 from tests.contract.world import World, assert_refused, make_world, sha256
 
 LIMITS = ImportLimits(tensor_bytes=64 * MIB)

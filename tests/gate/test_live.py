@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from regnf_state.originals import QUESTIONS
+from regnf_state.room import QUESTIONS
 from tests.contract.live import Live, eventually
 from tests.contract.world import assert_refused
 from tests.core.importing.fuzzing.seeds import Seeds

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_core.version import ENGINE_REVISION
 from scripts.engine_revision import ROOT, changes_since, next_record, write_revision
 from scripts.engine_sources import source_digest
 from tests.golden.cases import cases

@@ -128,7 +128,7 @@ def test_all_that_a_registration_loads_is_in_the_digest() -> None:
     code = (
         "import sys, regnf_core.batch, regnf_core.library\n"
         "from regnf_core.geometry.box import OrientedBox\n"
-        "from regnf_core.registration import register\n"
+        "from regnf_core.library import register\n"
         "from regnf_core.fields.build import open_field\n"
         "scene, chair = (open_field(f'examples/data/{name}.safetensors') for name in ('mix-room', 'armchair'))\n"
         "register(scene, chair, OrientedBox.from_corners([-0.83, -0.58, -0.5], [-0.29, 0.01, 0.01]))\n"

@@ -69,7 +69,7 @@ def test_a_port_in_use(run: Run, folder: Path) -> None:
 
 
 def test_two_services_on_one_state_folder(run: Run, folder: Path) -> None:
-    from regnf_cli.state_lock import StateLock
+    from regnf_cli.supervisor import StateLock
 
     with StateLock(folder / "state") as held:
         held.note(address="http://127.0.0.1:1")

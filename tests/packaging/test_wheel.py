@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import pytest
 import yaml
 
-from regnf_cli.demo_data import FILES
+from regnf_cli.demo import FILES
 from regnf_cli.manual import pages_of
 from regnf_core.version import __version__
 from scripts import wheel_hook
@@ -141,7 +141,7 @@ def test_with_the_service_alone_the_application_loads(wheel: Path, tmp_path: Pat
 
 PAGE = """
 import pathlib, sys, httpx
-from regnf_cli.local_service import running_service
+from regnf_cli.demo import running_service
 with running_service(pathlib.Path("state")) as address:
     for path in sys.argv[1:]:
         answer = httpx.get(address + path)
@@ -173,7 +173,7 @@ def test_type_checkers_see_the_types_of_an_editable_install(tmp_path: Path) -> N
     )
     install_wheel(venv, tmp_path / built.stdout.split()[-1])
     user = tmp_path / "user.py"
-    user.write_text("import regnf_service.app, regnf_worker.main\nfrom regnf_core import Sim3\nreveal_type(Sim3)\n")
+    user.write_text("import regnf_service.server, regnf_worker.main\nfrom regnf_core import Sim3\nreveal_type(Sim3)\n")
     command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--python-executable"]
     command += [str(venv / "bin/python"), "--cache-dir", str(tmp_path / "cache")]
     done = run([*command, str(user)], tmp_path, timeout_s=280.0)

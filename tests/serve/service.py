@@ -11,8 +11,8 @@ from pathlib import Path
 
 import httpx
 
-from regnf_cli.start_errors import StartError
-from regnf_cli.state_lock import StateLock
+from regnf_cli.embedded_redis import StartError
+from regnf_cli.supervisor import StateLock
 from tests.processes import alive, command_of, descendants_of
 from tests.worker.bench import eventually
 

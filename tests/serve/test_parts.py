@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from regnf_cli import embedded_redis
-from regnf_cli.listening import address_of, check_access, open_socket
-from regnf_cli.start_errors import StartError
-from regnf_cli.state_lock import StateLock
+from regnf_cli.embedded_redis import StartError, address_of, check_access, open_socket
+from regnf_cli.supervisor import StateLock
 from regnf_state.settings import Settings, is_loopback
 from tests.processes import alive, command_of, descendants_of
 from tests.worker.bench import eventually

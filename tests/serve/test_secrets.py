@@ -9,7 +9,7 @@ from pathlib import Path
 
 import httpx
 
-from regnf_cli.local_service import running_service
+from regnf_cli.demo import running_service
 from tests.processes import command_of, descendants_of
 
 TOKEN, FILED = "token-in-the-environment-1f9c", "token-in-the-file-77aa"

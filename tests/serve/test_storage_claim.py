@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_state.journal.storage_claim import STORAGE_KEY
+from regnf_state.journal.journal import STORAGE_KEY
 from regnf_state.redis.client import connect
 from tests.faults.house import plain_environment
 from tests.redis_server import private_redis

@@ -15,12 +15,11 @@ import pytest
 from redis import Redis
 from redis.exceptions import RedisError
 
-from regnf_service import lifespan
-from regnf_service.app import create_app
+from regnf_service import server
 from regnf_service.concurrency import Waiters
-from regnf_service.http.waiting import pause, wait_for
-from regnf_service.shutdown import stopping_on_signals
-from regnf_state.redis.address import NoRedisError
+from regnf_service.http.body import pause, wait_for
+from regnf_service.server import create_app, stopping_on_signals
+from regnf_state.redis.client import NoRedisError
 from regnf_state.settings import Settings
 from tests.contract.world import make_world
 from tests.stores import services_over
@@ -28,7 +27,7 @@ from tests.stores import services_over
 
 def test_the_application_loads_neither_torch_nor_open3d() -> None:
     heavy = "{'torch', 'open3d', 'regnf_worker', 'numpy'}"
-    code = f"import sys, regnf_service.app; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
+    code = f"import sys, regnf_service.server; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -124,9 +123,9 @@ def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(
                     return
                 raise faults.pop()
 
-        monkeypatch.setattr(lifespan, "Reaper", FaultyReaper)
-        monkeypatch.setattr(lifespan, "_REAP_EVERY_S", 0.001)
-        await asyncio.wait_for(lifespan._reap(services), 20)
+        monkeypatch.setattr(server, "Reaper", FaultyReaper)
+        monkeypatch.setattr(server, "_REAP_EVERY_S", 0.001)
+        await asyncio.wait_for(server._reap(services), 20)
 
     asyncio.run(run())
     assert not faults

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from regnf_service.http.buckets import Buckets
+from regnf_service.http.middleware import Buckets
 
 
 class Clock:

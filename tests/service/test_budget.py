@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from regnf_service.budget import seconds_until_free
+from regnf_service.library import seconds_until_free
 
 NOW = 100 * 60.0
 

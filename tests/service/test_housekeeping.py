@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from regnf_service.upkeep.housekeeping import Housekeeper, Removed
-from regnf_service.upkeep.lease import Lease, LeaseLostError
+from regnf_service.upkeep.housekeeping import Housekeeper, Lease, LeaseLostError, Removed
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from tests.stores import stores_over

@@ -11,7 +11,7 @@ from redis import Redis
 from redis.exceptions import ConnectionError as RedisConnectionError
 
 from regnf_service.http.sse import event_stream
-from regnf_service.job_watch import JobWatch, Position
+from regnf_service.services import JobWatch, Position
 from regnf_state.records import JobNews
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.settings import Settings

@@ -3,7 +3,7 @@
 import pytest
 from redis import Redis
 
-from regnf_service.upkeep.lease import Lease, LeaseLostError
+from regnf_service.upkeep.housekeeping import Lease, LeaseLostError
 
 
 @pytest.fixture

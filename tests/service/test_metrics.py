@@ -15,10 +15,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from redis import Redis
 
-from regnf_service import metrics_port
+from regnf_service import metrics as metrics_port
 from regnf_service.http.hosts import AllowedHosts
-from regnf_service.metrics import Metrics
-from regnf_service.metrics_port import served
+from regnf_service.metrics import Metrics, served
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.counters import BOUNDS_S, Counters

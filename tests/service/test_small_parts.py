@@ -15,14 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from regnf_core.texts import decode_text
-from regnf_service.http.digests import announced_digest, is_sha256
-from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.problems import problem_of
-from regnf_service.http.ranges import ByteRange, parse_range
-from regnf_service.http.routes.submitting import preferred_wait
+from regnf_service.http.query import decode_token, encode_token
+from regnf_service.http.ranges import ByteRange, announced_digest, is_sha256, parse_range
+from regnf_service.http.routes.registrations import preferred_wait
 from regnf_service.http.strict_json import parse_json
-from regnf_service.jobs import identity
-from regnf_service.jobs.identity import digest, job_id_of
+from regnf_service.jobs import submit
+from regnf_service.jobs.submit import digest, job_id_of
 from regnf_service.problem import Problem, json_pointer
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.reasons import REASONS
@@ -175,9 +174,9 @@ def test_another_revision_of_the_engine_gives_other_jobs_and_another_version_doe
 ) -> None:
     request = registration_request("a", "b")
     known = job_id_of(request)
-    monkeypatch.setattr(identity, "__version__", "99.0", raising=False)
+    monkeypatch.setattr(submit, "__version__", "99.0", raising=False)
     assert job_id_of(request) == known
-    monkeypatch.setattr(identity, "ENGINE_REVISION", identity.ENGINE_REVISION + 1)
+    monkeypatch.setattr(submit, "ENGINE_REVISION", submit.ENGINE_REVISION + 1)
     assert job_id_of(request) != known
 
 

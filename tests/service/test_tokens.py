@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from regnf_service.app import create_app
+from regnf_service.server import create_app
 from regnf_service.tokens import TokensError, caller_of, read_callers
 from regnf_state.ownership import owner_of, reference_of, sha256_of
 from regnf_state.settings import Settings

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from regnf_service.concurrency import Threads, whose
-from regnf_service.http.turns import AT_ONCE, Turns, fair_key
+from regnf_service.http.middleware import AT_ONCE, Turns, fair_key
 
 
 def order(arrivals: list[tuple[str, float]]) -> list[tuple[str, float]]:

@@ -14,11 +14,8 @@ import pytest
 from redis import Redis
 
 from regnf_service.webhooks import service
-from regnf_service.webhooks.policy import Webhooks
-from regnf_service.webhooks.sender import HttpSender, SendError
-from regnf_service.webhooks.service import deliver_until_stopped, full
-from regnf_service.webhooks.signing import read_secrets
-from regnf_service.webhooks.targets import AllowList
+from regnf_service.webhooks.service import HttpSender, SendError, deliver_until_stopped, full
+from regnf_service.webhooks.targets import AllowList, Webhooks, read_secrets
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.webhook_outbox import Message, RedisOutbox, line_of
 from tests.service.webhook_receiver import SECRET, Receiver, delivery, finish

@@ -7,7 +7,7 @@ import base64
 import pytest
 
 from regnf_service.tokens import TokensError
-from regnf_service.webhooks.signing import read_secrets, signed_headers
+from regnf_service.webhooks.targets import read_secrets, signed_headers
 from tests.service.webhook_receiver import KEY, SECRET, hmac_by_hand
 
 

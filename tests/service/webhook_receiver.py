@@ -13,10 +13,8 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from regnf_service.webhooks.deliverer import Deliverer
-from regnf_service.webhooks.sender import HttpSender
-from regnf_service.webhooks.signing import read_secrets
-from regnf_service.webhooks.targets import AllowList
+from regnf_service.webhooks.service import Deliverer, HttpSender
+from regnf_service.webhooks.targets import AllowList, read_secrets
 from regnf_state.ownership import reference_of
 from regnf_state.records import JobRecord
 from regnf_state.redis.jobs import RedisRecordStore

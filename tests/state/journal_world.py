@@ -7,8 +7,7 @@ from pathlib import Path
 
 from redis import Redis
 
-from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.journal.rebuild import Rebuilder, Rebuilt
+from regnf_state.journal.journaled_records import JournaledRecordStore, Rebuilder, Rebuilt
 from regnf_state.records import FieldRecord, JobRecord
 from tests.stores import HeldBlobs, WatchedQueue
 

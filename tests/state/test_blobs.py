@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_state.blobs.base import BlobStore, StorageFullError, StorageUnavailableError
-from regnf_state.blobs.cache import FileCache
+from regnf_state.blobs.base import BlobStore, FileCache, StorageFullError, StorageUnavailableError
 from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.blobs.object_store import ObjectBlobStore
 from tests.object_store import ObjectServer, environment

@@ -13,8 +13,7 @@ from redis.exceptions import RedisError, ResponseError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
 from regnf_state.redis import bounded_client
-from regnf_state.redis.bounded_client import BoundedRedis, connect_bounded
-from regnf_state.redis.circuit_breaker import Call, CircuitBreaker, CircuitOpenError
+from regnf_state.redis.bounded_client import BoundedRedis, Call, CircuitBreaker, CircuitOpenError, connect_bounded
 from tests.restartable_redis import restartable_redis
 
 

@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 import pytest
 
-from regnf_state.blobs.cache import FileCache
+from regnf_state.blobs.base import FileCache
 
 
 class Source:

@@ -6,8 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from redis import Redis
 
-from regnf_state.pages import all_of
-from regnf_state.record_store import RecordStore
+from regnf_state.record_store import RecordStore, all_of
 from regnf_state.records import QueueFullError, StaleAttemptError
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore

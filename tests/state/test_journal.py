@@ -8,7 +8,7 @@ import pytest
 from redis import Redis
 
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.journal.rebuild import Rebuilt
+from regnf_state.journal.journaled_records import Rebuilt
 from regnf_state.records import JobRecord, StaleAttemptError
 from regnf_state.redis.webhook_outbox import RedisOutbox
 from tests.state.journal_world import RETENTION_S, World, fresh_world

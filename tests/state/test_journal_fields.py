@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from regnf_state.journal.rebuild import Rebuilt
+from regnf_state.journal.journaled_records import Rebuilt
 from tests.state.journal_world import SCENE, World, fresh_world
 
 

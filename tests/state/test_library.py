@@ -10,9 +10,8 @@ from redis import Redis
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.library_entries import EntryNotes, checked_symmetry
-from regnf_state.library import NameTakenError
 from regnf_state.ownership import reference_of
-from regnf_state.record_store import RecordStore
+from regnf_state.record_store import NameTakenError, RecordStore
 from regnf_state.records import FieldRecord, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.state.journal_world import World, fresh_world

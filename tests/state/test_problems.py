@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 
 from regnf_core.errors import InvalidInputError
-from regnf_service.http.schemas.common import whole_problem
+from regnf_service.http.schemas.results import whole_problem
 from regnf_service.problem import Problem
 from regnf_state.manifest import ARTIFACTS, Artifact
-from regnf_state.problems import problem_document
-from regnf_state.reasons import REASONS
-from regnf_worker.problems import fault
+from regnf_state.reasons import REASONS, problem_document
+from regnf_worker.job_limits import fault
 
 
 @pytest.mark.parametrize("reason", sorted(REASONS))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from regnf_state.journal.storage_claim import STORAGE_KEY, StorageMismatchError, claim_storage
+from regnf_state.journal.journal import STORAGE_KEY, StorageMismatchError, claim_storage
 from tests.state.captured import CAPTURED, put_back
 from tests.state.journal_world import World, fresh_world
 from tests.stores import HeldBlobs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from regnf_core.viewing.mesh_file import mesh_file
+from regnf_core.viewing.field_views import mesh_file
 from tests.ui.synthetic import CHAIR_IN_SCENE, LIBRARY_FROM_CHAIR, Array, chair_boxes
 
 _ROOM: list[tuple[list[float], list[float]]] = [

@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from playwright.sync_api import Page, Route, expect
 
-from regnf_service.app import create_app
+from regnf_service.server import create_app
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.settings import Settings
 from tests.stores import private_stores

@@ -16,7 +16,7 @@ import uvicorn
 from fastapi import FastAPI
 from playwright.sync_api import expect
 
-from regnf_service.app import create_app
+from regnf_service.server import create_app
 from regnf_state.blobs.base import BlobStore
 from regnf_state.ownership import ANONYMOUS, reference_of
 from regnf_state.record_store import RecordStore

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from regnf_core.hints import HINTS
+from regnf_core.errors import HINTS
 from tests.ui.synthetic import Synthetic, rotation, sim3_document, similarity
 
 SIGMAS = [math.radians(0.4), math.radians(0.8), math.radians(0.2), 0.003, 0.001, 0.002, 0.005]

@@ -22,7 +22,7 @@ from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
-from regnf_worker.context import Context
+from regnf_worker.models import Context
 from tests.listing import below
 from tests.redis_server import private_redis
 from tests.requests import request_record

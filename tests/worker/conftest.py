@@ -8,7 +8,7 @@ import pytest
 from redis import Redis
 
 from regnf_state.settings import Settings
-from regnf_worker.context import Context
+from regnf_worker.models import Context
 from tests.worker.doubles import context_over
 from tests.worker.refusals import RefusingRedis
 

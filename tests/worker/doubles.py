@@ -6,7 +6,7 @@ from redis import Redis
 
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
-from regnf_worker.context import Context
+from regnf_worker.models import Context
 from tests.requests import request_record
 from tests.stores import HeldBlobs, ShiftedRecords, WatchedQueue
 

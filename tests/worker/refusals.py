@@ -11,7 +11,7 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import OutOfMemoryError, ReadOnlyError, ResponseError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
-from regnf_worker.context import Context
+from regnf_worker.models import Context
 
 FULL = OutOfMemoryError("command not allowed when used memory > 'maxmemory'.")
 PASSING = [

@@ -5,10 +5,9 @@ import pytest
 from regnf_core.errors import CancelledError
 from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.records import FieldRecord
-from regnf_worker.artifacts import publish
-from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
-from regnf_worker.heartbeat import Heartbeat
+from regnf_worker.attempt import Heartbeat, run_attempt
+from regnf_worker.models import Context
+from regnf_worker.settle import publish
 from tests.stores import ShiftedRecords, WatchedQueue
 from tests.worker.doubles import SHA, accept, job
 from tests.worker.tiny_engine import TinyEngine
@@ -56,7 +55,7 @@ def test_fields_that_are_still_imported_send_the_job_back(context: Context, monk
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
     accept(context)
-    monkeypatch.setattr("regnf_worker.fields._WAIT_BEFORE_GIVING_BACK_S", 0.0)
+    monkeypatch.setattr("regnf_worker.attempt._WAIT_BEFORE_GIVING_BACK_S", 0.0)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
     assert isinstance(context.queue, WatchedQueue)

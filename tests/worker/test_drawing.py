@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from regnf_core.errors import NoSurfaceError
-from regnf_core.field_views import FieldViews
+from regnf_core.field_notes import FieldViews
 from regnf_state.records import FieldRecord
-from regnf_worker.context import Context
-from regnf_worker.drawing import draw_field
+from regnf_worker.jobs import draw_field
+from regnf_worker.models import Context
 from tests.processes import alive, children_of
 from tests.worker.bench import OBJECT, SCENE, Bench, bench, eventually, kill
 from tests.worker.doubles import SHA, begin_import, field

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from regnf_core.errors import FieldFormatError
-from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.models import Context
 from regnf_worker.settle import ChildExit, settle_import
 from tests.worker.doubles import SHA, begin_import, field
 from tests.worker.tiny_engine import tiny_importer

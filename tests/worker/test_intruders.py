@@ -175,8 +175,7 @@ def test_orders_over_redis_end_neither_workers_nor_other_jobs(table: Bench, comm
 
 def test_with_a_key_only_what_is_signed_runs(tmp_path: Path) -> None:
     from regnf_state.queue import Work
-    from regnf_state.redis.payload import SIGNATURE, signature
-    from regnf_state.redis.queue import RqJobQueue
+    from regnf_state.redis.queue import SIGNATURE, RqJobQueue, signature
 
     key = "correct horse battery staple"
     with bench(tmp_path, queue_key=key) as table:

@@ -19,10 +19,8 @@ from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker import models
 from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, Made
-from regnf_worker.library_models import is_unmodeled_entry, model_entry
-from regnf_worker.models import model_key
+from regnf_worker.models import Context, is_unmodeled_entry, model_entry, model_key
 from tests.requests import request_record
 from tests.worker.doubles import context_over
 
@@ -227,7 +225,7 @@ def test_a_search_whose_candidate_is_gone_fails(context: Context) -> None:
 
 
 def test_a_search_stops_between_models_when_it_is_cancelled(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("regnf_worker.heartbeat._REPORT_EVERY_S", 0.0)  # every report asks the record
+    monkeypatch.setattr("regnf_worker.attempt._REPORT_EVERY_S", 0.0)  # every report asks the record
     engine = ModelEngine(while_making=lambda: context.records.request_cancel("j1"))
     assert run(context, engine, "j1", candidates=[CHAIR, TABLE, AIR]).status == "dismissed"
     assert engine.made == [b"chair"]

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from regnf_core.errors import FieldFormatError
-from regnf_state.originals import Originals
 from regnf_state.records import FieldRecord
-from regnf_worker.context import Context
+from regnf_state.room import Originals
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.models import Context
 from tests.stores import ShiftedRecords
 from tests.worker.doubles import SHA, begin_import, field
 from tests.worker.tiny_engine import tiny_importer

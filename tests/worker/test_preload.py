@@ -12,14 +12,14 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 
 from regnf_state.settings import Settings
 from regnf_worker import main
-from regnf_worker.preload import PreloadError
+from regnf_worker.main import PreloadError
 from tests.worker.bench import bench
 
 CODE = """
 import os
 os.environ["OMP_NUM_THREADS"] = "2"
 os.environ["OPENBLAS_NUM_THREADS"] = "2"
-from regnf_worker.preload import preload
+from regnf_worker.main import preload
 preload()
 import torch
 assert len(os.listdir("/proc/self/task")) == 1, "a fork would leave threads behind"
@@ -82,15 +82,15 @@ def test_a_worker_whose_redis_does_not_run_changes_nothing(monkeypatch: pytest.M
 IMPORTS = """
 import sys, os
 from pathlib import Path
-from regnf_worker.preload import preload
+from regnf_worker.main import preload
 preload()
 from regnf_core.geometry.box import OrientedBox
 from tests.core.analytic import chair, chair_box, chair_pose, room
 before = set(sys.modules)
 child = os.fork()
 if child == 0:
-    from regnf_core.registration import register
-    from regnf_core.viewing.artifacts import write_pictures, write_result
+    from regnf_core.library import register
+    from regnf_core.viewing.document import write_pictures, write_result
     found = register(room(chair_pose()), chair(), chair_box(chair_pose()))
     write_result(found, Path(sys.argv[1]))
     write_pictures(found, Path(sys.argv[1]))

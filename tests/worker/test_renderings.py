@@ -11,9 +11,9 @@ from regnf_core.rendering.request import RenderRequest
 from regnf_state.manifest import EDITED_FIELD, read_manifest
 from regnf_state.ownership import reference_of
 from regnf_state.records import FieldRecord, JobRecord
-from regnf_state.rendering_request import RenderingRequest
+from regnf_state.registration_request import RenderingRequest
 from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
+from regnf_worker.models import Context
 from regnf_worker.settle import ChildExit, settle_registration
 from tests.worker.doubles import context_over, job
 from tests.worker.tiny_engine import TinyEngine

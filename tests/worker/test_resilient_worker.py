@@ -16,10 +16,10 @@ from regnf_state.queue import Work
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from regnf_worker import kernel, process
-from regnf_worker.context import Context
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
 from regnf_worker.resilient_worker import ResilientWorker
-from regnf_worker.scratch import Scratch
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis
 
 # RQ's calls, one by one

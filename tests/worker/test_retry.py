@@ -13,11 +13,11 @@ from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
-from regnf_worker.retry import MAX_WAIT_S, passes, retry_until_available
-from regnf_worker.scratch import Scratch
+from regnf_worker.resilient_worker import MAX_WAIT_S, passes, retry_until_available
 from tests.requests import request_record
 from tests.worker.doubles import context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from regnf_state.blobs.base import StorageFullError
-from regnf_state.problems import problem_document
-from regnf_state.redis.address import NoRedisError
+from regnf_state.reasons import problem_document
+from regnf_state.redis.client import NoRedisError
 from regnf_state.settings import Settings
 from regnf_worker import kernel
-from regnf_worker.context import Context
-from regnf_worker.problems import fault
-from regnf_worker.scratch import Scratch
+from regnf_worker.job_limits import fault
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context
 
 
 @pytest.mark.parametrize(

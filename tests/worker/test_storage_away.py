@@ -14,9 +14,9 @@ from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
-from regnf_worker.scratch import Scratch
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
 from tests.requests import request_record
 from tests.stores import HeldBlobs

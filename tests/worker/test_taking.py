@@ -11,8 +11,8 @@ from regnf_service.upkeep.reaper import Reaper
 from regnf_state.queue import Work
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
-from regnf_worker.context import Context
-from regnf_worker.taking import Taken, Taking
+from regnf_worker.models import Context
+from regnf_worker.resilient_worker import Taken, Taking
 from tests.worker.doubles import SHA, accept
 
 JOB = Work("registration", "j1", 1)

@@ -299,9 +299,9 @@ BEGINNINGS = [
     ("os:setpgrp", "OSError"),
     ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
     ("regnf_worker.kernel:give_way", "MemoryError"),
-    ("regnf_worker.worker_pipe:hold", "OSError"),
+    ("regnf_worker.resilient_worker:hold", "OSError"),
     ("regnf_worker.job_limits:JobLimits.hold_here", "ValueError"),
-    ("regnf_worker.scratch:Scratch.use", "OSError"),
+    ("regnf_worker.kernel:Scratch.use", "OSError"),
     ("random:seed", "KeyboardInterrupt"),
 ]
 """What a job's process does before its job."""

@@ -25,8 +25,8 @@ from regnf_state.manifest import EDITED_FIELD
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker.attempt import run_attempt
-from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, Made
+from regnf_worker.models import Context
 
 Report = Callable[[str, float], None]
 
@@ -239,8 +239,8 @@ def tiny_importer(
 
 def run_drawing(reference: str) -> None:
     """Says that it has begun, and goes on once the file `draw` is in the state folder."""
-    from regnf_core.field_views import FieldViews
-    from regnf_worker.drawing import draw_field
+    from regnf_core.field_notes import FieldViews
+    from regnf_worker.jobs import draw_field
 
     def draw(path: Path) -> FieldViews:
         folder = Settings().state_dir

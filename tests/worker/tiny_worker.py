@@ -18,8 +18,8 @@ from regnf_state.logs import configure_logging
 from regnf_state.queue import Kind
 from regnf_state.settings import Settings
 from regnf_worker import process
-from regnf_worker.context import Context
-from regnf_worker.scratch import Scratch
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context
 from tests.worker import tiny_engine
 
 FUNCTIONS: Mapping[Kind, process.Function] = {

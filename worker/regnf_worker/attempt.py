@@ -3,38 +3,279 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import TracebackType
 from typing import Any
 
 from redis.exceptions import RedisError
 from rq.timeouts import JobTimeoutException
 
-from regnf_core.errors import CancelledError, RegnfError
+from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
+from regnf_core.field_notes import FieldNotes
+from regnf_core.rendering.request import RenderRequest
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.job_request import request_of
 from regnf_state.logs import log_context
 from regnf_state.manifest import Manifest, read_manifest
-from regnf_state.problems import problem_document
-from regnf_state.records import JobRecord, StaleAttemptError, UnreadableRecordError
-from regnf_state.rendering_request import RenderingRequest
-from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, told_by_result
-from regnf_worker.context import Context
-from regnf_worker.edited_fields import keep_edited_field
-from regnf_worker.engine import Engine, Made
-from regnf_worker.field_notes import warned_of
-from regnf_worker.fields import Fields, FieldsNotReadyError
-from regnf_worker.heartbeat import Heartbeat
-from regnf_worker.job_limits import JobLimits, held_memory_limit, open_reserve
+from regnf_state.ownership import sha256_of
+from regnf_state.reasons import problem_document
+from regnf_state.record_store import RecordStore
+from regnf_state.records import WARNINGS, FieldRecord, JobRecord, StaleAttemptError, UnreadableRecordError
+from regnf_state.registration_request import RegistrationRequest, RenderingRequest, request_of
+from regnf_worker.engine import Candidate, Engine, Made
+from regnf_worker.job_limits import (
+    JobLimits,
+    are_files_away,
+    fault,
+    held_memory_limit,
+    new_incident,
+    open_reserve,
+    refusal,
+    timeout,
+)
 from regnf_worker.kernel import give_way
-from regnf_worker.problems import are_files_away, fault, new_incident, refusal, timeout
-from regnf_worker.registration import register
-from regnf_worker.rendering import render
-from regnf_worker.rest import Published, finish_result
-from regnf_worker.retry import retry_until_available
-from regnf_worker.worker_pipe import let_worker_go
+from regnf_worker.models import Context, ObjectModels
+from regnf_worker.resilient_worker import let_worker_go, retry_until_available
+from regnf_worker.settle import (
+    Published,
+    discard,
+    discard_others,
+    finish_result,
+    keep_edited_field,
+    publish,
+    store_artifacts,
+    told_by_result,
+)
+
+# What a job repeats of its fields' imports: in its result all of it, in its record the words of the warnings.
+
+_MOST_WORDS = 16
+_WORD_LENGTH = 64
+
+
+def warned_of(scene: FieldRecord, objects: Sequence[FieldRecord]) -> dict[str, Any]:
+    """An entry of a job's inputs: the words of the warnings of its scene, and of its object if it has one alone."""
+    named = {"scene": scene} | ({"object": objects[0]} if len(objects) == 1 else {})
+    words = {
+        name: [word[:_WORD_LENGTH] for word in FieldNotes.of_report(one.report).words[:_MOST_WORDS]]
+        for name, one in named.items()
+    }
+    found = {name: list(dict.fromkeys(said)) for name, said in words.items() if said}
+    return {WARNINGS: found} if found else {}
+
+
+# A job's heartbeat, which also tells the job when it must stop.
+
+STOP_WITHIN_S = 5.0
+_REPORT_EVERY_S = 0.25
+_LAST_WORD_S = 1.0
+"""A heartbeat that is on its way when the job ends has this long to arrive."""
+
+
+class Heartbeat:
+    """Beats in a thread of its own while the job runs, and writes the job's progress to its record.
+
+    Use as a context manager. ``report`` is the registration's progress callback: it raises CancelledError once the job
+    was cancelled or another attempt has taken over (``superseded``). A job that does not come back to ``report`` within
+    five seconds of that is killed: native code receives no exception.
+    """
+
+    def __init__(self, records: RecordStore, job_id: str, attempt: int, beat_s: float) -> None:
+        self._records = records
+        self._job_id = job_id
+        self._attempt = attempt
+        self._beat_s = beat_s
+        self._ended = threading.Event()
+        self._stop = threading.Event()
+        self._phase: str | None = None
+        self._reported = 0.0
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self.superseded = False
+
+    def __enter__(self) -> Heartbeat:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join(_LAST_WORD_S)
+
+    def report(self, phase: str, progress: float) -> None:
+        """Note phase and overall progress 0..1: every change of phase, the rest a few times a second."""
+        self.check()
+        now = time.monotonic()
+        if phase == self._phase and now - self._reported < _REPORT_EVERY_S:
+            return
+        self._phase, self._reported = phase, now
+        self._ask(lambda: self._records.update_job(self._job_id, self._attempt, phase=phase, progress=progress))
+        self.check()
+
+    def check(self) -> None:
+        """Raises CancelledError when the job shall stop."""
+        if self._stop.is_set():
+            raise CancelledError("the job was cancelled" if not self.superseded else "another attempt has taken over")
+
+    def confirm(self) -> None:
+        """Ask the record, as soon as it answers, whether this attempt counts. Raises CancelledError, RedisError."""
+        retry_until_available(
+            f"the record of job {self._job_id}",
+            lambda: self._note(self._records.heartbeat, self._job_id, self._attempt),
+        )
+        self.check()
+
+    def _beat(self) -> None:
+        while not self._ended.wait(self._beat_s):
+            self._ask(lambda: self._records.heartbeat(self._job_id, self._attempt))
+            if self._stop.is_set():
+                if not self._ended.wait(STOP_WITHIN_S):
+                    logger.warning("job %s attempt %d does not stop: killed", self._job_id, self._attempt)
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return
+
+    def _ask(self, change: Any) -> None:
+        try:
+            self._note(change)
+        except RedisError as error:
+            logger.warning("job %s attempt %d: Redis does not answer: %s", self._job_id, self._attempt, error)
+        except MemoryError:
+            logger.warning("job %s attempt %d: no memory is left for a heartbeat", self._job_id, self._attempt)
+
+    def _note(self, change: Any, *arguments: Any) -> None:
+        try:
+            record: JobRecord = change(*arguments)
+        except StaleAttemptError:
+            self.superseded = True
+            self._stop.set()
+        else:
+            if record.cancel_requested:
+                self._stop.set()
+
+
+# The fields that a job reads: waited for until their import has ended, then files for as long as the job runs.
+
+_POLL_S = 0.2
+_WAIT_BEFORE_GIVING_BACK_S = 20.0
+
+
+class FieldsNotReadyError(Exception):
+    """A field is still being imported; the job goes back to the queue, so that the worker is free for others."""
+
+
+class Fields:
+    """Fields of one job. Whatever is opened stays open until ``stack`` closes."""
+
+    def __init__(self, context: Context, heartbeat: Heartbeat, stack: ExitStack) -> None:
+        self._context = context
+        self._heartbeat = heartbeat
+        self._stack = stack
+        self._deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
+
+    def ready(self, references: Sequence[str]) -> list[FieldRecord]:
+        """The fields' records, once their imports have ended; all of them are asked for at once.
+
+        Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
+        """
+        while True:
+            found = self._usable(references)
+            awaited = next((one.sha256 for one in found if one.state == "validating"), None)
+            if awaited is None:
+                return found
+            self._heartbeat.check()
+            if time.monotonic() > self._deadline:
+                raise FieldsNotReadyError(awaited)
+            time.sleep(_POLL_S)
+
+    def file(self, sha256: str) -> Path:
+        """The safe field file of a field that is ready."""
+        return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
+
+    def _usable(self, references: Sequence[str]) -> list[FieldRecord]:
+        found = self._context.records.get_fields(references)
+        return [self._checked(field, sha256_of(name)) for field, name in zip(found, references, strict=True)]
+
+    def _checked(self, field: FieldRecord | None, name: str) -> FieldRecord:
+        """One that may still become, or is, ready."""
+        if field is None:
+            raise InvalidInputError(f"field {name} was deleted", reason="FIELD_NOT_FOUND")
+        if field.state == "rejected":
+            why = (field.error or {}).get("reason", "unknown")
+            raise InvalidInputError(f"field {name} was rejected: {why}", reason="FIELD_REJECTED")
+        settings = self._context.settings
+        longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
+        if field.state == "validating" and self._context.records.now() - field.updated > longest:
+            message = f"field {name} was not imported within {longest:g} s (twice REGNF_IMPORT_TIMEOUT_S and more)"
+            raise InvalidInputError(message, reason="FIELD_IMPORT_TIMEOUT")
+        return field
+
+
+# The work of a registration job: models of its objects, then the engine.
+
+
+def register(
+    context: Context,
+    engine: Engine,
+    request: RegistrationRequest,
+    fields: Fields,
+    scene: FieldRecord,
+    objects: Sequence[FieldRecord],
+    heartbeat: Heartbeat,
+    folder: Path,
+) -> Made:
+    """Have the engine do what the request asks for, artifacts into ``folder``."""
+    options, scene_file = request.options, fields.file(scene.sha256)
+    notes = {sha256_of(one.sha256): FieldNotes.of_report(one.report) for one in objects}
+    notes["scene"] = FieldNotes.of_report(scene.report)
+    if request.candidates is not None:
+        models = ObjectModels(context, engine, options, folder)
+        candidates = [_candidate(models, one, fields, heartbeat) for one in objects]
+        if all(one.model is None for one in candidates):
+            raise NoSurfaceError("none of the candidates is usable as an object", reason="NO_SURFACE_IN_OBJECT")
+        return engine.search(scene_file, candidates, request, heartbeat.report, folder, notes)
+    (one,) = objects
+    object_file, model = fields.file(one.sha256), None
+    if options.preset == "robust":
+        model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
+    named = replace(request, object=sha256_of(one.sha256))
+    return engine.register(scene_file, object_file, model, named, heartbeat.report, folder, notes)
+
+
+def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, heartbeat: Heartbeat) -> Candidate:
+    """One candidate with its model; one that is no object is unusable, not the end of the search."""
+    heartbeat.report("loading", 0.0)
+    sha256 = field.sha256
+    try:
+        model = models.of(field, lambda: fields.file(sha256))
+    except (NoSurfaceError, InvalidInputError) as error:
+        return Candidate(sha256_of(sha256), lambda: fields.file(sha256), None, error.reason)
+    return Candidate(sha256_of(sha256), lambda: fields.file(sha256), model)
+
+
+# The work of a rendering job: every field that its edits name, then the engine.
+
+
+def render(
+    engine: Engine,
+    request: RenderRequest,
+    fields: Fields,
+    scene: FieldRecord,
+    objects: Sequence[FieldRecord],
+    heartbeat: Heartbeat,
+    folder: Path,
+) -> list[str]:
+    """Have the engine render what the request asks for; the names of the artifacts in ``folder``."""
+    opened = {sha256_of(one.sha256): partial(fields.file, one.sha256) for one in objects}
+    return engine.render(fields.file(scene.sha256), opened, request, heartbeat.report, folder)
+
 
 logger = logging.getLogger(__name__)
 

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from regnf_core import __version__
-from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.field_notes import NO_NOTES, FieldNotes
 from regnf_core.importing.gate.gate import ImportLimits, import_field
 from regnf_core.options import RegistrationOptions
 from regnf_core.rendering.request import RenderRequest
+from regnf_core.version import ENGINE_REVISION
+from regnf_state.manifest import EDITED_FIELD
 from regnf_state.registration_request import RegistrationRequest
+
+if TYPE_CHECKING:
+    from regnf_core.rendering.job import RenderReport
+
 
 Report = Callable[[str, float], None]
 Importer = Callable[[Path, Path, dict[str, Any], Path | None, Path | None], dict[str, Any]]
@@ -142,8 +149,8 @@ class CoreEngine:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
-        from regnf_core.registration import WarmStart, register, with_late_clouds
-        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
+        from regnf_core.library import WarmStart, register, with_late_clouds
+        from regnf_core.viewing.document import PICTURES, write_pictures, write_result
 
         _one_thread()
         start, truth = request.initial_transform, request.ground_truth
@@ -172,10 +179,9 @@ class CoreEngine:
     ) -> Made:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
-        from regnf_core.library import LibraryObject, search_library
-        from regnf_core.registration import with_late_clouds
+        from regnf_core.library import LibraryObject, search_library, with_late_clouds
         from regnf_core.viewing import ranking_document
-        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
+        from regnf_core.viewing.document import PICTURES, write_pictures, write_result
 
         _one_thread()
 
@@ -210,7 +216,6 @@ class CoreEngine:
 
         from regnf_core.fields.build import open_field
         from regnf_core.rendering.job import phase_of, run_render
-        from regnf_worker.rendering_result import write_result
 
         made = run_render(
             open_field(scene, self.device),
@@ -260,3 +265,29 @@ def core_importer(limits: ImportLimits) -> Importer:
         return report.to_dict()
 
     return run
+
+
+# The result document of a rendering.
+
+
+def write_result(folder: Path, request: RenderRequest, report: RenderReport, engine: dict[str, Any]) -> list[str]:
+    """Write ``result.json`` beside the files of a rendering; the names of all that is to be kept."""
+    names = [one.name for one in report.artifacts]
+    document = {
+        "frames": request.frames,
+        "size": list(request.image_size),
+        "depth_unit": report.depth_unit,
+        "seconds": report.seconds,
+        "field": _digest(folder / EDITED_FIELD) if EDITED_FIELD in names else None,
+        "seed": request.seed,
+        "options": asdict(request.options),
+        "engine": engine,
+        "artifacts": [asdict(one) for one in report.artifacts],
+    }
+    (folder / "result.json").write_text(json.dumps(document), encoding="utf-8")
+    return [*names, "result.json"]
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -14,16 +14,15 @@ from typing import Any
 from redis.exceptions import RedisError
 from rq.timeouts import JobTimeoutException
 
-from regnf_core.errors import FieldFormatError, RegnfError
-from regnf_core.field_candidates import Candidate
+from regnf_core.errors import Candidate, FieldFormatError, RegnfError
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.originals import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_state.ownership import owner_of
 from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord, SettingsFile, StaleAttemptError
-from regnf_worker.context import Context
+from regnf_state.room import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_worker.engine import Importer
-from regnf_worker.problems import are_files_away, fault, new_incident, refusal, timeout
-from regnf_worker.retry import retry_until_available
+from regnf_worker.job_limits import are_files_away, fault, new_incident, refusal, timeout
+from regnf_worker.models import Context
+from regnf_worker.resilient_worker import retry_until_available
 
 _CLAIM_KEPT_S = 24 * 3600
 logger = logging.getLogger(__name__)

@@ -2,26 +2,104 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import sys
 from collections.abc import MutableMapping
 from contextlib import closing
+from importlib import import_module
+from pathlib import Path
 
 from redis.exceptions import ConnectionError as RedisConnectionError
+from redis.exceptions import RedisError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
-from regnf_state.journal.storage_claim import StorageMismatchError
+from regnf_state.journal.journal import StorageMismatchError, claim_storage
 from regnf_state.logs import configure_logging
-from regnf_state.redis.address import NoRedisError, redis_address
-from regnf_state.redis.client import WORKER_RETRIES, connect
+from regnf_state.redis.client import WORKER_RETRIES, NoRedisError, connect, redis_address
 from regnf_state.settings import Settings
-from regnf_worker.context import Context
-from regnf_worker.kernel import give_way, share_cores
-from regnf_worker.preload import PreloadError, preload
+from regnf_state.stores import open_stores
+from regnf_worker import kernel
+from regnf_worker.kernel import Scratch, give_way, share_cores
+from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
-from regnf_worker.scratch import Scratch
-from regnf_worker.storage_check import check_storage
+
+# Loading the engine into the worker's own process, once, so that its children find it there: REGNF_PRELOAD.
+#
+# A child of a process that has threads may hang: of a pool of threads, a fork copies the locks and not the threads.
+# So nothing is run here, only imported. torch starts its threads with its first operation, CUDA its context with the
+# first call, and both happen in children only; OpenBLAS, numpy's, starts its threads as it is loaded and is therefore
+# told to have none, here and in the children.
+
+_MODULES = (
+    "regnf_worker.engine",
+    "regnf_worker.attempt",
+    "regnf_core.geometry.box",
+    "regnf_core.viewing",
+    "regnf_core.fields.build",
+    "regnf_core.library",
+    "regnf_core.library",
+    "regnf_core.rendering.job",
+    "regnf_core.geometry.sim3",
+    "PIL.PngImagePlugin",
+)
+"""What regnf_worker.engine imports where it needs it, and what Pillow does."""
+
+
+class PreloadError(RuntimeError):
+    """Something that was loaded has started threads: children could hang."""
+
+    reason = "PRELOAD_THREADS"
+
+
+def preload() -> None:
+    """Import what registrations need. Raises PreloadError if the process has several threads afterwards (Linux)."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    for name in _MODULES:
+        import_module(name)
+    tasks = Path("/proc/self/task")
+    if tasks.exists() and len(list(tasks.iterdir())) > 1:
+        raise PreloadError("a library that was loaded has started threads; unset REGNF_PRELOAD")
+    gc.freeze()  # a collection in a child would otherwise copy the pages of everything that was loaded
+
+
+# Before a worker takes jobs: is its storage the one whose records Redis holds?
+
+_WAIT_S = 10.0
+
+
+def check_storage(settings: Settings) -> None:
+    """Raises StorageMismatchError. Says nothing while Redis or the storage is away: the front end looks again.
+
+    In a process of its own: a client of an object store does not survive the forks to come.
+    """
+    reading, writing = os.pipe()
+
+    def tell() -> None:
+        os.write(writing, _mismatch(settings).encode())
+
+    try:
+        kernel.in_child(tell)
+    finally:
+        os.close(writing)
+    with os.fdopen(reading, "rb") as told:
+        message = told.read().decode()
+    if message:
+        raise StorageMismatchError(message)
+
+
+def _mismatch(settings: Settings) -> str:
+    """What is wrong; "" when nothing is, or nobody can tell."""
+    stores = open_stores(settings, retries=0, storage_wait_s=_WAIT_S)
+    try:
+        claim_storage(stores.redis, stores.records.journal.storage_id(), settings.adopt_storage or None)
+    except StorageMismatchError as error:
+        return str(error)
+    except (RedisError, OSError):
+        pass
+    return ""
+
 
 _ASKED = "REGNF_PRELOAD"
 logger = logging.getLogger(__name__)

@@ -5,16 +5,52 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from redis.exceptions import RedisError
 
-from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import RegnfError
 from regnf_core.options import RegistrationOptions
+from regnf_core.version import ENGINE_REVISION
+from regnf_state.blobs.base import BlobStore
+from regnf_state.queue import JobQueue
+from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, StaleAttemptError
-from regnf_worker.context import Context
+from regnf_state.room import Originals
+from regnf_state.settings import Settings
+from regnf_state.stores import open_stores
 from regnf_worker.engine import Engine, Model
+
+# What a job is given: settings and stores, made from the environment in the job's own process.
+
+_RETRIES = 20
+"""About eighteen seconds: a job outlives a restart of Redis."""
+_STORAGE_WAIT_S = 120.0
+
+
+@dataclass(frozen=True)
+class Context:
+    """Settings and stores of one process."""
+
+    settings: Settings
+    records: RecordStore
+    blobs: BlobStore
+    queue: JobQueue
+
+    @cached_property
+    def originals(self) -> Originals:
+        """The uploads that stay after their import."""
+        return Originals(self.records, self.blobs, self.settings)
+
+    @classmethod
+    def from_settings(cls, settings: Settings, existing: bool = False) -> Context:
+        """The stores that the settings name; ``existing`` as ``open_stores`` has it. Raises NoRedisError."""
+        stores = open_stores(settings, retries=_RETRIES, storage_wait_s=_STORAGE_WAIT_S, existing=existing)
+        return cls(settings, stores.records, stores.blobs, stores.queue)
+
 
 logger = logging.getLogger(__name__)
 
@@ -84,3 +120,33 @@ class ObjectModels:
 def kept_by_default(options: RegistrationOptions) -> bool:
     """Whether the options ask for the model that is kept: the number of its samples is all they have a say in."""
     return options.robust.object_samples == RegistrationOptions().robust.object_samples
+
+
+# Models of the objects of libraries, made once the object is an entry: no search has to make them first.
+
+
+def is_unmodeled_entry(records: RecordStore, reference: str, attempt: int) -> bool:
+    """Whether the field is ready, an entry of its owner's library, and its symmetry is not known."""
+    field = records.get_field(reference)
+    return (
+        field is not None
+        and field.attempt == attempt
+        and field.state == "ready"
+        and field.library is not None
+        and field.symmetry is None
+    )
+
+
+def model_entry(context: Context, reference: str, engine: Engine) -> None:
+    """Make the model of an entry's field, keep it, and note the symmetry. What is no object is left as it is."""
+    field = context.records.get_field(reference)
+    if field is None:
+        return
+    with (
+        TemporaryDirectory(prefix="model-") as folder,
+        context.blobs.local_copy(f"fields/{reference}/field.safetensors") as safe_field,
+    ):
+        try:
+            ObjectModels(context, engine, RegistrationOptions(), Path(folder)).of(field, lambda: safe_field)
+        except RegnfError as error:
+            logger.info("field %s has no model as an object: %s", reference, error)

@@ -8,17 +8,20 @@ has run a torch operation hang.
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 import signal
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from redis import Redis
 from redis.exceptions import RedisError
 from rq import Queue
 from rq.exceptions import StopRequested
@@ -27,25 +30,110 @@ from rq.timeouts import JobTimeoutException
 from rq.utils import now
 from rq.worker import WorkerStatus
 
-from regnf_core.importing.gate.fair_clock import LONGEST
-from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
+from regnf_core.importing.gate.child import LONGEST
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, JobQueue, Kind, Work
 from regnf_state.records import UnreadableRecordError
-from regnf_state.redis import payload
-from regnf_state.redis.address import redis_address
-from regnf_state.redis.client import WORKER_RETRIES, connect
+from regnf_state.redis import queue as payload
+from regnf_state.redis.client import WORKER_RETRIES, connect, redis_address
 from regnf_state.redis.fair_queue import FairQueue
-from regnf_worker import jobs, kernel, worker_pipe
-from regnf_worker.context import Context
-from regnf_worker.field_drawer import Draw, FieldDrawer
-from regnf_worker.finishing import ChildAtPictures, Finishing
-from regnf_worker.job_limits import JobLimits
-from regnf_worker.late_entries import LateEntries
-from regnf_worker.problems import start_refused
-from regnf_worker.resilient_worker import ResilientWorker
-from regnf_worker.rest import give_up_rest
-from regnf_worker.scratch import Scratch
-from regnf_worker.settle import ChildExit, settle_import, settle_registration
-from regnf_worker.taking import Taking
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_worker import jobs, kernel, resilient_worker
+from regnf_worker.job_limits import JobLimits, start_refused
+from regnf_worker.jobs import Draw, FieldDrawer
+from regnf_worker.kernel import Scratch
+from regnf_worker.models import Context, is_unmodeled_entry
+from regnf_worker.resilient_worker import ResilientWorker, Taking
+from regnf_worker.settle import ChildExit, give_up_rest, settle_import, settle_registration
+
+# The job process that is still at the pictures of a result which is out. The worker goes on meanwhile.
+
+_DEATH_S = 10.0
+"""A killed process is gone within this time."""
+
+
+@dataclass(frozen=True)
+class ChildAtPictures:
+    """Such a process. ended: the reading end of its pipe · until: when it has had its time, by the monotonic clock ·
+    on_end: called once it is gone."""
+
+    pid: int
+    ended: int
+    until: float
+    on_end: Callable[[], None]
+
+
+class Finishing:
+    """One such process at most."""
+
+    def __init__(self) -> None:
+        self._child: ChildAtPictures | None = None
+
+    def take(self, child: ChildAtPictures) -> None:
+        """Look after a process, once there is no other."""
+        self._child = child
+
+    def is_free(self, seconds: float = 0.0) -> bool:
+        """Whether there is none any more, waited for so many seconds at most. One that has had its time is killed."""
+        child = self._child
+        if child is None:
+            return True
+        if time.monotonic() >= child.until:
+            self._kill(child)
+        if not isinstance(kernel.wait_for_exit(child.pid, child.ended, seconds), kernel.Exit):
+            return False
+        self._child = None
+        os.close(child.ended)
+        child.on_end()
+        return True
+
+    def end(self, grace_s: float) -> None:
+        """The worker stops: what is not made within its grace is missing."""
+        if not self.is_free(grace_s) and self._child is not None:
+            self._kill(self._child)
+            self.is_free(_DEATH_S)
+
+    @staticmethod
+    def _kill(child: ChildAtPictures) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+
+
+# Fields that became a library's entries while their import ran.
+#
+# Such an import may have looked for the entry too early, and work that runs is not queued a second time. So the
+# worker looks once more when the import's process has ended.
+
+logger = logging.getLogger(__name__)
+
+
+class LateEntries:
+    """For one import after the other. An import that begins with the entry has had its turn: what is no object has no
+    model, and is not tried again."""
+
+    def __init__(self, redis: Redis, queue: JobQueue) -> None:
+        self._records = RedisRecordStore(redis)  # without the journal: its storage does not survive the worker's forks
+        self._queue = queue
+        self._known = False
+
+    def before(self, work: Work) -> None:
+        """To be called before the import's process."""
+        self._known = self._is_unmodeled(work)
+
+    def after(self, work: Work) -> None:
+        """To be called once the import is in no list any more: queues it again, for the model alone."""
+        if not self._known and self._is_unmodeled(work):
+            try:
+                self._queue.enqueue_import(work.argument, work.attempt)
+            except RedisError as error:
+                logger.warning("the model of entry %s is left to its first job: %s", work.argument, error)
+
+    def _is_unmodeled(self, work: Work) -> bool:
+        try:
+            return is_unmodeled_entry(self._records, work.argument, work.attempt)
+        except (RedisError, UnreadableRecordError) as error:
+            logger.warning("whether %s is an entry without a model is not known: %s", work.argument, error)
+            return False
+
 
 Function = Callable[[str, int, str], None]
 """(job's id or field's reference, attempt, worker)."""
@@ -228,7 +316,7 @@ class RegnfWorker(ResilientWorker):
             kernel.prefer_as_oom_victim()
             kernel.give_way(self._niceness)
             os.close(ended)
-            worker_pipe.hold(held_by_child)
+            resilient_worker.hold(held_by_child)
             if limited:
                 self._job_limits.hold_here()
             self._scratch.use(folder)

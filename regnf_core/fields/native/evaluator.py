@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.native.library import Variant, variant
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_core.fields.positional_encoding import PositionalEncoding
 
 _CONTRACTIONS = {"none": 0, "linf": 1, "linf_grid": 2}
 _COUNTS = ("layers", "levels", "dense_levels", "features", "smoothstep", "directions", "degree", "contraction")

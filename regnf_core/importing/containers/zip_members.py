@@ -13,8 +13,158 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers import zip_records as records
-from regnf_core.importing.containers.zip_records import Directory, Header, malformed
+
+# The records of a zip file, decoded and bounds-checked one at a time. ``container`` checks what they say.
+
+Bytes = memoryview
+
+LOCAL_SIGNATURE = b"PK\x03\x04"
+_CENTRAL_SIGNATURE = b"PK\x01\x02"
+END_SIGNATURE = b"PK\x05\x06"
+_END64_SIGNATURE = b"PK\x06\x06"
+_LOCATOR64_SIGNATURE = b"PK\x06\x07"
+DESCRIPTOR_SIGNATURE = b"PK\x07\x08"
+
+_LOCAL = struct.Struct("<4sHHHHHIIIHH")
+_CENTRAL = struct.Struct("<4sHHHHHHIIIHHHHHII")
+_END = struct.Struct("<4sHHHHIIH")
+_END64 = struct.Struct("<4sQHHIIQQQQ")
+_LOCATOR64 = struct.Struct("<4sIQI")
+END_SIZE = _END.size
+_ZIP64_EXTRA = 1
+_MAX16, _MAX32 = 0xFFFF, 0xFFFFFFFF
+_MAX_NAME_BYTES = 512
+_MAX_EXTRA_FIELDS = 8
+
+
+def malformed(message: str, reason: str = "ARCHIVE_MALFORMED") -> FieldFormatError:
+    """The error for a container fault."""
+    return FieldFormatError(message, reason=reason)
+
+
+@dataclass(frozen=True)
+class Directory:
+    """Where the central directory lies (bytes from the file's start) and how many entries it claims."""
+
+    offset: int
+    end: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Header:
+    """One entry's header, central or local. ``end`` is where the header's own bytes end · mode: of the file on a Unix
+    system, its kind included, 0 where that is not said; a central header says it."""
+
+    name: bytes
+    flags: int
+    method: int
+    crc32: int
+    compressed_size: int
+    size: int
+    local_offset: int
+    end: int
+    mode: int = 0
+
+
+def read_directory_end(data: Bytes) -> Directory:
+    """The end-of-central-directory record, which must be the file's last 22 bytes, and its zip64 companion if any.
+
+    Raises FieldFormatError: ARCHIVE_MALFORMED, or ARCHIVE_MULTI_DISK for a part of a split archive.
+    """
+    at = len(data) - END_SIZE
+    _, disk, start_disk, here, count, size, offset, _ = _END.unpack_from(data, at)
+    if disk or start_disk or here != count:
+        raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
+    locator_at = at - _LOCATOR64.size
+    if locator_at >= 0 and data[locator_at : locator_at + 4] == _LOCATOR64_SIGNATURE:
+        wide = _read_directory_end64(data, locator_at)
+        narrow = ((count, wide.count, _MAX16), (size, wide.end - wide.offset, _MAX32), (offset, wide.offset, _MAX32))
+        if any(short not in (long, sentinel) for short, long, sentinel in narrow):
+            raise malformed("the two directory records disagree")
+        return wide
+    if count == _MAX16 or _MAX32 in (size, offset):
+        raise malformed("the zip64 directory record is missing")
+    if offset + size != at:
+        raise malformed("the central directory does not end where the record says")
+    return Directory(offset, at, count)
+
+
+def _read_directory_end64(data: Bytes, locator_at: int) -> Directory:
+    _, disk, end64_at, disks = _LOCATOR64.unpack_from(data, locator_at)
+    if disk or disks != 1:
+        raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
+    if end64_at + _END64.size != locator_at or data[end64_at : end64_at + 4] != _END64_SIGNATURE:
+        raise malformed("the zip64 directory record is not where its locator says")
+    _, record, _, _, disk, start_disk, here, count, size, offset = _END64.unpack_from(data, end64_at)
+    if disk or start_disk or here != count:
+        raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
+    if record != _END64.size - 12 or offset + size != end64_at:
+        raise malformed("the central directory does not end where the zip64 record says")
+    return Directory(offset, end64_at, count)
+
+
+def read_central_header(data: Bytes, at: int, limit: int) -> Header:
+    """The central header at ``at``; nothing of it may reach past ``limit``."""
+    if at + _CENTRAL.size > limit or data[at : at + 4] != _CENTRAL_SIGNATURE:
+        raise malformed("the central directory holds something that is not an entry")
+    values = _CENTRAL.unpack_from(data, at)
+    flags, method, crc32, packed, size = values[3], values[4], values[7], values[8], values[9]
+    name_length, extra_length, comment_length, disk, offset = *values[10:14], values[16]
+    if name_length > _MAX_NAME_BYTES:
+        raise malformed("an entry's name is too long", "ARCHIVE_ENTRY_NAME")
+    name_at = at + _CENTRAL.size
+    end = name_at + name_length + extra_length
+    if comment_length or disk or end > limit:
+        raise malformed("a central header is not one that torch.save writes")
+    wide = _zip64_values(data[name_at + name_length : end])
+    size, packed, offset = (_widened(value, wide) for value in (size, packed, offset))
+    name, mode = bytes(data[name_at : name_at + name_length]), values[15] >> 16
+    return Header(name, flags, method, crc32, packed, size, offset, end, mode)
+
+
+def read_local_header(data: Bytes, at: int, limit: int) -> Header:
+    """The local header at ``at``; sizes and CRC are zero where a descriptor after the data carries them."""
+    if at + _LOCAL.size > limit or data[at : at + 4] != LOCAL_SIGNATURE:
+        raise malformed("no local header where the central directory says", "ARCHIVE_HEADER_MISMATCH")
+    _, _, flags, method, _, _, crc32, packed, size, name_length, extra_length = _LOCAL.unpack_from(data, at)
+    name_at = at + _LOCAL.size
+    end = name_at + name_length + extra_length
+    if end > limit:
+        raise malformed("a local header reaches past the directory", "ARCHIVE_HEADER_MISMATCH")
+    wide = _zip64_values(data[name_at + name_length : end])
+    size, packed = (_widened(value, wide) for value in (size, packed))
+    return Header(bytes(data[name_at : name_at + name_length]), flags, method, crc32, packed, size, at, end)
+
+
+def _zip64_values(extra: Bytes) -> list[int]:
+    """The 64-bit numbers of the zip64 extra field, in order; the other extra fields (padding) are only walked."""
+    found: list[int] | None = None
+    at = fields = 0
+    while at < len(extra):
+        fields += 1
+        if at + 4 > len(extra) or fields > _MAX_EXTRA_FIELDS:
+            raise malformed("an extra field is cut short, or there are too many")
+        kind, length = struct.unpack_from("<HH", extra, at)
+        at += 4
+        if at + length > len(extra):
+            raise malformed("an extra field is cut short")
+        if kind == _ZIP64_EXTRA:
+            if found is not None or length > 28:
+                raise malformed("the zip64 field occurs twice or is too long")
+            found = [value for (value,) in struct.iter_unpack("<Q", extra[at : at + length // 8 * 8])]
+        at += length
+    return found or []
+
+
+def _widened(value: int, wide: list[int]) -> int:
+    """The value itself, or the next 64-bit one where the 32-bit field holds the sentinel."""
+    if value != _MAX32:
+        return value
+    if not wide:
+        raise malformed("a zip64 size is missing")
+    return wide.pop(0)
+
 
 MAX_ENTRIES = 16_384
 STORED, DEFLATED = 0, 8
@@ -45,20 +195,20 @@ def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders
     docs/import-gate.md.
     """
     _check_ends(data)
-    directory = records.read_directory_end(data)
+    directory = read_directory_end(data)
     return _tile(data, _central_headers(data, directory, methods), directory.offset, folders)
 
 
 def _check_ends(data: memoryview) -> None:
     """The file begins with an entry and ends with the directory's end record."""
-    if bytes(data[:4]) != records.LOCAL_SIGNATURE[: len(data[:4])]:
+    if bytes(data[:4]) != LOCAL_SIGNATURE[: len(data[:4])]:
         raise malformed("something lies before the archive", "ARCHIVE_PREFIXED_DATA")
-    at = len(data) - records.END_SIZE
-    if at > 0 and data[at : at + 4] == records.END_SIGNATURE and bytes(data[-2:]) == b"\0\0":
+    at = len(data) - END_SIZE
+    if at > 0 and data[at : at + 4] == END_SIGNATURE and bytes(data[-2:]) == b"\0\0":
         return
-    tail = bytes(data[-(records.END_SIZE + 0xFFFF) :])
-    found = tail.rfind(records.END_SIGNATURE)
-    if 0 <= found <= len(tail) - records.END_SIZE:
+    tail = bytes(data[-(END_SIZE + 0xFFFF) :])
+    found = tail.rfind(END_SIGNATURE)
+    if 0 <= found <= len(tail) - END_SIZE:
         raise malformed("something lies behind the archive", "ARCHIVE_TRAILING_DATA")
     raise FieldFormatError("the archive's end is missing: the file was cut short", reason="FILE_TRUNCATED")
 
@@ -69,7 +219,7 @@ def _central_headers(data: memoryview, directory: Directory, methods: Collection
     headers = []
     at = directory.offset
     for _ in range(directory.count):
-        header = records.read_central_header(data, at, directory.end)
+        header = read_central_header(data, at, directory.end)
         _check_header(header, directory.offset, methods)
         headers.append(header)
         at = header.end
@@ -109,7 +259,7 @@ def _tile(data: memoryview, headers: list[Header], data_end: int, folders: bool)
     for central in sorted(headers, key=lambda header: header.local_offset):
         if central.local_offset != expected:
             raise _gap(expected, central.local_offset)
-        local = records.read_local_header(data, central.local_offset, data_end)
+        local = read_local_header(data, central.local_offset, data_end)
         _check_same(central, local)
         end = local.end + central.compressed_size
         if end > data_end:
@@ -154,7 +304,7 @@ def _descriptor_size(data: memoryview, central: Header, at: int, limit: int) -> 
         length = struct.calcsize(layout)
         if max(central.size, central.compressed_size) > largest or at + length > limit:
             continue
-        wanted = struct.pack(layout, records.DESCRIPTOR_SIGNATURE, central.crc32, central.compressed_size, central.size)
+        wanted = struct.pack(layout, DESCRIPTOR_SIGNATURE, central.crc32, central.compressed_size, central.size)
         if bytes(data[at : at + length]) == wanted:
             return length
     raise malformed("the descriptor behind an entry contradicts the central directory", "ARCHIVE_HEADER_MISMATCH")

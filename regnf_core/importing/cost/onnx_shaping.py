@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from regnf_core.importing.cost.onnx_numbers import range_length, range_of
-from regnf_core.importing.cost.onnx_values import (
+from regnf_core.importing.cost.onnx_numbers import (
     Attributes,
     Inputs,
     Rule,
@@ -18,6 +17,8 @@ from regnf_core.importing.cost.onnx_values import (
     listed,
     made,
     needed,
+    range_length,
+    range_of,
 )
 
 

@@ -23,7 +23,7 @@ from regnf_core.importing.families import (
     unsupported,
 )
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
+from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 

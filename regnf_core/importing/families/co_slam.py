@@ -12,15 +12,21 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import require_shape, tensor_error
 from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField, converted_of
-from regnf_core.importing.families.grid_field import space_readings
-from regnf_core.importing.families.grid_search import GridHabits, find_spaces
-from regnf_core.importing.families.layers import Layers, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import contradiction, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces, space_readings
+from regnf_core.importing.families.layers import (
+    Layers,
+    contradiction,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    require_family,
+    shared_entries,
+    strip_prefix,
+)
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import GridDescription, UploadDescription
+from regnf_core.importing.upload_description import GridDescription, UploadDescription, require_shape, tensor_error
 
 FAMILY = "co_slam"
 _NETWORK, _TABLE, _COLORS = "decoder.sdf_net.model.", "embed_fn.params", "decoder.color_net."

@@ -10,15 +10,23 @@ from dataclasses import replace
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.deepsdf import at_code, latent_code
-from regnf_core.importing.families.layers import Layers, folded_weight, layer_names, read_layers, strip_prefix
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    Layers,
+    folded_weight,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_family,
+    shared_entries,
+    states,
+    strip_prefix,
+)
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.families.states import states
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.upload_description import UploadDescription, require_shape, tensor_error
 
 FAMILY = "deepsdf_blocks"
 _USUAL = 3

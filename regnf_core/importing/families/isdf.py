@@ -11,13 +11,19 @@ from dataclasses import replace
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import layer_names, read_layers, require_extra_columns, strip_prefix
+from regnf_core.importing.families.layers import (
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    require_family,
+    shared_entries,
+    strip_prefix,
+)
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.upload_description import UploadDescription, tensor_error
 
 FAMILY = "isdf"
 _INPUT_SCALE, _OUTPUT_SCALE = 0.05937489, 0.14

@@ -2,17 +2,161 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
-from regnf_core.importing.families.shared import contradiction
+from regnf_core.importing.pickle.pickle_machine import TensorRef
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.schema.layers import MAX_LAYERS
+from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
+from regnf_core.schema.description import shift_rows
+from regnf_core.schema.tensor_check import MAX_LAYERS
+
+# Chains of linear layers in a state dictionary: each sees what the one before gives, perhaps with the input again.
+
+_ENDINGS = (".weight", ".weight_v", ".parametrizations.weight.original1")
+_PARTS = (".weight", ".bias", ".weight_v", ".weight_g", ".parametrizations.weight.original0", _ENDINGS[2])
+_DEPTH = 4
+_DISTANCE_WORDS = ("sdf", "implicit", "geometry", "surface", "dist")
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Layers by name, in order; those in ``skips`` see the network's input again."""
+
+    where: str
+    names: tuple[str, ...]
+    input_width: int
+    skips: tuple[int, ...]
+
+
+def find_chains(state: dict[str, Any]) -> list[Chain]:
+    """The networks of a state dictionary that are chains of at least two linear layers and nothing else.
+
+    All of it together, or its largest parts, by the components of their names; where several are found and the names
+    of some say that they are distances, those.
+    """
+    for depth in range(_DEPTH):
+        groups: dict[str, dict[str, Any]] = {}
+        for name, value in state.items():
+            groups.setdefault(".".join(name.split(".")[:depth]), {})[name] = value
+        chains = [chain for where, group in groups.items() if (chain := _chain(where, group)) is not None]
+        if chains:
+            named = [chain for chain in chains if any(word in chain.where.lower() for word in _DISTANCE_WORDS)]
+            return named or chains
+    return []
+
+
+def _chain(where: str, group: dict[str, Any]) -> Chain | None:
+    layers = _linear_layers(group)
+    if layers is None or not 2 <= len(layers) <= MAX_LAYERS:
+        return None
+    inputs, skips = layers[0][1][1], []
+    for i, (before, after) in enumerate(itertools.pairwise(layers), start=1):
+        extra = after[1][1] - before[1][0]
+        if extra not in (0, inputs):
+            return None
+        if extra:
+            skips.append(i)
+    return Chain(where, tuple(name for name, _ in layers), inputs, tuple(skips))
+
+
+def _linear_layers(group: dict[str, Any]) -> Sequence[tuple[str, tuple[int, ...]]] | None:
+    """Names and shapes (out, in); None where the group holds tensors of anything else."""
+    tensors = {name: value.shape for name, value in group.items() if isinstance(value, TensorRef)}
+    layers = []
+    for name, shape in tensors.items():
+        ending = next((e for e in _ENDINGS if name.endswith(e)), None)
+        if ending is not None and len(shape) == 2 and min(shape) > 0:
+            layers.append((name.removesuffix(ending), shape))
+    known = {name + part for name, _ in layers for part in _PARTS}
+    return layers if layers and set(tensors) <= known else None
+
+
+# What every family does with the uploader's description.
+
+UNIT_CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+_SHARED = frozenset(
+    {
+        "family",
+        "bounds",
+        "world_scale",
+        "sign",
+        "up_axis",
+        "label",
+        "frame",
+        "dataset_transform",
+        "accept_implausible",
+        "as",
+        "cameras",
+        "color",
+    }
+)
+"""Entries that mean something for every family."""
+
+
+def shared_entries(
+    overrides: UploadDescription,
+    bounds: Sequence[Sequence[float]],
+    world_scale: float = 1.0,
+    sign: int = 1,
+) -> dict[str, Any]:
+    """The entries of a safe field's description that all kinds share.
+
+    bounds: lowest and highest corner in the coordinates of the checkpoint's function · world_scale: length of one unit
+    of those coordinates in the family's own unit · sign: -1 where the family's functions are negative in free space.
+    What ``overrides`` says goes before.
+    """
+    scale = world_scale * (overrides.world_scale or 1.0)
+    return {
+        "bounds": overrides.bounds or [[scale * value for value in corner] for corner in bounds],
+        "world_scale": scale,
+        "sign": overrides.sign or sign,
+        "up_axis": overrides.up_axis,
+        "label": overrides.label,
+    }
+
+
+def entries_at(entries: dict[str, Any], origin: Sequence[float] | None) -> dict[str, Any]:
+    """The shared entries of a function whose coordinates begin at ``origin``, a place in those of the file.
+
+    The field stays in the file's frame: its placement adds the origin again, in float64. None: nothing was subtracted.
+    """
+    if origin is None:
+        return entries
+    shift = [entries["world_scale"] * value for value in origin]
+    own = [[value - by for value, by in zip(corner, shift, strict=True)] for corner in entries["bounds"]]
+    return entries | {"placement": {"transform": shift_rows(shift), "bounds": own}}
+
+
+def assumed_bounds(overrides: UploadDescription) -> tuple[str, ...]:
+    """Why the unit cube bounds a field that trains in the unit sphere; nothing where other bounds are said."""
+    return () if overrides.bounds else ("bounds [-1, 1]: the unit sphere's cube, in which it trains",)
+
+
+def refuse_other_entries(overrides: UploadDescription, family: str, meant: Sequence[str] = ()) -> None:
+    """Raise FieldFormatError (INVALID_DESCRIPTION) for an entry that neither all families share nor is ``meant``."""
+    others = [name for name, value in overrides.non_default().items() if name not in _SHARED and name not in meant]
+    if others:
+        raise FieldFormatError(f"description.{others[0]} means nothing for {family}", reason="INVALID_DESCRIPTION")
+
+
+def require_family(overrides: UploadDescription, family: str) -> None:
+    """Raise FieldFormatError (FAMILY_NOT_SUPPORTED) if ``overrides`` names another family than the file's."""
+    if overrides.family not in (None, family):
+        message = f"the file is {family}, the description says {overrides.family}"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+
+
+def contradiction(name: str, said: object, found: object) -> FieldFormatError:
+    """The error for an entry of the settings or the description that the tensors exclude: both values, by name."""
+    message = f"{name}: the settings or the description say {said}, the tensors have {found}"
+    return FieldFormatError(message, reason="SETTINGS_CONTRADICT_TENSORS")
+
 
 _NORMALIZED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))
 """How torch names direction and length of a normalized weight: the older way, the newer way."""
@@ -126,3 +270,28 @@ def strip_prefix(values: object, prefix: str) -> dict[str, Any]:
         return {}
     named = ((key, value) for key, value in values.items() if isinstance(key, str) and key.startswith(prefix))
     return {key.removeprefix(prefix): value for key, value in named}
+
+
+# Where in a checkpoint the state dictionary of a network lies.
+
+_WRAPPERS = ("", "module.", "model.", "module.model.", "model.module.", "_orig_mod.", "net.", "network.")
+"""What trainers put before the names of a network's own parts."""
+
+
+def states(checkpoint: dict[Any, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The dictionaries of tensors in a checkpoint, itself included, and where each lies."""
+    for where, values in (("", checkpoint), *checkpoint.items()):
+        if isinstance(where, str) and isinstance(values, dict):
+            named = {key: value for key, value in values.items() if isinstance(key, str)}
+            if any(isinstance(value, TensorRef) for value in named.values()):
+                yield where, named
+
+
+def state_under(checkpoint: dict[Any, Any], part: str) -> dict[str, Any]:
+    """The tensors of the network's part ``part`` (a prefix that ends in a dot), without it; empty where none is."""
+    for _, state in states(checkpoint):
+        for wrapper in _WRAPPERS:
+            found = strip_prefix(state, wrapper + part)
+            if found:
+                return found
+    return {}

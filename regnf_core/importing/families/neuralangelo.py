@@ -13,16 +13,23 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
-from regnf_core.importing.families.grid_field import most_usual, space_readings, step_of
-from regnf_core.importing.families.grid_search import GridHabits, find_spaces
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces, most_usual, space_readings, step_of
 from regnf_core.importing.families.grid_space import GridSpace
-from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    Layers,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    require_family,
+    shared_entries,
+    strip_prefix,
+)
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import GridDescription, UploadDescription
+from regnf_core.importing.upload_description import Float32Array, GridDescription, UploadDescription, require_shape
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 FAMILY = "neuralangelo"

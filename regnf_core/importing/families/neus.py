@@ -12,11 +12,20 @@ from dataclasses import replace
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.color import neus as color
 from regnf_core.importing.families.color.head import ReadColor, understood, with_color, with_deviation, without_color
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import layer_names, read_layers, strip_prefix
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    assumed_bounds,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_family,
+    shared_entries,
+    state_under,
+    strip_prefix,
+)
 from regnf_core.importing.families.monosdf_grid import FAMILY as MONOSDF
 from regnf_core.importing.families.monosdf_grid import convert_grid
 from regnf_core.importing.families.network import (
@@ -29,16 +38,8 @@ from regnf_core.importing.families.network import (
     skips_of,
     told,
 )
-from regnf_core.importing.families.shared import (
-    UNIT_CUBE,
-    assumed_bounds,
-    refuse_other_entries,
-    require_family,
-    shared_entries,
-)
-from regnf_core.importing.families.states import state_under
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.upload_description import UploadDescription, tensor_error
 
 FAMILY = "neus"
 _SCALES = (1.0, 3.0)

@@ -7,12 +7,19 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import layer_names, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    require_family,
+    shared_entries,
+    strip_prefix,
+)
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
 
 FAMILY = "nglod"
 

@@ -10,20 +10,17 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
-from regnf_core.importing.families.shared import (
+from regnf_core.importing.families.layers import (
     UNIT_CUBE,
     contradiction,
     refuse_other_entries,
     require_family,
     shared_entries,
 )
-from regnf_core.importing.onnx.model import Attribute, Model, Node, Port, read_model, unsupported
-from regnf_core.importing.onnx.older import as_of_13
-from regnf_core.importing.onnx.tensor import Array
-from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.kinds.onnx import MAX_BATCH, MAX_NUMBERS
+from regnf_core.importing.onnx.model import Array, Attribute, Model, Node, Port, as_of_13, read_model, unsupported
+from regnf_core.importing.upload_description import StoredArray, UploadDescription
+from regnf_core.schema.kinds import MAX_BATCH, MAX_NUMBERS
 from regnf_core.schema.onnx_operators import OPERATORS
 
 _BATCH = 1024

@@ -11,14 +11,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle.pickle_values import Placeholder
+from regnf_core.importing.families.layers import (
+    Layers,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    require_family,
+    shared_entries,
+    strip_prefix,
+)
+from regnf_core.importing.pickle.pickle_machine import Placeholder
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
 
 FAMILY = "pin_slam"
 _OBJECT = "NeuralPoints"

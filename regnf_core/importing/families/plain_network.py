@@ -10,12 +10,18 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, read_layers
-from regnf_core.importing.families.linear_chains import find_chains
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    Layers,
+    find_chains,
+    read_layers,
+    refuse_other_entries,
+    require_family,
+    shared_entries,
+    states,
+)
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, Order, network_field, told
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.families.siren import OMEGAS
-from regnf_core.importing.families.states import states
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 

@@ -14,18 +14,25 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.color import studio
 from regnf_core.importing.families.color.head import with_assumption, with_color, with_deviation
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
-from regnf_core.importing.families.grid_field import most_usual, space_readings
-from regnf_core.importing.families.grid_search import GridHabits, find_spaces
-from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import UNIT_CUBE, contradiction, refuse_other_entries, shared_entries
-from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces, most_usual, space_readings
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    Layers,
+    contradiction,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    shared_entries,
+    strip_prefix,
+)
+from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder
 from regnf_core.importing.tensor_source import TensorSource, as_tensor, lookup
-from regnf_core.importing.upload_description import GridDescription, UploadDescription
-from regnf_core.schema.kinds.neus_facto import SKIP_LAYER
+from regnf_core.importing.upload_description import Float32Array, GridDescription, UploadDescription, require_shape
+from regnf_core.schema.kinds import SKIP_LAYER
 
 _RADIUS = 2.0
 """Half an edge of the cube that the grid covers: contracted space."""

@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import layer_names, read_layers, require_extra_columns, strip_prefix
+from regnf_core.importing.families.layers import (
+    UNIT_CUBE,
+    layer_names,
+    read_layers,
+    refuse_other_entries,
+    require_extra_columns,
+    require_family,
+    shared_entries,
+    strip_prefix,
+)
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.upload_description import UploadDescription, tensor_error
 
 FAMILY = "siren"
 OMEGAS = (30.0, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 60.0, 100.0)

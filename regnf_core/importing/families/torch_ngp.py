@@ -15,21 +15,29 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
-from regnf_core.importing.families.grid_field import most_usual, space_readings
-from regnf_core.importing.families.grid_search import GridHabits, find_spaces
-from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.offset_grids import not_recognized, offset_readings, read_table
-from regnf_core.importing.families.shared import (
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces, most_usual, space_readings
+from regnf_core.importing.families.layers import (
     UNIT_CUBE,
+    Layers,
     contradiction,
+    layer_names,
+    read_layers,
     refuse_other_entries,
+    require_extra_columns,
     require_family,
     shared_entries,
+    strip_prefix,
 )
+from regnf_core.importing.families.offset_grids import not_recognized, offset_readings, read_table
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import GridDescription, UploadDescription
+from regnf_core.importing.upload_description import (
+    Float32Array,
+    GridDescription,
+    UploadDescription,
+    require_shape,
+    tensor_error,
+)
 
 FAMILY = "torch_ngp"
 _OWN, _TCNN = ("encoder.embeddings", "encoder.offsets", "backbone.0.weight"), ("encoder.params", "backbone.params")

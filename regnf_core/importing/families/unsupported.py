@@ -7,8 +7,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import strip_prefix
-from regnf_core.importing.families.states import states
+from regnf_core.importing.families.layers import states, strip_prefix
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from regnf_core.errors import RegnfError
-from regnf_core.importing.cost.calls import Calls
-from regnf_core.importing.gate.ambiguity import OpenCandidate
+from regnf_core.importing.cost.mesh_work import Calls
 from regnf_core.importing.gate.cost_estimate import seconds_of
 from regnf_core.importing.gate.picture import candidate_name
 from regnf_core.importing.gate.plausibility import without_new_code
 from regnf_core.importing.gate.reading_field import field_of
+from regnf_core.importing.gate.readings_beside import OpenCandidate
 from regnf_core.viewing.field_picture import SMALL, field_picture
 
 _WORK = Calls((40_000, 37_000), (12_000,))

@@ -8,12 +8,87 @@ import selectors
 import signal
 import subprocess
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Literal
 
-from regnf_core.importing.gate.fair_clock import FairClock
-from regnf_core.importing.gate.watch import Trespass, Watch
+# How long a child has run, without the time for which it was ready to run and others had the cores.
+
+LONGEST = 2.0
+"""A child never has longer than so many times its limit, however much others do."""
+_NANOSECONDS = 1e9
+
+
+def waited_s(pid: int) -> float:
+    """Seconds for which the process was ready and had no core, by Linux's account of its first thread; 0 without it."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / _NANOSECONDS
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+@dataclass(frozen=True)
+class FairClock:
+    """Tells whether the process has had ``limit_s``. Where a machine has more to do than cores, that takes longer."""
+
+    pid: int
+    limit_s: float
+    now: Callable[[], float] = time.monotonic
+    waited: Callable[[int], float] = waited_s
+    started: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "started", self.now())
+
+    def left_s(self) -> float:
+        """What is left of the limit, not below 0."""
+        since = self.now() - self.started
+        had = max(since - self.waited(self.pid), since / LONGEST)
+        return max(0.0, self.limit_s - had)
+
+
+# What the parent sees of a child while it runs: limits that the kernel has for a file or a user, not a child.
+
+MAX_THREADS = 64
+_MAX_ENTRIES = 64
+_BLOCK = 512
+
+Trespass = Literal["threads", "output"]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """A look at one child: how many threads it has, and how much lies in its folder."""
+
+    folder: Path
+    folder_bytes: int
+
+    def look(self, pid: int) -> Trespass | None:
+        """Which limit the child is beyond, if any."""
+        if _threads(pid) > MAX_THREADS:
+            return "threads"
+        return "output" if self._too_much_output() else None
+
+    def _too_much_output(self) -> bool:
+        total = 0
+        with suppress(FileNotFoundError), os.scandir(self.folder) as entries:  # a file may just be renamed
+            for count, entry in enumerate(entries):
+                total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
+                if count >= _MAX_ENTRIES or total > self.folder_bytes:
+                    return True
+        return False
+
+
+def _threads(pid: int) -> int:
+    """Threads of the process, 0 where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0
+    return int(fields[17])
+
 
 _LOOK_S = 0.1
 _MAX_OUTPUT = 64 * 1024

@@ -16,8 +16,10 @@ from functools import partial
 from itertools import islice
 from typing import Any
 
-from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.importing.cost.calls import (
+from torch import Tensor
+
+from regnf_core.errors import MOST_CANDIDATES
+from regnf_core.importing.cost.mesh_work import (
     CLIMB_POINTS,
     FINAL_POINTS,
     FINALISTS,
@@ -31,13 +33,122 @@ from regnf_core.importing.cost.calls import (
     WRITTEN_NEAR,
 )
 from regnf_core.importing.families.converted import ConvertedField, Reading
-from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
-from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, LEAST_SUPPORT, Evidence, Trial
-from regnf_core.importing.gate.interpolation import told_interpolation
-from regnf_core.importing.gate.misfit_choice import chosen_by_misfit
+from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, CLEARLY, LEAST, LEAST_SUPPORT, Evidence, Trial
 from regnf_core.importing.gate.plausibility import without_new_code
-from regnf_core.importing.gate.readings_beside import readings_beside, readings_written_near
+from regnf_core.importing.gate.readings_beside import (
+    AmbiguousError,
+    OpenCandidate,
+    readings_beside,
+    readings_written_near,
+)
 from regnf_core.schema.hash_grid_config import Interpolation
+
+# Linear or smoothstep: how a hash grid was interpolated in training, told from the gradient within its cells.
+#
+# Smoothstep modulates a level's slope within each cell; training makes the other levels cancel that. So under the
+# interpolation of training the rest of the gradient's norm does not follow the difference between the two
+# interpolations, and under the other one it makes up for all of it. And only as it was in training does a level's
+# part correct what the coarser levels leave at every place of a cell. One of both has to be clear, and the other one
+# must not speak against it. A field that was trained too shortly does not tell.
+
+_TRAINED = 0.08
+"""Only a field whose gradient is this near to 1 tells that it was interpolated linearly: one that was trained for
+shorter under smoothstep looks like that, too."""
+_SMOOTH, _LINEAR = 0.15, -0.3
+"""How much more the norm follows the difference under linear than under smoothstep, at least or at most."""
+_NEAR = 1.0
+_CLEAR = 2.0 * LEAST_SUPPORT
+"""Chance is not all of the difference: both readings have the right rows, and linear interpolation is less noisy. Of
+fields trained for 150 steps the wrong one was ahead by 14 at most."""
+_AGAINST = -3.0
+"""Standard errors by which no level may speak against what the others tell."""
+
+
+def told_interpolation(linear: Trial, smoothstep: Trial) -> Interpolation | None:
+    """How the grid was interpolated, by one reading's trials under both; None where they do not tell."""
+    by_norm = _told_by_norm(linear, smoothstep)
+    if by_norm is None:
+        return _told_by_levels(linear, smoothstep)
+    one, other = (linear, smoothstep) if by_norm == "linear" else (smoothstep, linear)
+    return by_norm if one.support_over(other) > -LEAST_SUPPORT else None
+
+
+def _told_by_levels(linear: Trial, smoothstep: Trial) -> Interpolation | None:
+    if _is_corrected(linear, smoothstep):
+        return "linear"
+    return "smoothstep" if _is_corrected(smoothstep, linear) else None
+
+
+def _is_corrected(one: Trial, other: Trial) -> bool:
+    if one.levels is None or other.levels is None or one.support_over(other) < _CLEAR:
+        return False
+    return float(one.levels.over(other.levels).in_errors().min()) > _AGAINST
+
+
+def _told_by_norm(linear: Trial, smoothstep: Trial) -> Interpolation | None:
+    if linear.gradient is None or smoothstep.gradient is None:
+        return None
+    more = _share_undone(smoothstep.gradient, linear.gradient) - _share_undone(linear.gradient, smoothstep.gradient)
+    if more > _SMOOTH:
+        return "smoothstep"
+    if more < _LINEAR and linear.mean < _TRAINED:
+        return "linear"
+    return None
+
+
+def _share_undone(gradient: Tensor, other: Tensor) -> float:
+    """Slope of the norm of ``gradient`` over what the ``other`` one would add to it: 0 under the right one."""
+    norm = gradient.norm(dim=-1).clamp_min(1e-6)
+    added = ((other - gradient) * gradient).sum(dim=-1) / norm
+    kept = ((norm - 1.0).abs() < _NEAR) & (added.abs() < _NEAR)
+    added, beyond = added[kept] - added[kept].mean(), norm[kept] - norm[kept].mean()
+    return float((added * beyond).sum() / added.square().sum().clamp_min(1e-12))
+
+
+# The choice among readings by how far the gradient's norm is from 1 on average, and by usual numbers.
+#
+# Readings that fit clearly worse than the best are out. Those left that are one function need no choice. Of the
+# others the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident.
+
+_FINALLY = 0.04
+"""In the second round, at more points, a reading is out that fits worse by this share of the best's misfit."""
+_ACCIDENT = 0.5 * math.log(2.0)
+"""Usual numbers are powers of two: among layouts spread by less than this (log of the finest resolution), one of them
+is no accident."""
+
+
+def chosen_by_misfit(trials: Sequence[Trial], finest: Evidence) -> tuple[Trial | None, list[Trial]]:
+    """The reading that the misfit and its numbers tell, or None where they do not; and all that fit as well.
+
+    finest: more points, near the surface of the reading that fits best.
+    """
+    best = min(trials, key=lambda trial: trial.mean)
+    left = [trial for trial in trials if not best.is_distance or not best.is_better(trial, CLEARLY, LEAST)]
+    if best.is_distance and len(left) > 1 and not all(trial.is_same(best) for trial in left):
+        left = _second_round(left, finest)
+    usual = min(left, key=lambda trial: (trial.reading.tier, trial.mean))
+    others = [trial for trial in left if not trial.is_same(usual)]
+    return (usual if _is_no_accident(usual, others) else None), [usual, *others]
+
+
+def _second_round(trials: Sequence[Trial], finest: Evidence) -> list[Trial]:
+    """Those of ``trials`` that are as good as the best of them at more points. The least usual ones are not asked."""
+    finalists = sorted(trials, key=lambda trial: (trial.reading.tier, trial.mean))[:FINALISTS]
+    again = [finest.of(trial.reading) for trial in finalists]
+    best = min(again, key=lambda trial: trial.mean)
+    return [trial for trial in again if not best.is_better(trial, _FINALLY)]
+
+
+def _is_no_accident(usual: Trial, others: Sequence[Trial]) -> bool:
+    """Whether ``usual`` is the only one, or of numbers so usual that its place among the others is no chance."""
+    if not others:
+        return True
+    scales = [trial.reading.scale for trial in (usual, *others)]
+    told = [scale for scale in scales if scale is not None]
+    if usual.reading.tier > 0 or any(trial.reading.tier == 0 for trial in others) or len(told) < len(scales):
+        return False
+    return max(told) - min(told) <= _ACCIDENT
+
 
 _SHOWN = MOST_CANDIDATES
 _KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")

@@ -24,17 +24,16 @@ from typing import TYPE_CHECKING, Any
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.gate.ambiguity import AmbiguousError, require_told
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.reading import Companions
+from regnf_core.importing.gate.readings_beside import AmbiguousError, require_told
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
-from regnf_core.schema.color import split_color
-from regnf_core.schema.kinds.voxel_grid import WEIGHTS
-from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.schema.description import OBSERVATION, split_color
+from regnf_core.schema.kinds import WEIGHTS
 
 if TYPE_CHECKING:
-    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.observation import SdfField
     from regnf_core.importing.families.converted import ConvertedField
     from regnf_core.importing.gate.reading import ReadUpload
     from regnf_core.importing.upload_description import UploadDescription
@@ -110,7 +109,7 @@ def _stored(read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool)
     """
     from regnf_core.importing.gate.cost_estimate import affordable_share, require_affordable, with_affordable_color
     from regnf_core.importing.gate.observed import observed
-    from regnf_core.importing.gate.placement import placed
+    from regnf_core.importing.gate.report import placed
     from regnf_core.schema.safe_format import write_safe_field
 
     _require_text(read.field.description)
@@ -138,7 +137,7 @@ def _read(
 ) -> ReadUpload:
     """What ``read_upload`` returns; nothing that it has unpacked is left, but what is mapped stays readable."""
     from regnf_core.importing.gate.reading import read_upload
-    from regnf_core.importing.run.unpacking import remove_unpacked
+    from regnf_core.importing.run.tar_run import remove_unpacked
 
     try:
         return read_upload(upload, out_dir, description, limits, beside)
@@ -212,7 +211,7 @@ def _require_text(description: dict[str, Any]) -> None:
 
     Raises FieldFormatError (SAFE_FORMAT_INVALID).
     """
-    from regnf_core.labels import LABEL_PATTERN
+    from regnf_core.library_entries import LABEL_PATTERN
 
     if not re.fullmatch(LABEL_PATTERN, description.get("label") or ""):
         raise FieldFormatError("the field's label has control characters", reason="SAFE_FORMAT_INVALID")
@@ -225,11 +224,11 @@ def _require_text(description: dict[str, Any]) -> None:
 def _settled(converted: ConvertedField, share: int) -> ConvertedField:
     """The one function that the field stands for, where its shapes leave several. share: see calls_of_trials."""
     if converted.open_readings:
-        from regnf_core.importing.gate.network_form import settle_form  # loads torch
+        from regnf_core.importing.gate.network_form import settle_form
 
         converted = settle_form(converted)
     if converted.readings:
-        from regnf_core.importing.gate.choice import choose_reading  # loads torch
+        from regnf_core.importing.gate.choice import choose_reading
 
         converted = choose_reading(converted, share)
     require_told(converted)

@@ -7,22 +7,27 @@ from contextlib import suppress
 from dataclasses import replace
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import StoredArray
-from regnf_core.importing.cost.budget import require_room, require_within
-from regnf_core.importing.cost.calls import COLOR_POINTS, SAMPLES, SHARES, Calls, calls_of_check, calls_of_trials
-from regnf_core.importing.cost.mesh_work import mesh_work
-from regnf_core.importing.cost.network_work import color_work, network_work
-from regnf_core.importing.cost.onnx_memory import onnx_bytes
-from regnf_core.importing.cost.onnx_work import onnx_work
+from regnf_core.importing.cost.mesh_work import (
+    COLOR_POINTS,
+    SAMPLES,
+    SHARES,
+    Calls,
+    calls_of_check,
+    calls_of_trials,
+    color_work,
+    mesh_work,
+    network_work,
+    require_room,
+    require_within,
+)
+from regnf_core.importing.cost.onnx_work import onnx_bytes, onnx_work
 from regnf_core.importing.families.color.head import ASSUMED, LEFT_OUT
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.schema.color import COLOR, NetworkColor, split_color
-from regnf_core.schema.description import FieldDescription
-from regnf_core.schema.kinds.mesh import MeshDescription
-from regnf_core.schema.kinds.onnx import OnnxDescription
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import tensor_specs
+from regnf_core.importing.upload_description import StoredArray
+from regnf_core.schema.description import COLOR, FieldDescription, NetworkColor, split_color
+from regnf_core.schema.kinds import MeshDescription, OnnxDescription
+from regnf_core.schema.safe_format import parse_description, tensor_specs
 
 
 def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import observed_field
 from regnf_core.importing.gate.reading import with_unused_cameras
-from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.schema.description import OBSERVATION
 
 if TYPE_CHECKING:
     from regnf_core.importing.families.converted import ConvertedField
@@ -48,7 +48,7 @@ def _by_cameras(
     converted: ConvertedField, read: ReadUpload, cameras: Trajectory, limits: ImportLimits
 ) -> ConvertedField:
     from regnf_core.importing.gate.lines_of_sight import observed_by_cameras
-    from regnf_core.importing.gate.plausibility import without_new_code  # loads torch
+    from regnf_core.importing.gate.plausibility import without_new_code
 
     with without_new_code():
         grid, words, doubt = observed_by_cameras(

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
-from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
+from regnf_core.importing.containers.sniff import HEAD_BYTES, MESH_FORMATS, explain_refusal, sniff_format
 from regnf_core.importing.gate.report import ImportLimits
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ def read_upload(
     Large parts of archives are unpacked to ``folder``. Raises FieldFormatError with the reason of the refusing stage.
     """
     from regnf_core.importing.run.opened import open_settings, open_upload
-    from regnf_core.importing.run.unpacking import new_file
+    from regnf_core.importing.run.tar_run import new_file
     from regnf_core.importing.upload_description import UploadDescription
 
     said = UploadDescription.from_dict(description)
@@ -179,8 +178,7 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
 
 
 def _convert_torch(kind: str, data: memoryview, tensor_bytes: int, describe: Describe) -> ConvertedField:
-    from regnf_core.importing.containers.container import read_archive
-    from regnf_core.importing.containers.legacy_container import read_legacy
+    from regnf_core.importing.containers.legacy_container import read_archive, read_legacy
     from regnf_core.importing.families import convert_checkpoint
     from regnf_core.importing.pickle.pickle_reader import read_pickle
     from regnf_core.importing.settings.facts import facts_of

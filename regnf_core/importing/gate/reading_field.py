@@ -6,11 +6,10 @@ import warnings
 
 import torch
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.importing.families.converted import Reading
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import tensor_specs
+from regnf_core.schema.safe_format import parse_description, tensor_specs
 
 
 def field_of(reading: Reading) -> SdfField:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families.converted import Reading
-from regnf_core.importing.families.grid_field import finest_of
-from regnf_core.importing.families.grid_search import grid_name
+from regnf_core.errors import MOST_CANDIDATES, FieldFormatError
+from regnf_core.importing.families.converted import ConvertedField, Reading
+from regnf_core.importing.families.grid_search import finest_of, grid_name
 from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig
 
 _FINEST = (-0.24, -0.12, -0.06, math.log(2000 / 2048), 0.06, 0.12, 0.24)
@@ -78,3 +80,40 @@ def _said(reading: Reading, grid: HashGridConfig, said: dict[str, int]) -> Readi
     say = {**reading.say, "hash": {**parts, **said}}
     described = {**reading.description, "hash": grid.described()}
     return replace(reading, name=grid_name(grid), say=say, description=described, scale=finest_of(grid))
+
+
+# The refusal of a file that may be one of several functions, with the functions themselves.
+
+
+@dataclass(frozen=True)
+class OpenCandidate:
+    """name: what distinguishes it · say: the entries of a description that choose it · make: gives its function."""
+
+    name: str
+    say: dict[str, Any]
+    make: Callable[[], Reading] = field(repr=False)
+
+
+class AmbiguousError(FieldFormatError):
+    """The evidence leaves several functions; ``asked`` holds those that are shown, the likeliest first."""
+
+    reason = "LAYOUT_AMBIGUOUS"
+
+    def __init__(self, message: str, asked: Sequence[OpenCandidate]) -> None:
+        super().__init__(message)
+        lines: dict[str, OpenCandidate] = {}
+        for one in asked:
+            if one.say:
+                lines.setdefault(json.dumps(one.say, sort_keys=True), one)
+        self.asked = tuple(lines.values())[:MOST_CANDIDATES]
+
+
+def require_told(converted: ConvertedField) -> None:
+    """Raise AmbiguousError where the file leaves functions between which no behavior decides."""
+    if not converted.untold:
+        return
+    reading = Reading(converted.family, converted.description, converted.tensors)
+    asked = [OpenCandidate(one.name, one.say, partial(one.of, reading)) for one in converted.untold]
+    lines = " or ".join(json.dumps(one.say) for one in asked)
+    message = f"neither the tensors nor how they behave tell which function this is; add to the description {lines}"
+    raise AmbiguousError(message, asked)

@@ -6,14 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from regnf_core.importing.meshes.dae import read_dae
-from regnf_core.importing.meshes.geometry import Geometry, Siblings
 from regnf_core.importing.meshes.glb import read_glb, read_gltf
-from regnf_core.importing.meshes.obj import read_obj
-from regnf_core.importing.meshes.off import read_off
-from regnf_core.importing.meshes.pcd import read_pcd
 from regnf_core.importing.meshes.ply import read_ply
-from regnf_core.importing.meshes.stl import read_stl
-from regnf_core.importing.meshes.xyz import read_xyz
+from regnf_core.importing.meshes.point_files import read_pcd, read_xyz
+from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, read_obj, read_off, read_stl
 
 CLOUD_FORMATS = ("ply", "pcd", "xyz", "off")
 """Formats that may hold points alone."""

@@ -11,7 +11,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from regnf_core.importing.meshes.geometry import (
+from regnf_core.importing.meshes.triangle_files import (
     MAX_TRIANGLES,
     Float64Array,
     Siblings,

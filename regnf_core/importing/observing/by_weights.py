@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.arrays import StoredArray
-from regnf_core.schema.kinds.voxel_grid import WEIGHTS
-from regnf_core.schema.observation_grid import FARTHEST, FREE, MAX_COUNT, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.importing.upload_description import StoredArray
+from regnf_core.schema.description import FARTHEST, FREE, MAX_COUNT, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.schema.kinds import WEIGHTS
 
 Cells = tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]
 """Middles (M, 3) of cells, in the coordinates of the kind's function, and their states (M,)."""
@@ -64,7 +64,7 @@ def _extent(
         ranges = [np.flatnonzero(seen.any(axis=others))[[0, -1]] for others in ((1, 2), (0, 2), (0, 1))]
         first, last = np.array(ranges, np.float64).T
         return origin + spacing * first, origin + spacing * last, float(spacing.max())
-    from regnf_core.importing.containers.voxel_maps import seen_extent
+    from regnf_core.importing.containers.euclidean import seen_extent
 
     low, high = seen_extent(tensors["blocks"].astype(np.int64), seen)
     size = float(description["voxel_size"])

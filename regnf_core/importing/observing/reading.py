@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -11,23 +14,216 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.observing.trajectory import (
     MOST_CAMERAS,
+    Array,
+    Axes,
     Intrinsics,
     Trajectory,
     malformed,
     trajectory_of,
     without_intrinsics,
 )
-from regnf_core.importing.observing.trajectory_json import is_trajectory, read_trajectory_json
-from regnf_core.importing.observing.trajectory_text import read_matrices, read_tum
-from regnf_core.importing.settings.json_reader import read_json
-from regnf_core.importing.settings.keys import Keys
-from regnf_core.importing.settings.plain import looks_like_json
+from regnf_core.importing.settings.facts import is_similarity
+from regnf_core.importing.settings.keys import MAX_NUMBER_CHARACTERS, Keys, decoded, looks_like_json, read_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from regnf_core.importing.run.opened import SettingsFile
     from regnf_core.importing.upload_description import CamerasDescription
+
+
+# nerfstudio's transforms.json and its likes, and sdfstudio's meta_data.json, without their images.
+
+_PINHOLES = re.compile(r"OPENCV|PERSPECTIVE|(SIMPLE_)?(PINHOLE|RADIAL)")
+"""Camera models whose images are those of a pinhole, but for a little distortion."""
+_POSES = "transform_matrix", "camtoworld"
+_SIDE = 1000.0
+"""Pixels along an image's side, where a file gives an angle in place of pixels: any number is right."""
+
+
+def is_trajectory(keys: Keys) -> bool:
+    """Whether the file lists frames with poses."""
+    frames = keys.find("frames")
+    first = frames[0] if isinstance(frames, list) and frames else None
+    return isinstance(first, dict) and any(name in first for name in _POSES)
+
+
+def read_trajectory_json(keys: Keys, intrinsics: Intrinsics | None, axes: Axes | None) -> Trajectory:
+    """The cameras in a file for which :func:`is_trajectory` holds. intrinsics, axes: where the file does not say.
+
+    Raises FieldFormatError: CAMERAS_MALFORMED, CAMERAS_NOT_SUPPORTED, CAMERAS_INTRINSICS_MISSING, SETTINGS_MALFORMED.
+    """
+    _require_pinhole(keys)
+    frames = list(_frames(keys))
+    ours = "camtoworld" in frames[0].find("")
+    name = _POSES[1] if ours else _POSES[0]
+    poses = np.stack([_pose(frame, name) for frame in frames])
+    each = [_intrinsics(frame, keys) or intrinsics for frame in frames]
+    found = [one for one in each if one is not None]
+    if len(found) < len(each):
+        raise without_intrinsics(keys.file)
+    convention = axes or ("opencv" if ours else "opengl")
+    return trajectory_of(keys.file, poses, found, convention, _to_dataset(keys, ours))
+
+
+def _require_pinhole(keys: Keys) -> None:
+    model = keys.find("camera_model")
+    if model is not None and not _PINHOLES.fullmatch(str(model)):
+        message = f"{keys.file}: cameras of the model {str(model)[:40]} are not supported"
+        raise FieldFormatError(message, reason="CAMERAS_NOT_SUPPORTED")
+
+
+def _frames(keys: Keys) -> Iterator[Keys]:
+    values = keys.find("frames")
+    if len(values) > MOST_CAMERAS:
+        raise malformed(f"{keys.file} lists more than {MOST_CAMERAS} cameras")
+    for index, value in enumerate(values):
+        if not isinstance(value, dict):
+            raise malformed(f"{keys.file}: frames.{index} is no frame")
+        yield Keys(keys.file, value, f"frames.{index}.")
+
+
+def _pose(frame: Keys, name: str) -> Array:
+    """(4, 4) from four rows, or from three."""
+    value = frame.find(name)
+    rows = len(value) if isinstance(value, list) else 0
+    found = frame.matrix(name, 3 if rows == 3 else 4, 4)
+    if found is None:
+        raise malformed(f"{frame.file}: {frame.at}{name} is missing")
+    return np.array([*found, *([[0.0, 0.0, 0.0, 1.0]] if rows == 3 else [])])
+
+
+def _intrinsics(frame: Keys, keys: Keys) -> Intrinsics | None:
+    """The frame's own, or else those of all frames; None where neither says."""
+
+    def number(*names: str) -> float | None:
+        found = (each.number(name) for each in (frame, keys) for name in names)
+        return next((one for one in found if one is not None), None)
+
+    width, height = number("w", "width"), number("h", "height")
+    matrix = next((rows for each in (frame, keys) if (rows := _matrix(each)) is not None), None)
+    if matrix is not None:
+        (fx, _, cx, *_), (_, fy, cy, *_) = matrix[:2]
+        return Intrinsics(fx, fy, cx, cy, width or 2 * cx, height or 2 * cy)
+    middle_x, middle_y = number("cx"), number("cy")
+    width = width or (2 * middle_x if middle_x else _SIDE)
+    height = height or (2 * middle_y if middle_y else width)
+    focal_x = number("fl_x") or _focal(width, number("camera_angle_x"))
+    focal_y = number("fl_y") or _focal(height, number("camera_angle_y"))
+    if focal_x is None and focal_y is None:
+        return None
+    cx = width / 2 if middle_x is None else middle_x
+    cy = height / 2 if middle_y is None else middle_y
+    return Intrinsics(focal_x or focal_y or 0.0, focal_y or focal_x or 0.0, cx, cy, width, height)
+
+
+def _focal(side: float, angle: float | None) -> float | None:
+    """In pixels, from the angle (radians) that an image spans along one side."""
+    return None if angle is None or not 0 < angle < math.pi else side / 2 / math.tan(angle / 2)
+
+
+def _matrix(keys: Keys) -> list[list[float]] | None:
+    """The 3 x 3 or 4 x 4 matrix ``intrinsics``, or its first three rows."""
+    value = keys.find("intrinsics")
+    if not isinstance(value, list) or not value or not isinstance(value[0], list):
+        return None
+    return keys.matrix("intrinsics", len(value), len(value[0])) if min(len(value), len(value[0])) >= 3 else None
+
+
+def _to_dataset(keys: Keys, ours: bool) -> Array | None:
+    """From the file's world to that of the data which the trainer's frame is told against."""
+    if ours:
+        rows = keys.matrix("worldtogt", 4, 4)
+        return None if rows is None or not is_similarity(rows) else np.array(rows)
+    applied = keys.find("applied_transform")
+    rows = keys.matrix("applied_transform", 4 if isinstance(applied, list) and len(applied) == 4 else 3, 4)
+    if rows is None:
+        return None
+    scale = keys.number("applied_scale") or 1.0
+    forward = np.eye(4)
+    forward[:3] = np.array(rows)[:3]
+    forward[:3] *= scale
+    if not is_similarity(forward):
+        raise malformed(f"{keys.file}: applied_transform is no rotation and place")
+    return np.asarray(np.linalg.inv(forward), np.float64)
+
+
+# Poses as plain numbers: a file of TUM's (timestamp tx ty tz qx qy qz qw), or a folder with a matrix a file.
+
+MOST_BYTES = 8 << 20
+_TUM = 8
+_NUMBERS = re.compile(r"[0-9]+")
+_SEPARATORS = re.compile(r"[\s,;]+")
+_CELLS = re.compile(r"[;\t]")
+
+
+def read_tum(name: str, data: bytes | memoryview) -> Array | None:
+    """The poses (N, 4, 4), camera to world, of a file with eight numbers a line; None where it is none.
+
+    Lines that are empty or begin with # are passed over. Raises FieldFormatError (CAMERAS_MALFORMED).
+    """
+    rows = _rows(name, data)
+    if not rows or any(len(row) != _TUM for row in rows):
+        return None
+    values = np.array(rows, np.float64)
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(values[:, 4:], axis=1, keepdims=True)
+        x, y, z, w = (values[:, 4:] / length).T
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, 3] = values[:, 1:4]
+    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1)
+    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1)
+    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1)
+    return poses
+
+
+def read_matrices(files: Sequence[tuple[str, bytes | memoryview]]) -> tuple[Array | None, Array | None]:
+    """The poses (N, 4, 4) of files with a 4 x 4 or 3 x 4 matrix each, by the numbers in their names, and the 3 x 3 or
+    4 x 4 matrix of the one file whose name says ``intrinsic``. None where there are none.
+
+    Raises FieldFormatError (CAMERAS_MALFORMED).
+    """
+    poses, intrinsics = [], None
+    if len(files) > MOST_CAMERAS:
+        raise malformed(f"more than {MOST_CAMERAS} files of poses")
+    for name, data in sorted(files, key=lambda file: _order(file[0])):
+        rows = _rows(name, data)
+        if "intrinsic" in PurePosixPath(name).name.lower():
+            if len(rows) < 3 or any(len(row) != len(rows[0]) or len(row) < 3 for row in rows):
+                raise malformed(f"{name} holds no 3 x 3 matrix")
+            intrinsics = np.array(rows, np.float64)[:3, :3]
+        elif len(rows) in (3, 4) and all(len(row) == 4 for row in rows):
+            poses.append(np.array([*rows, [0.0, 0.0, 0.0, 1.0]][:4], np.float64))
+    return (np.stack(poses) if poses else None), intrinsics
+
+
+def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
+    """The lines' numbers; NaN and infinity are such, as trackers write them for a camera that they have lost."""
+    lines = (line.strip() for line in decoded(name, data, MOST_BYTES).splitlines())
+    words = (_words(line) for line in lines if line and not line.startswith("#"))
+    return [[_number(name, word) for word in line] for line in words]
+
+
+def _words(line: str) -> list[str]:
+    """A line's numbers. A spreadsheet that writes decimal commas parts them by semicolons or tabs."""
+    cells = _CELLS.split(line)
+    if len(cells) > 1 and "." not in line and all(cell.count(",") <= 1 for cell in cells):
+        line = line.replace(",", ".")
+    return [word for word in _SEPARATORS.split(line) if word]
+
+
+def _number(name: str, word: str) -> float:
+    try:
+        if len(word) <= MAX_NUMBER_CHARACTERS:
+            return float(word)
+    except ValueError:
+        pass
+    raise malformed(f"{name}: {word[:MAX_NUMBER_CHARACTERS]!r} is no number")
+
+
+def _order(name: str) -> tuple[list[int], str]:
+    return [int(number[:18]) for number in _NUMBERS.findall(PurePosixPath(name).name)[:8]], name
+
 
 _ARRAY_BYTES = 64 << 20
 _KNOWN_NAMES = ("transforms.json", "transforms_train.json", "meta_data.json", "cameras_sphere.npz")

@@ -14,9 +14,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from regnf_core.importing.pickle.pickle_machine import PickleLimits, PickleMachine
-from regnf_core.importing.pickle.pickle_stream import PickleStream, pickle_error
-from regnf_core.importing.pickle.pickle_values import StorageRef
+from regnf_core.importing.pickle.pickle_machine import (
+    PickleLimits,
+    PickleMachine,
+    PickleStream,
+    StorageRef,
+    pickle_error,
+)
 
 
 def read_pickle(data: memoryview, limits: PickleLimits | None = None) -> Any:

@@ -2,18 +2,241 @@
 
 from __future__ import annotations
 
+import fnmatch
+import re
+import zlib
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.containers.zip_members import DEFLATED, STORED, read_members
-from regnf_core.importing.run.checkpoint_names import choose_checkpoint
-from regnf_core.importing.run.settings_names import MAX_FILES, choose_settings
-from regnf_core.importing.run.tar_run import TarRun
-from regnf_core.importing.run.unpacking import archive_error
-from regnf_core.importing.run.zip_run import ZipRun
-from regnf_core.labels import shown_path
+from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members
+from regnf_core.importing.run.tar_run import MAX_PARTS, TarRun, archive_error, kept, require_modest
+from regnf_core.library_entries import shown_path
+
+# Which file of a run is its checkpoint: the newest step by the trainer's own naming, never by the files' times.
+
+_TIERS = (
+    (".ckpt", ".pth.tar", ".pth", ".pt"),
+    (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
+    (".glb", ".gltf", ".ply", ".obj", ".stl", ".off", ".dae", ".pcd", ".xyz"),
+)
+"""What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
+_OTHER_FOLDERS = frozenset(
+    {
+        "optimizerparameters",
+        "schedulerparameters",
+        "latentcodes",
+        "reconstructions",
+        "normalizationparameters",
+        "sdfsamples",
+        "tensorboard",
+        "wandb",
+        "code",
+        ".git",
+        ".hydra",
+        "__macosx",
+    }
+)
+"""Folders in which trainers keep other tensors than the field's, in lower case."""
+_OTHER_FILES = re.compile(
+    r"cameras.*\.npz|.*(optimizer|optim|scheduler|opt_state).*|events\.out\..*|\._.*", re.IGNORECASE
+)
+_NUMBER = re.compile(r"\d+")
+_OF_TRAINING = re.compile(r"ckpt|checkpoint|model|epoch|step|iter|(?<![a-z])ep(?=[^a-z]*\d)", re.IGNORECASE)
+"""In a name or its folder's: the numbers are steps of a training, and not which of several things it is."""
+_STEP_WORD = re.compile(r"(?<![a-z])(epochs?|ep|steps?|iterations?|iters?|it)(?=[^a-z]*#)", re.IGNORECASE)
+_STANDING = {"best": 1, "current": 3, "last": 4, "latest": 4, "final": 5}
+"""Words in place of a number: where they stand beside numbered files, which have 2."""
+_STANDING_WORD = re.compile(r"(?<![a-z])(best|current|last|latest|final)(?![a-z])", re.IGNORECASE)
+_SHOWN = 6
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A file that may hold a field. Files of one ``series`` are one training at several times."""
+
+    name: str
+    series: tuple[str, str, str]
+    age: tuple[int, tuple[int, ...]]
+
+
+def choose_checkpoint(names: Iterable[str]) -> str:
+    """The newest checkpoint among ``names``, paths below the run's folder with ``/`` between their parts.
+
+    Raises FieldFormatError: RUN_WITHOUT_CHECKPOINT, or AMBIGUOUS_RUN where several files are no steps of one training.
+    """
+    tier = _first_tier(names)
+    if not tier:
+        ends = " ".join(end for ends in _TIERS for end in ends)
+        raise FieldFormatError(
+            f"no file of the run is a checkpoint; looked for {ends}", reason="RUN_WITHOUT_CHECKPOINT"
+        )
+    if len({candidate.series for candidate in tier}) > 1:
+        shown = ", ".join(sorted(shown_path(candidate.name) for candidate in tier)[:_SHOWN])
+        message = f"{len(tier)} files of the run may be the checkpoint: {shown}; give one of them by itself"
+        raise FieldFormatError(message, reason="AMBIGUOUS_RUN")
+    return max(tier, key=lambda candidate: (candidate.age, candidate.name)).name
+
+
+def _first_tier(names: Iterable[str]) -> list[_Candidate]:
+    tiers: tuple[list[_Candidate], ...] = ([], [], [])
+    for name in names:
+        path = PurePosixPath(name)
+        if _OTHER_FILES.fullmatch(path.name) or any(part.lower() in _OTHER_FOLDERS for part in path.parts[:-1]):
+            continue
+        for tier, ends in zip(tiers, _TIERS, strict=True):
+            end = next((end for end in ends if path.name.lower().endswith(end)), None)
+            if end is not None and len(path.name) > len(end):
+                tier.append(_candidate(path, end))
+                break
+    return next((tier for tier in tiers if tier), [])
+
+
+def _candidate(path: PurePosixPath, end: str) -> _Candidate:
+    stem = path.name[: -len(end)]
+    if not _OF_TRAINING.search(f"{path.parent.name}/{stem}"):
+        return _Candidate(str(path), (str(path.parent), stem, end), (0, ()))
+    words = [word.lower() for word in _STANDING_WORD.findall(stem)]
+    numbers = tuple(int(number) for number in _NUMBER.findall(stem)[:8] if len(number) <= 18)
+    standing = _STANDING[words[-1]] if words else 2 if numbers else 0
+    nameless = _STEP_WORD.sub("", _NUMBER.sub("#", _STANDING_WORD.sub("", stem)))
+    series = re.sub(r"[^a-z]+", "_", nameless.lower()).strip("_")
+    return _Candidate(str(path), (str(path.parent), series, end), (standing, numbers[::-1]))
+
+
+# A run in a zip file, read as strictly as a checkpoint's own zip; but folders and deflated members are allowed.
+
+_PIECE = 1 << 20
+
+
+class ZipRun:
+    """The members of one zip file by name. ``most`` caps the bytes of those that are unpacked."""
+
+    def __init__(self, data: memoryview, most: int) -> None:
+        members = read_members(data, (STORED, DEFLATED), folders=True)
+        self._data = data
+        self._most = most
+        self._members = {member.name: member for member in members if not member.name.endswith("/")}
+        if any(name.count("/") >= MAX_PARTS for name in self._members):
+            raise archive_error("a member lies in too many folders", "ARCHIVE_ENTRY_NAME")
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Each member's size in bytes, as the archive claims it."""
+        return {name: member.size for name, member in self._members.items()}
+
+    def take(self, names: Collection[str], folder: Path) -> dict[str, memoryview]:
+        """The members of these names. Raises FieldFormatError: ARCHIVE_TOO_LARGE, ARCHIVE_DEFLATE_MALFORMED,
+        ARCHIVE_CRC_MISMATCH.
+        """
+        wanted = [self._members[name] for name in names]
+        require_modest(sum(m.size for m in wanted), sum(m.packed_size for m in wanted), self._most)
+        return {member.name: self._content(member, folder) for member in wanted}
+
+    def _content(self, member: Member, folder: Path) -> memoryview:
+        packed = self._data[member.offset : member.offset + member.packed_size]
+        content = packed if member.method == STORED else kept(_inflated(packed, member), member.size, folder)
+        crc32 = 0
+        for start in range(0, len(content), _PIECE):
+            crc32 = zlib.crc32(content[start : start + _PIECE], crc32)
+        if crc32 != member.crc32:
+            raise archive_error(f"the bytes of {member.name} are damaged (CRC)", "ARCHIVE_CRC_MISMATCH")
+        return content
+
+
+def _inflated(packed: memoryview, member: Member) -> Iterator[bytes]:
+    """Piece by piece; never more than the archive claims."""
+    inflater, left, at = zlib.decompressobj(-zlib.MAX_WBITS), member.size, 0
+    faulty = archive_error(f"{member.name} does not inflate to what the archive claims", "ARCHIVE_DEFLATE_MALFORMED")
+    waiting: bytes | memoryview = b""
+    while not inflater.eof:
+        if not waiting:
+            waiting = packed[at : at + _PIECE]
+            at += len(waiting)
+        try:
+            piece = inflater.decompress(waiting, min(_PIECE, left + 1))
+        except zlib.error as error:
+            raise faulty from error
+        if len(piece) > left or (not piece and not waiting):
+            raise faulty
+        waiting = inflater.unconsumed_tail
+        left -= len(piece)
+        yield piece
+    if left or waiting or inflater.unused_data or at != len(packed):
+        raise faulty
+
+
+# Which files of a run are its trainer's settings: known names at known places round the checkpoint, nearest first.
+
+_LEVELS = 4
+"""How many folders above the checkpoint's own may be the run's."""
+RUN_FILES = (
+    "config.yml",
+    "config.yaml",
+    "config.json",
+    "parsed.yaml",
+    "config/parsed.yaml",
+    "config/config.yaml",
+    "recording/*.conf",
+    "*.conf",
+    "specs.json",
+    ".hydra/config.yaml",
+    "run.yaml",
+    "run.yml",
+    "params.yaml",
+    "hparams.yaml",
+    "dataparser_transforms.json",
+    "meta_data.json",
+    "transforms.json",
+    "cameras_sphere.npz",
+)
+"""Below one of the folders from the checkpoint's own upwards."""
+DATA_FILES = ("dataparser_transforms.json", "meta_data.json", "transforms.json", "cameras_sphere.npz")
+"""What trainers keep beside the images: taken from anywhere in the run where there is one of the name."""
+MAX_FILES = 32
+
+
+def choose_settings(names: Collection[str], checkpoint: str) -> tuple[str, ...]:
+    """The settings among ``names`` that belong to ``checkpoint``, at most one a name, the nearest."""
+    here = PurePosixPath(checkpoint)
+    known = [name for name in names if name != checkpoint]
+    chosen: dict[str, str] = {}
+    for folder in list(here.parents)[:_LEVELS]:
+        for pattern in run_patterns(here.stem):
+            for name in sorted(known):
+                path = PurePosixPath(name)
+                if path.is_relative_to(folder) and _matches(path.relative_to(folder), pattern):
+                    chosen.setdefault(_role(path), name)
+    for wanted in DATA_FILES:
+        found = [name for name in known if PurePosixPath(name).name == wanted]
+        if len(found) == 1:
+            chosen.setdefault(wanted, found[0])
+    scales = [name for name in known if "NormalizationParameters" in PurePosixPath(name).parts]
+    if len(scales) == 1:
+        chosen.setdefault("normalization", scales[0])
+    return tuple(chosen.values())[:MAX_FILES]
+
+
+def run_patterns(stem: str) -> tuple[str, ...]:
+    """Where the settings of the checkpoint of the name ``stem`` lie, below one of its folders."""
+    return (*RUN_FILES, f"LatentCodes/{stem}.pth")
+
+
+def _matches(path: PurePosixPath, pattern: str) -> bool:
+    parts = pattern.split("/")
+    return len(parts) == len(path.parts) and all(map(fnmatch.fnmatchcase, path.parts, parts))
+
+
+def _role(path: PurePosixPath) -> str:
+    """What there may be one of."""
+    if path.suffix == ".conf":
+        return ".conf"
+    if path.parent.name == "LatentCodes":
+        return "codes"
+    return path.name
+
 
 MAX_SETTINGS_BYTES = 64 << 20
 """All settings together: latent codes of a thousand shapes are the largest."""

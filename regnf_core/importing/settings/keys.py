@@ -2,11 +2,66 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from typing import Any
 
-from regnf_core.importing.settings.plain import Tagged, malformed, plain
+from regnf_core.errors import FieldFormatError
+from regnf_core.texts import TextError, decode_text
+
+# What the readers of settings files give: plain values. A tag of YAML stays a text beside its value.
+
+MAX_DEPTH = 48
+MAX_NODES = 60_000
+MAX_NUMBER_CHARACTERS = 40
+"""No trainer writes a longer one."""
+
+
+@dataclass(frozen=True)
+class Tagged:
+    """A value that the file wants made into an object of ``tag``. Nothing is made: ``value`` is what was written."""
+
+    tag: str
+    value: Any
+
+
+def malformed(message: str) -> FieldFormatError:
+    """The error for settings that break their format."""
+    return FieldFormatError(message, reason="SETTINGS_MALFORMED")
+
+
+def too_large(message: str) -> FieldFormatError:
+    """The error for settings beyond what any trainer writes."""
+    return FieldFormatError(message, reason="SETTINGS_TOO_LARGE")
+
+
+def unsafe(message: str) -> FieldFormatError:
+    """The error for settings that ask for another file, or for the environment."""
+    return FieldFormatError(message, reason="SETTINGS_UNSAFE")
+
+
+def decoded(name: str, data: bytes | memoryview, most: int) -> str:
+    """The file as text. Raises FieldFormatError: SETTINGS_TOO_LARGE, SETTINGS_MALFORMED."""
+    if len(data) > most:
+        raise too_large(f"{name} has {len(data)} bytes; at most {most} are read")
+    try:
+        return decode_text(data)
+    except TextError as error:
+        raise malformed(f"{name} is {error}") from error
+
+
+def looks_like_json(data: bytes | memoryview) -> bool:
+    """Whether a text begins with a brace, in whatever encoding."""
+    return bytes(data[:64]).strip(b"\xef\xbb\xbf\xfe\xff\0 \t\r\n")[:1] == b"{"
+
+
+def plain(value: Any) -> Any:
+    """The value below its tags."""
+    while isinstance(value, Tagged):
+        value = value.value
+    return value
+
 
 _SHOWN = 60
 
@@ -114,3 +169,59 @@ class Keys:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
             raise self.fault(str(index), "a number")
         return float(value)
+
+
+# JSON of a trainer: duplicate keys, depth and size are looked at before or while Python's own reader reads it.
+
+MAX_BYTES = 8 << 20
+MAX_VALUES = 400_000
+"""Commas and colons; a list of two thousand cameras has a tenth of them."""
+
+
+def read_json(name: str, data: bytes | memoryview) -> Any:
+    """The value in the file ``name``. Raises FieldFormatError: SETTINGS_TOO_LARGE, SETTINGS_MALFORMED."""
+    text = decoded(name, data, MAX_BYTES)
+    if text.count(",") + text.count(":") > MAX_VALUES:
+        raise too_large(f"{name} holds more than {MAX_VALUES} values")
+    if text.count("[") + text.count("{") > MAX_DEPTH and _depth(text) > MAX_DEPTH:
+        raise too_large(f"{name} is nested more than {MAX_DEPTH} deep")
+    try:
+        return json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant, parse_int=_whole)
+    except (ValueError, RecursionError) as error:
+        raise malformed(f"{name} is no sound JSON") from error
+
+
+def _depth(text: str) -> int:
+    """How deep brackets nest, those within texts left out."""
+    depth = deepest = 0
+    in_text = escaped = False
+    for character in text:
+        if in_text:
+            in_text = escaped or character != '"'
+            escaped = character == "\\" and not escaped
+        elif character == '"':
+            in_text = True
+        elif character in "[{":
+            depth += 1
+            deepest = max(deepest, depth)
+        elif character in "]}":
+            depth -= 1
+    return deepest
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) != len(pairs):
+        raise ValueError("a key occurs twice")
+    return values
+
+
+def _no_constant(word: str) -> float:
+    raise ValueError(f"{word} is not JSON")
+
+
+def _whole(digits: str) -> int:
+    """No float is as large as an int of some hundred digits."""
+    if len(digits) > MAX_NUMBER_CHARACTERS:
+        raise ValueError("a number of too many digits")
+    return int(digits)

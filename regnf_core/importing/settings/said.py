@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families.shared import contradiction
+from regnf_core.importing.families.layers import contradiction
 from regnf_core.importing.settings.documents import Documents
 from regnf_core.importing.settings.facts import Facts
 from regnf_core.importing.settings.keys import Keys

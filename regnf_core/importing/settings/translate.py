@@ -9,12 +9,14 @@ from types import ModuleType
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.run.opened import SettingsFile
+from regnf_core.importing.containers.legacy_container import read_archive, read_legacy
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
+from regnf_core.importing.pickle.pickle_machine import TensorRef
+from regnf_core.importing.pickle.pickle_reader import read_pickle
+from regnf_core.importing.run.opened import MAX_SETTINGS_BYTES, SettingsFile
 from regnf_core.importing.settings.documents import read_documents
 from regnf_core.importing.settings.facts import Facts
-from regnf_core.importing.settings.keys import Keys
-from regnf_core.importing.settings.latent_codes import latent_code
-from regnf_core.importing.settings.plain import malformed
+from regnf_core.importing.settings.keys import Keys, malformed
 from regnf_core.importing.settings.said import Said
 from regnf_core.importing.settings.trainers import (
     co_slam,
@@ -29,7 +31,56 @@ from regnf_core.importing.settings.trainers import (
     sdf_field,
     sines,
 )
+from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.library_entries import shown_path
+
+# One shape's latent code out of a file of codes beside the settings, through the gate's own reader of pickles.
+
+_MAX_CODE = 512
+
+
+def latent_code(file: SettingsFile, index: int) -> tuple[list[float], int]:
+    """The code ``index`` of the file, and how many there are.
+
+    Raises FieldFormatError: SETTINGS_MALFORMED, INVALID_DESCRIPTION for an index beyond them, and what the readers of
+    torch.save's files raise.
+    """
+    stored, source = _stored(file)
+    value = stored if isinstance(stored, TensorRef) else lookup(_mapping(file, stored), "weight")
+    codes = source.array("latent_codes", value)
+    if codes.ndim == 3 and codes.shape[1] == 1:
+        codes = codes[:, 0]
+    if codes.ndim != 2 or not 1 <= codes.shape[1] <= _MAX_CODE or not len(codes):
+        raise _malformed(file, f"latent_codes of the shape {codes.shape}")
+    if index >= len(codes):
+        message = f"description.latent_index: {index}, but {file.name} has {len(codes)} codes, counted from 0"
+        raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
+    return [float(number) for number in codes[index]], len(codes)
+
+
+def _stored(file: SettingsFile) -> tuple[object, TensorSource]:
+    kind = sniff_format(bytes(file.data[:HEAD_BYTES]))
+    if kind == "torch-zip":
+        archive = read_archive(file.data)
+        values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, MAX_SETTINGS_BYTES)
+    elif kind == "torch-legacy":
+        values, legacy = read_legacy(file.data)
+        source = TensorSource(legacy, MAX_SETTINGS_BYTES)
+    else:
+        raise _malformed(file, "no file of torch.save")
+    return _mapping(file, values).get("latent_codes"), source
+
+
+def _mapping(file: SettingsFile, value: object) -> dict[object, object]:
+    if not isinstance(value, dict):
+        raise _malformed(file, "no latent_codes")
+    return value
+
+
+def _malformed(file: SettingsFile, what: str) -> FieldFormatError:
+    return FieldFormatError(f"{shown_path(file.name)}: {what}", reason="SETTINGS_MALFORMED")
+
 
 _MAX_WHY = 400
 _PARTS = ("hash", "positional_encoding", "color")

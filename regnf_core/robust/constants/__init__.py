@@ -19,14 +19,17 @@ option, see regnf_core/options.py.
 
 from __future__ import annotations
 
-from regnf_core.robust.constants.covariance import COVARIANCE
-from regnf_core.robust.constants.library import LIBRARY
-from regnf_core.robust.constants.model import MODEL, SIGNATURE
-from regnf_core.robust.constants.refinement import REFINEMENT
-from regnf_core.robust.constants.sampling import SAMPLING
-from regnf_core.robust.constants.scene import OCCLUSION, SCENE, SUPPORT_PLANES
-from regnf_core.robust.constants.search import FEATURES, SEARCH
-from regnf_core.robust.constants.verdict import EVIDENCE, RELATION, VERDICT
+from regnf_core.robust.constants.model import FEATURES, LIBRARY, MODEL, REFINEMENT, SEARCH, SIGNATURE
+from regnf_core.robust.constants.verdict import (
+    COVARIANCE,
+    EVIDENCE,
+    OCCLUSION,
+    RELATION,
+    SAMPLING,
+    SCENE,
+    SUPPORT_PLANES,
+    VERDICT,
+)
 
 __all__ = [
     "COVARIANCE",

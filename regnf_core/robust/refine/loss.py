@@ -1,6 +1,6 @@
 """The refinement's robust loss: kernel widths, cost, normal equations, and the score that ranks poses.
 
-The kernel itself is in regnf_core/robust/kernel.py, the numbers are in regnf_core/robust/constants/refinement.py.
+The kernel itself is in regnf_core/robust/residuals.py, the numbers are in regnf_core/robust/constants/model.py.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.constants import EVIDENCE, REFINEMENT
-from regnf_core.robust.kernel import geman_mcclure_agreement, geman_mcclure_weight
-from regnf_core.robust.residuals import Residuals
+from regnf_core.robust.residuals import Residuals, geman_mcclure_agreement, geman_mcclure_weight
 
 
 def adaptive_width(r: Residuals, lowest: Tensor | float, widest: Tensor | float) -> Tensor:

@@ -2,18 +2,188 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
 
+import torch
 from torch import Tensor
 
-from regnf_core.geometry.pose_distance import distinct
+from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import EVIDENCE, VERDICT
-from regnf_core.robust.model.object_model import ObjectModel
+from regnf_core.robust.constants import EVIDENCE, MODEL, VERDICT
+from regnf_core.robust.model import ObjectModel, SelfSymmetry
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.verdict.lead import apart, apart_from_answer, merits
-from regnf_core.robust.verdict.probability import pose_odds
+from regnf_core.robust.search.bounds import turns_about
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
+
+# By how much a pose is better than the next one that is another answer.
+#
+# Poses are compared by their merits: the log odds say which of them fit at all, the score says which of these fits
+# best. A pose that is right stands out among all that a search found. Where an object is not in the box, or the right
+# pose was lost, several poses are about as likely.
+#
+# An answer may list several poses that fit alike, of which one is right. They are no rivals of the answer as a whole.
+
+
+def merits(log_odds: Tensor, scores: Tensor) -> Tensor:
+    """(H,) in log odds, larger is better: what poses with these log odds (H,) of being right, each alone, and scores
+    (H,), 0..1, smaller is better, are compared by."""
+    return log_odds - VERDICT.log_odds_per_score * scores.to(log_odds)
+
+
+def leads(merits: Tensor, apart: Tensor) -> Tensor:
+    """(H,): each pose's merit (H,) above that of the best of the poses that are ``apart`` (H, H) from it, at most
+    VERDICT.most_lead, which is also the lead of a pose without any."""
+    others = torch.where(apart, merits, -torch.inf).amax(1)
+    return (merits - others).clamp(-VERDICT.most_lead, VERDICT.most_lead)
+
+
+def apart_from_answer(apart: Tensor, answer: Sequence[int]) -> Tensor:
+    """(H, H) as ``apart``, but a pose of the ``answer``, given by their numbers, is apart only from poses that are
+    apart from all of them."""
+    joined = apart.clone()
+    joined[list(answer)] = apart[list(answer)].all(0)
+    return joined
+
+
+def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:
+    """(H, H) bool: which of the poses T (H,) place the object elsewhere than which, its symmetries allowed for.
+
+    points: (E, 3), the object's outermost ones. Two poses are apart if they place one of them more than VERDICT.apart
+    diameters apart. The diagonal is False.
+    """
+    points = points.double()
+    placed = T.inverse().apply(points)
+    alike = _alike(symmetry).inverse().apply(points)
+    rows = []
+    for number in range(len(T)):
+        pose = T[number]
+        equivalents = pose.inverse().apply(alike.reshape(-1, 3)).reshape(alike.shape)
+        far = (placed[:, None] - equivalents).norm(dim=-1).amax(-1).amin(-1)
+        rows.append(pose.scale * far > VERDICT.apart)
+    return torch.stack(rows)
+
+
+def _alike(symmetry: SelfSymmetry) -> Sim3:
+    """(K,) the object's symmetries, the identity among them, with turns about its axis in small steps."""
+    identity = Sim3.identity()[None]
+    exact = Sim3.cat([identity, symmetry.T[symmetry.deviation <= MODEL.max_deviating_share]])
+    if symmetry.axis is None:
+        return exact
+    rotations = turns_about(symmetry.axis, VERDICT.axis_turns)
+    turns = Sim3(torch.ones(len(rotations)).double(), rotations, torch.zeros(len(rotations), 3).double())
+    return Sim3.cat([turn[None] @ exact for turn in turns])
+
+
+# The probability that a pose is right, from its features: a sum of functions, each monotone in one feature.
+#
+#     logit P(right) = b + sum_k f_k(x_k),    f_k piecewise linear, increasing or decreasing as SPEAKS_FOR says
+#
+# There are two such sums. One knows the pose ``alone``. The other knows the candidates ``among`` which it is: its
+# further feature is the pose's lead, how far its log odds alone, less the score's share, lie above those of the next
+# other answer (:mod:`.lead`).
+#
+# "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make
+# equal. The functions are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).
+# The second sum has two models: one for scenes of which it is known what was seen, one for the others. What a feature
+# tells depends on that: a field has surface that nobody saw, and only an observation says which it is.
+
+LEAD = "lead"
+SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
+_ALONE = "probability-alone.json"
+_AMONG = {True: "probability-observed.json", False: "probability-unobserved.json"}
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """A piecewise linear function of one feature: its values at increasing knots; constant beyond the outer ones."""
+
+    feature: str
+    knots: Tensor
+    values: Tensor
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """The function's values at x (H,)."""
+        x = x.clamp(self.knots[0], self.knots[-1])
+        right = torch.searchsorted(self.knots, x).clamp(1, len(self.knots) - 1)
+        low, high = self.knots[right - 1], self.knots[right]
+        share = (x - low) / (high - low)
+        return torch.lerp(self.values[right - 1], self.values[right], share)
+
+
+@dataclass(frozen=True, eq=False)
+class ProbabilityModel:
+    """bias: logit where every term is at its best value, 0 · terms: at most 0, one for each feature that counts."""
+
+    bias: float
+    terms: tuple[Term, ...]
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> ProbabilityModel:
+        """The model that a file holds. Raises ValueError for a term that is not monotone as its feature must be."""
+        terms = tuple(
+            Term(name, *(torch.tensor(one[part], dtype=torch.float64) for part in ("knots", "values")))
+            for name, one in stored["terms"].items()
+        )
+        for term in terms:
+            steps = term.values.diff() * (1 if SPEAKS_FOR_AMONG[term.feature] else -1)
+            if not (bool((steps >= 0).all()) and bool((term.knots.diff() > 0).all())):
+                raise ValueError(f"the term of {term.feature} is not monotone")
+        return cls(float(stored["bias"]), terms)
+
+    def logit(self, features: dict[str, Tensor]) -> Tensor:
+        """(H,) log odds of the poses with these features, each (H,). What is not a number is as bad as can be."""
+        spoken = self.against(features)
+        return self.bias + torch.stack(list(spoken.values())).sum(0)
+
+    def against(self, features: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What each feature speaks against the poses, (H,), in logits: 0 where it is at its best, else negative."""
+        return {term.feature: _worst_if_nan(term, features[term.feature].double()) for term in self.terms}
+
+
+def _worst_if_nan(term: Term, x: Tensor) -> Tensor:
+    return torch.where(x.isnan(), term.values.min(), term(x.nan_to_num(0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOdds:
+    """The two sums. among_hidden: the second one where the object is mostly hidden at the best pose; None: the same.
+
+    A field of one depth image is solid behind what was seen, so it says itself what was hidden, as an observation does.
+    The scenes of which nothing is known, from which their model has learned, show surface on most sides of an object.
+    """
+
+    alone: ProbabilityModel
+    among: ProbabilityModel
+    among_hidden: ProbabilityModel | None = None
+
+    def log_odds(self, features: dict[str, Tensor], scores: Tensor, apart: Tensor) -> Tensor:
+        """(H,): log odds of the candidates, each as one among them.
+
+        features: each (H,) · scores: (H,), smaller is better · apart: (H, H) bool, which candidates are other answers
+        than which.
+        """
+        compared = merits(self.alone.logit(features), scores)
+        model = self.among
+        if self.among_hidden is not None and float(features["hidden"][compared.argmax()]) > VERDICT.mostly_hidden:
+            model = self.among_hidden
+        return model.logit({**features, LEAD: leads(compared, apart)})
+
+
+@cache
+def pose_odds(observed: bool) -> PoseOdds:
+    """The models that are shipped. observed: whether it is known what was seen of the scene."""
+    among = _stored(_AMONG[observed], "among")
+    return PoseOdds(_stored(_ALONE, "alone"), among, None if observed else _stored(_AMONG[True], "among"))
+
+
+def _stored(name: str, model: str) -> ProbabilityModel:
+    return ProbabilityModel.from_dict(json.loads(files(__package__).joinpath(name).read_text())[model])
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +191,7 @@ class Answer:
     """The best of H candidates by the held-out samples, and its rivals, which explain these as well, best first.
 
     scores: (H,), 0..1, smaller is better · demerits: (H,), what candidates are compared by, smaller is better, see
-    :func:`regnf_core.robust.verdict.lead.merits` · probability: (H,), that the candidate is right, where those that
+    :func:`regnf_core.robust.verdict.answer.merits` · probability: (H,), that the candidate is right, where those that
     place the object elsewhere compete with it, but the best one and those of its rivals that place nearly the same
     surface do not compete with each other: of those, that one of them is right · probability_alone: (H,), the same
     where these compete too: that this very pose is right.

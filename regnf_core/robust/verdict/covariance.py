@@ -23,11 +23,9 @@ from torch import Tensor
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import COVARIANCE
-from regnf_core.robust.kernel import geman_mcclure_curvature, geman_mcclure_weight
 from regnf_core.robust.refine.loss import facing, kernel_widths, observed_weight, offset_prior, sample_weights
-from regnf_core.robust.residuals import Residuals
-from regnf_core.robust.samples import fixed_generator
-from regnf_core.robust.working_frame import WorkingFrame
+from regnf_core.robust.residuals import Residuals, geman_mcclure_curvature, geman_mcclure_weight
+from regnf_core.robust.working_frame import WorkingFrame, fixed_generator
 
 _TINY = COVARIANCE.regularization
 

@@ -8,14 +8,14 @@ from typing import Any
 
 from regnf_core.field_source import Role, assumed_role
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_service.budget import check_budget
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
+from regnf_service.library import check_budget
 from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.services import Services
-from regnf_state.originals import delete_upload, original_key, settings_key
 from regnf_state.ownership import reference_of
 from regnf_state.records import CAMERAS, ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
+from regnf_state.room import delete_upload, original_key, settings_key
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES
-from regnf_service.bytes_under_way import Claim
-from regnf_service.concurrency import in_thread
+from regnf_service.concurrency import Claim, in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, keep_held, store_upload
 from regnf_service.fields.uploads import Received, Upload, closing, open_upload
 from regnf_service.problem import CLOSE, Problem

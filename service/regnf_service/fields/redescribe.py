@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.fields.ingest import check_workers, function_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.originals import original_key, settings_key
 from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, StaleAttemptError
+from regnf_state.room import original_key, settings_key
 
 
 def redescribe(services: Services, caller: str, known: FieldRecord, said: UploadDescription, label: str | None) -> bool:
@@ -73,3 +74,23 @@ def _require_bytes_of(services: Services, field: FieldRecord) -> None:
     """They may have been let go of in between."""
     if not services.blobs.exists(original_key(field.sha256)):
         raise Problem("FIELD_BYTES_GONE")
+
+
+# The mesh and the picture of a field: a worker makes them when it has time, first those that somebody asks for.
+
+_AGAIN = {"Retry-After": "1"}
+
+
+def missing_view(services: Services, record: FieldRecord, reason: str) -> Problem:
+    """What is to be said of a view that is not there: ``reason``. Blocking.
+
+    With Retry-After while a worker is to make it, which it does sooner for this call.
+    """
+    if record.state != "ready":
+        return Problem(reason)
+    if record.views is None:  # imported by an earlier release
+        with suppress(StaleAttemptError):
+            services.records.update_field(record.sha256, attempt=record.attempt, views="pending")
+    elif record.views == "pending":
+        services.records.draw_next(record.sha256)
+    return Problem(reason, headers=_AGAIN if record.views in (None, "pending") else None)

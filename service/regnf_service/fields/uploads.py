@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import anyio
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
-from regnf_service.bytes_under_way import Claim
-from regnf_service.concurrency import UPLOADS
+from regnf_service.concurrency import UPLOADS, Claim
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter

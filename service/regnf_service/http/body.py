@@ -2,12 +2,101 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import asyncio
+import email.message
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import Annotated, Protocol, TypeVar
 
+from fastapi import Depends, Query
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
+from starlette.types import Message
 
-from regnf_service.http.pace import Pace
+from regnf_service.concurrency import LOOKS, PARSING, in_thread, pause
+from regnf_service.fields.ingest import StoredUpload, check_room
+from regnf_service.fields.piecewise import PieceRange, arrived, check_piece, finish_pieces, held, keep_piece, open_piece
+from regnf_service.http.middleware import fair_key
+from regnf_service.http.schemas.reading import read_model
+from regnf_service.http.strict_json import MOST_VALUES
 from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
+from regnf_state.settings import Settings
+
+# What routes are given: the services, and the small readings of a request that several of them share.
+#
+# All are coroutines: the framework would run a plain function in a thread, which costs more than most answers.
+
+
+async def services_of(request: Request) -> Services:
+    services: Services = request.app.state.services
+    return services
+
+
+async def prefix_of(request: Request) -> str:
+    """What the caller's paths begin with: "" or "/v1", behind whatever a proxy put in front."""
+    root = str(request.scope.get("root_path", ""))
+    path = request.scope["path"].removeprefix(root)
+    return root + ("/v1" if path == "/v1" or path.startswith("/v1/") else "")
+
+
+async def caller_of_request(request: Request) -> str:
+    """Whose call it is."""
+    caller: str = request.state.caller
+    return caller
+
+
+ServicesDep = Annotated[Services, Depends(services_of)]
+CallerDep = Annotated[str, Depends(caller_of_request)]
+PrefixDep = Annotated[str, Depends(prefix_of)]
+WaitQuery = Annotated[int, Query(ge=0, le=30, description="Seconds to hold the answer back for news.")]
+LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return at most.")]
+PageTokenQuery = Annotated[str | None, Query(max_length=200, description="`next_page_token` of the page before.")]
+
+
+# How fast a client sends a body, and the time that it has for it.
+
+
+class Pace:
+    """Of one body. Only time spent waiting for the client counts."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._stall_s = settings.upload_stall_s
+        self._bytes_per_s = settings.min_bytes_per_s
+        self._received = 0
+        self._waited = 0.0
+        self._since: float | None = None
+        self._limit: asyncio.Timeout | None = None
+        self._is_cut = False
+
+    def behind_s(self) -> float:
+        """By how much the body is later than the slowest that is taken for long; negative: earlier."""
+        waiting = 0.0 if self._since is None else time.monotonic() - self._since
+        return self._waited + waiting - self._received / self._bytes_per_s
+
+    def cut(self) -> None:
+        """End it as if it had stalled."""
+        self._is_cut = True
+        if self._limit is not None and not self._limit.expired():
+            self._limit.reschedule(asyncio.get_running_loop().time())
+
+    async def next(self, request: Request) -> Message:
+        """What comes next. Raises Problem UPLOAD_STALLED when nothing comes for long, or too little."""
+        left = 0.0 if self._is_cut else min(self._stall_s, max(0.0, self._stall_s - self.behind_s()))
+        self._since = time.monotonic()
+        try:
+            async with asyncio.timeout(left) as self._limit:
+                message = await request.receive()
+        except TimeoutError as error:
+            raise Problem("UPLOAD_STALLED", headers=CLOSE) from error
+        finally:
+            self._waited += time.monotonic() - self._since
+            self._since = self._limit = None
+        self._received += len(message.get("body", b""))
+        return message
 
 
 def declared_length(request: Request, besides: int = 0) -> int | None:
@@ -55,3 +144,272 @@ async def chunks(request: Request, limit: int, pace: Pace, too_large: str = "UPL
         more = message.get("more_body", False)
     if declared is not None and received != declared:
         raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
+
+
+# Reading JSON bodies: large ones beside the event loop, so that other requests go on meanwhile.
+
+_SMALL_BYTES = 16 * 1024
+_REASON = "INVALID_REQUEST"
+_Model = TypeVar("_Model")
+
+
+async def read_json(
+    request: Request, services: Services, caller: str, model: type[_Model], most_values: int = MOST_VALUES
+) -> _Model:
+    """The body of a request as ``model``.
+
+    A large one counts among its caller's uploads until it is read: what a caller has in memory is bounded by their
+    number. Raises Problem as ``read_model`` and ``body.chunks``, REQUEST_TOO_LARGE, TOO_MANY_UPLOADS.
+    """
+    refuse_encoding(request)
+    pace = Pace(services.settings)
+    text = bytearray()
+    async with AsyncExitStack() as place:
+        async for data in chunks(request, services.settings.max_request_bytes, pace, "REQUEST_TOO_LARGE"):
+            if len(text) <= _SMALL_BYTES < len(text) + len(data):
+                await place.enter_async_context(services.uploads.held(fair_key(request.scope, caller), pace))
+            text += data
+        return await read_text(model, bytes(text), most_values)
+
+
+async def read_text(model: type[_Model], text: bytes, most_values: int = MOST_VALUES, what: str = "The body") -> _Model:
+    """As ``read_model``. Raises Problem as that does."""
+    if len(text) <= _SMALL_BYTES:
+        return read_model(model, text, _REASON, most_values, what)
+    return await PARSING.run(read_model, model, text, _REASON, most_values, what)
+
+
+# One request of an upload in pieces: the piece is read and kept, and the field made once all are here.
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One piece of a caller's upload. digest: of the piece, where it was announced · complete: whether the last piece
+    makes the field."""
+
+    caller: str
+    sha256: str
+    range: PieceRange
+    digest: str | None
+    complete: bool
+
+
+async def receive_piece(request: Request, services: Services, piece: Piece, pace: Pace) -> StoredUpload | int:
+    """The field, once all pieces are here; before that how many bytes have arrived.
+
+    Raises Problem: what ``check_room``, ``check_piece``, ``keep_piece`` and ``finish_pieces`` raise, DIGEST_MISMATCH.
+    """
+    room = await in_thread(check_room, services, piece.caller, piece.sha256)
+    known = await held(services, piece.caller, piece.sha256)
+    if known is None:
+        await check_piece(services, piece.caller, piece.sha256, piece.range)
+    await _receive(request, services, piece, room, pace, keep=known is None)
+    if known is not None:
+        return known
+    offset = await arrived(services, piece.caller, piece.sha256)
+    if piece.complete and offset == piece.range.total:
+        return await finish_pieces(services, piece.caller, piece.sha256)
+    return offset
+
+
+async def _receive(
+    request: Request, services: Services, piece: Piece, room: int | None, pace: Pace, keep: bool
+) -> None:
+    """Read the body to its end, and keep it if it is a piece that is wanted."""
+    refuse_encoding(request)
+    data = chunks(request, piece.range.length, pace, too_large="INVALID_HEADER")  # more than Content-Range says
+    if piece.range.first is None:
+        async for _ in data:
+            pass
+        return
+    with services.under_way.claim(piece.caller, room, piece.range.length) as claim:
+        async with open_piece(services, claim, piece.range) as upload:
+            async for block in data:
+                await upload.feed(block)
+            received = await upload.finish()
+            if piece.digest not in (None, received.sha256):
+                raise Problem("DIGEST_MISMATCH")
+            if keep:
+                await keep_piece(services, piece.caller, piece.sha256, piece.range, upload, received)
+
+
+# Holding an answer back until there is news, without holding a thread.
+
+_FIRST_PAUSE_S = 0.02
+_MAX_PAUSE_S = 0.25
+_Value = TypeVar("_Value")
+
+
+async def wait_for(
+    fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, services: Services, caller: str
+) -> _Value:
+    """What ``fetch`` (blocking) returns once it is ``enough``, ``seconds`` have passed or the service stops.
+
+    At once where very many wait already, or many of this caller.
+    """
+    deadline = time.monotonic() + (seconds if services.waiters.has_room(caller) else 0.0)
+    step = _FIRST_PAUSE_S
+    with services.waiters.held(caller):
+        value = await in_thread(fetch)
+        while True:
+            left = deadline - time.monotonic()
+            if enough(value) or left <= 0:
+                return value
+            if await pause(min(services.waiters.pause_s(caller, step), left), services.stopping):
+                return value
+            value = await LOOKS.run(fetch)
+            step = min(step * 1.5, _MAX_PAUSE_S)
+
+
+# multipart/form-data read as a stream: text parts into memory, file parts straight to where they go.
+#
+# The framework's own form parser spools files to a temporary folder first; a scene of gigabytes must not pass through
+# it.
+
+_MAX_HEADER_BYTES = 4096
+_MAX_PARAMETERS = 64
+"""Of a header. The library that reads them takes time that grows with the square of their number."""
+_MAX_HEADERS = 8
+
+
+class Sink(Protocol):
+    """Where a file part's bytes go."""
+
+    def begin(self, filename: str) -> None:
+        """The part has come, under this name; "" for none."""
+        ...
+
+    async def feed(self, data: bytes | bytearray) -> None: ...
+
+
+class _Part:
+    """One part: its name, and its text if it is no file."""
+
+    def __init__(self) -> None:
+        self.headers: dict[str, str] = {}
+        self.name = ""
+        self.filename = ""
+        self.text = bytearray()
+
+
+class _Collector:
+    """Turns the parser's callbacks into a list of (part, bytes): None for a part's beginning."""
+
+    def __init__(self, boundary: str) -> None:
+        self.events: list[tuple[_Part, bytearray | None]] = []
+        self.ended = False
+        self._part = _Part()
+        self._field = bytearray()
+        self._value = bytearray()
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._begin,
+                "on_part_data": self._data,
+                "on_header_field": lambda data, start, end: self._field.extend(data[start:end]),
+                "on_header_value": lambda data, start, end: self._value.extend(data[start:end]),
+                "on_header_end": self._header,
+                "on_headers_finished": lambda: self.events.append((self._part, None)),
+                "on_end": self._end,
+            },
+            max_header_count=_MAX_HEADERS,
+            max_header_size=_MAX_HEADER_BYTES,
+        )
+
+    def _begin(self) -> None:
+        self._part = _Part()
+
+    def _data(self, data: bytes, start: int, end: int) -> None:
+        """Joined with what came just before: nearly a boundary in every line would make an event of every few bytes."""
+        if self.events and isinstance(known := self.events[-1][1], bytearray):
+            known += data[start:end]
+        else:
+            self.events.append((self._part, bytearray(data[start:end])))
+
+    def _end(self) -> None:
+        self.ended = True
+
+    def _header(self) -> None:
+        name = self._field.decode("latin-1").lower()
+        self._part.headers[name] = self._value.decode("latin-1")
+        self._field.clear()
+        self._value.clear()
+        if name == "content-disposition":
+            self._part.name = _parameter(self._part.headers[name], "name") or ""
+            self._part.filename = _parameter(self._part.headers[name], "filename") or ""
+
+    def feed(self, data: bytes) -> list[tuple[_Part, bytearray | None]]:
+        self._parser.write(data)
+        events, self.events = self.events, []
+        return events
+
+
+def _parameter(header: str, name: str) -> str | None:
+    """One parameter of a structured header such as Content-Disposition or Content-Type; None where there are many."""
+    if header.count(";") > _MAX_PARAMETERS:
+        return None
+    message = email.message.Message()
+    message["content-type"] = header.replace("\r", " ").replace("\n", " ")
+    try:
+        value = message.get_param(name)
+    except ValueError:  # a continuation (RFC 2231) numbered with more digits than an integer may have
+        return None
+    return value if isinstance(value, str) else None
+
+
+def boundary_of(request: Request) -> str:
+    """The boundary that the Content-Type announces. Raises Problem MALFORMED_MULTIPART."""
+    boundary = _parameter(request.headers.get("content-type", ""), "boundary")
+    if not boundary or not boundary.isascii() or len(boundary) > 70:
+        raise Problem("MALFORMED_MULTIPART", "The Content-Type names no usable boundary.", headers=CLOSE)
+    return boundary
+
+
+async def read_parts(
+    body: AsyncIterator[bytes],
+    boundary: str,
+    files: Mapping[str, Sink],
+    texts: Mapping[str, int],
+) -> dict[str, bytes]:
+    """Feed the parts named in ``files`` to their sinks; return the text parts, capped as ``texts`` says, by name.
+
+    A file part that came appears in the answer too, empty. Looking for boundaries takes long where there is nearly one
+    in every line, so it is done in a thread, a piece at a time.
+
+    Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, DUPLICATE_PART, REQUEST_TOO_LARGE, and what the sinks raise.
+    """
+    collector = _Collector(boundary)
+    parts: dict[str, _Part] = {}
+    async for data in body:
+        try:
+            events = await PARSING.run(collector.feed, data)
+        except FormParserError as error:
+            raise Problem("MALFORMED_MULTIPART", headers=CLOSE) from error
+        for part, content in events:
+            if content is None:
+                _admit(part, parts, files, texts)
+            elif part.name in files:
+                await files[part.name].feed(content)
+            else:
+                _add_text(part, content, texts[part.name])
+    if not collector.ended:
+        raise Problem("MALFORMED_MULTIPART", "The body ends before its closing boundary.", headers=CLOSE)
+    return {name: bytes(part.text) for name, part in parts.items()}
+
+
+def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], texts: Mapping[str, int]) -> None:
+    if part.name not in files and part.name not in texts:
+        raise Problem("UNKNOWN_PART", f"Known parts: {', '.join([*files, *texts])}.", headers=CLOSE)
+    if part.name in parts:
+        raise Problem("DUPLICATE_PART", headers=CLOSE)
+    if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):
+        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.", headers=CLOSE)
+    parts[part.name] = part
+    if part.name in files:
+        files[part.name].begin(part.filename)
+
+
+def _add_text(part: _Part, content: bytearray, limit: int) -> None:
+    if len(part.text) + len(content) > limit:
+        raise Problem("REQUEST_TOO_LARGE", f"The part {part.name} takes at most {limit} bytes.", headers=CLOSE)
+    part.text += content

@@ -11,9 +11,8 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import TypeAdapter
 
 from regnf_core import __version__
-from regnf_service.http.open_paths import OPEN_PATHS
-from regnf_service.http.problems import MEDIA_TYPE
-from regnf_service.http.schemas.references import REFERENCED
+from regnf_service.http.problems import MEDIA_TYPE, OPEN_PATHS
+from regnf_service.http.schemas.reading import REFERENCED
 from regnf_state.reasons import REASONS
 
 _DESCRIPTION = """\

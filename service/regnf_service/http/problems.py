@@ -13,18 +13,61 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
 from redis.exceptions import OutOfMemoryError, RedisError
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
-from regnf_service.http.allowed_methods import allowed_methods
-from regnf_service.http.security_headers import SECURITY_HEADERS
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_state.blobs.base import StorageFullError
-from regnf_state.library import NameTakenError
 from regnf_state.reasons import REASONS
+from regnf_state.record_store import NameTakenError
 from regnf_state.records import QueueFullError, QuotaError, RecordError, RecordsFullError, UnreadableRecordError
+
+# Which methods an address answers to, by the contract.
+
+
+def allowed_methods(contract: dict[str, Any], path: str) -> list[str]:
+    """The methods that a path answers to, below whatever prefix; none for one the contract does not know."""
+    found = set()
+    for template, operations in contract["paths"].items():
+        pattern = re.sub(r"\\{[^}]+\\}", "[^/]+", re.escape(template))
+        if re.fullmatch(f"(/v1)?{pattern}", path):
+            found |= {method.upper() for method in operations}
+    return sorted(found)
+
+
+# Addresses that need no token: the liveness probe, and the pages, which ask for the token themselves.
+
+OPEN_PATHS = re.compile(r"(/v1)?/(healthz|docs)|/static/.*|(/v1)?/jobs/[A-Za-z0-9_-]+/view")
+
+
+# What every answer tells browsers: no other site may read it or show it in a frame, and its type is what it says.
+
+_STRICT_POLICY = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+_FIXED = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "X-Frame-Options": "DENY",
+}
+_UNLESS_SAID = {"Content-Security-Policy": _STRICT_POLICY, "Cache-Control": "no-store"}
+"""Pages bring a policy of their own; what may be kept says so itself."""
+
+
+def secure(headers: MutableHeaders) -> None:
+    """Add what is missing."""
+    for name, value in _FIXED.items():
+        headers[name] = value
+    for name, value in _UNLESS_SAID.items():
+        headers.setdefault(name, value)
+
+
+SECURITY_HEADERS = {**_FIXED, **_UNLESS_SAID}
+"""For answers that are written without the framework."""
+
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"

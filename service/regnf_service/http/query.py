@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import json
+import math
+import re
 from collections import Counter
 
 from fastapi.routing import APIRoute
+from starlette.datastructures import Headers
 from starlette.requests import Request
+from starlette.types import Scope
 
 from regnf_service.problem import CLOSE, Problem, json_pointer
+from regnf_state.record_store import Position
 
 _MOST_PARAMETERS = 32
 
@@ -31,3 +39,45 @@ async def refuse_unknown_parameters(request: Request) -> None:
         raise Problem(
             "INVALID_QUERY", errors=errors, headers=CLOSE if request.method in ("POST", "PUT", "PATCH") else None
         )
+
+
+# Page tokens: where the look for the page before ended. They carry no secret and open nothing, so none is signed.
+
+NEXT_PAGE = "For the next page's `page_token`; null on the last page. A page before the last may be short or empty."
+
+
+def encode_token(rest: Position | None) -> str | None:
+    """The token for what is older than this position; None when there is no more."""
+    if rest is None:
+        return None
+    return base64.urlsafe_b64encode(json.dumps(rest).encode()).decode().rstrip("=")
+
+
+def decode_token(token: str | None) -> Position | None:
+    """The position from a token. Raises Problem INVALID_PAGE_TOKEN."""
+    if token is None:
+        return None
+    try:
+        value = json.loads(base64.b64decode(token + "=" * (-len(token) % 4), altchars=b"-_", validate=True))
+    except (ValueError, binascii.Error, RecursionError) as error:
+        raise Problem("INVALID_PAGE_TOKEN") from error
+    match value:
+        case [float() | int() as created, str() as name] if math.isfinite(created) and name.isascii():
+            return float(created), name
+    raise Problem("INVALID_PAGE_TOKEN")
+
+
+# Which requests a page answers and which JSON: addresses that people open in a browser have both.
+
+_HOME = re.compile(r"(/v1)?(/|/jobs|/fields|/library)")
+
+
+def wants_page(scope: Scope) -> bool:
+    """Whether the sender would rather have a page than JSON: a browser that opens the address names HTML first."""
+    first = Headers(scope=scope).get("accept", "").split(",")[0].partition(";")[0]
+    return scope["method"] in ("GET", "HEAD") and first.strip().lower() == "text/html"
+
+
+def is_home_page(scope: Scope) -> bool:
+    """Whether a browser opens one of the addresses of the home page, which holds no data and needs no token."""
+    return _HOME.fullmatch(scope["path"]) is not None and wants_page(scope)

@@ -5,6 +5,8 @@ One range is honored, several are answered with the whole.
 
 from __future__ import annotations
 
+import base64
+import binascii
 import os
 import re
 from collections.abc import AsyncIterator, Mapping
@@ -17,9 +19,67 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from regnf_service.concurrency import in_thread
-from regnf_service.http.etags import IfNoneMatch
-from regnf_service.problem import Problem
+from regnf_service.fields.piecewise import PieceRange
+from regnf_service.problem import CLOSE, Problem
 from regnf_state.blobs.base import BlobStore
+from regnf_state.records import FieldRecord
+
+# Entity tags and `If-None-Match` (RFC 9110, sections 8.8.3 and 13.1.2).
+
+_TAG = re.compile(r'(?:W/)?("[\x21\x23-\x7e\x80-\xff]*")')
+_LIST = re.compile(rf"[ \t,]*{_TAG.pattern}(?:[ \t]*,[ \t,]*{_TAG.pattern})*[ \t,]*")
+_KEPT = ("etag", "cache-control", "retry-after")
+
+
+@dataclass(frozen=True)
+class IfNoneMatch:
+    """The condition that a request sets. ``given`` is False without a condition, or with a malformed one."""
+
+    given: bool = False
+    tags: frozenset[str] | None = frozenset()
+    """The opaque tags, with their quotes; None means `*`, any tag."""
+
+    def matches(self, etag: str) -> bool:
+        """Whether the client holds this version. The comparison is weak: proxies may put `W/` before a tag."""
+        return self.given and (self.tags is None or etag.removeprefix("W/") in self.tags)
+
+    def differs(self, etag: str) -> bool:
+        """Whether the client holds another version."""
+        return self.given and not self.matches(etag)
+
+    def apply(self, answer: Response) -> Response:
+        """The answer, or 304 with its headers when the client holds that version."""
+        if not self.matches(answer.headers.get("etag", "")):
+            return answer
+        return Response(
+            status_code=304, headers={name: answer.headers[name] for name in _KEPT if name in answer.headers}
+        )
+
+
+def parse_if_none_match(header: str | None) -> IfNoneMatch:
+    """The condition in a header; a malformed header sets none."""
+    if header is not None and header.strip() == "*":
+        return IfNoneMatch(True, None)
+    if header is None or not _LIST.fullmatch(header):
+        return IfNoneMatch()
+    return IfNoneMatch(True, frozenset(_TAG.findall(header)))
+
+
+def field_etag(record: FieldRecord) -> str:
+    """Changes with every change of the field's record."""
+    return f'"{record.sha256[:16]}.{record.version}"'
+
+
+async def _of_request(
+    if_none_match: Annotated[
+        str | None, Header(description="One or several ETags, or `*`: 304 when one of them is the current one.")
+    ] = None,
+) -> IfNoneMatch:
+    return parse_if_none_match(if_none_match)
+
+
+IfNoneMatchDep = Annotated[IfNoneMatch, Depends(_of_request)]
+
 
 _ONE_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
@@ -130,3 +190,67 @@ async def _blocks(file: BinaryIO, part: ByteRange, block_bytes: int) -> AsyncIte
     while left and (block := await in_thread(file.read, min(left, block_bytes))):
         left -= len(block)
         yield block
+
+
+# Content-Range of a request (RFC 9110, 14.4 and 14.5): which piece of a file the body is.
+
+PATTERN = r"^bytes ([0-9]{1,15}-[0-9]{1,15}|\*)/[0-9]{1,15}$"
+_RANGE = re.compile(r"bytes (?:([0-9]{1,15})-([0-9]{1,15})|\*)/([0-9]{1,15})", re.ASCII | re.IGNORECASE)
+
+
+def content_range(header: str | None, limit: int) -> PieceRange | None:
+    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_EMPTY."""
+    if header is None:
+        return None
+    match = _RANGE.fullmatch(header.strip())
+    if match is None:
+        detail = "Content-Range is not `bytes first-last/total` or `bytes */total`."
+        raise Problem("INVALID_HEADER", detail, headers=CLOSE)
+    first, last, total = (None if text is None else int(text) for text in match.groups())
+    assert total is not None
+    if total > limit:
+        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.", headers=CLOSE)
+    if total == 0:
+        raise Problem("UPLOAD_EMPTY", headers=CLOSE)
+    if first is None or last is None:
+        return PieceRange(None, None, total)
+    if not first <= last < total:
+        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.", headers=CLOSE)
+    return PieceRange(first, last + 1, total)
+
+
+# The digests that clients announce: in a path, and in Content-Digest (RFC 9530).
+
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_MEMBER = re.compile(r"\s*([a-z0-9*_.-]{1,32})=:([A-Za-z0-9+/=]{0,128}):\s*")
+
+
+def is_sha256(text: str) -> bool:
+    """Whether the text is a SHA-256 as fields are named: 64 lower-case hexadecimal digits."""
+    return _SHA256.fullmatch(text) is not None
+
+
+def announced_digest(header: str | None) -> str | None:
+    """The sha-256 of a Content-Digest header in hexadecimal; None when there is none to compare with.
+
+    Raises Problem INVALID_DIGEST.
+    """
+    if header is None:
+        return None
+    for member in header.split(","):
+        match = _MEMBER.fullmatch(member)
+        if match is None:
+            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.", headers=CLOSE)
+        if match.group(1) == "sha-256":
+            return _decoded(match.group(2))
+    return None
+
+
+def _decoded(text: str) -> str:
+    try:
+        value = base64.b64decode(text, validate=True)
+    except binascii.Error:
+        value = b""
+    if len(value) != 32:
+        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.", headers=CLOSE)
+    return value.hex()

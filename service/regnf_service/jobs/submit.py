@@ -2,21 +2,142 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
+from regnf_core.cost import Cost, Term, estimate
 from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.errors import InvalidDetectionError
-from regnf_service.budget import check_budget
-from regnf_service.jobs.cost_limits import check_cost
-from regnf_service.jobs.identity import digest, functions_of, job_id_of
-from regnf_service.problem import Problem
+from regnf_core.options import RegistrationOptions
+from regnf_core.rendering import request as rendering_cost
+from regnf_core.rendering.request import RENDERER_REVISION, RenderRequest
+from regnf_core.version import ENGINE_REVISION
+from regnf_service.library import check_budget
+from regnf_service.problem import Problem, json_pointer
 from regnf_service.services import Services
-from regnf_state.job_request import JobRequest, kind_of
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
 from regnf_state.records import FieldRecord, JobRecord, RecordError, UnreadableRecordError
-from regnf_state.rendering_request import RenderingRequest
+from regnf_state.registration_request import JobRequest, RenderingRequest, estimated_cost, kind_of
+from regnf_state.settings import Settings
+
+# Requests that multiply to more memory, time or files than one job may have are refused before they are queued.
+
+DEFAULT_MEMORY_BYTES = 4 << 30
+"""The most that a request may be estimated at where REGNF_JOB_MEMORY_BYTES says nothing else."""
+_SECONDS_ARE_WITHIN = 10.0
+"""Fields differ in speed by this factor either way: what the fastest ones would do in time is taken."""
+_GIB = 1 << 30
+
+
+@dataclass(frozen=True)
+class _Refusals:
+    """How requests of a kind are refused. within: where in the body their options are."""
+
+    reason: str
+    within: tuple[str, ...] = ()
+
+
+_OF_REGISTRATIONS = _Refusals("OPTIONS_TOO_COSTLY", ("options",))
+_OF_RENDERINGS = _Refusals("RENDER_TOO_LARGE")
+
+
+def check_cost(settings: Settings, request: JobRequest) -> None:
+    """Raises Problem OPTIONS_TOO_COSTLY, or RENDER_TOO_LARGE for a rendering.
+
+    What default options cost is never refused, however low the limits are.
+    """
+    cost = estimated_cost(request)
+    if isinstance(request, RenderingRequest):
+        _check_files(settings, request)
+        _check(settings, cost, rendering_cost.estimate(RenderRequest()), _OF_RENDERINGS)
+    else:
+        usual = estimate(RegistrationOptions(preset=request.options.preset), max(1, len(request.objects)))
+        _check(settings, cost, usual, _OF_REGISTRATIONS)
+
+
+def _check(settings: Settings, cost: Cost, usual: Cost, refusals: _Refusals) -> None:
+    memory = max(settings.job_memory_bytes or DEFAULT_MEMORY_BYTES, usual.memory_bytes)
+    if cost.memory_bytes > memory:
+        estimated, limit = f"{cost.memory_bytes / _GIB:.1f} GiB of memory", f"{memory / _GIB:.1f} GiB"
+        raise _refusal(cost.largest("memory_bytes"), estimated, limit, refusals)
+    seconds = max(settings.job_timeout_s, usual.seconds)
+    least = cost.seconds / _SECONDS_ARE_WITHIN
+    if least > seconds:
+        raise _refusal(cost.largest("seconds"), f"at least {least:,.0f} s", f"{seconds:,.0f} s", refusals)
+
+
+def _check_files(settings: Settings, request: RenderingRequest) -> None:
+    files, limit = rendering_cost.estimate(request.rendering).file_bytes, settings.job_scratch_bytes
+    if files > limit:
+        detail = f"The files may take {files / _GIB:.1f} GiB; the limit is {limit / _GIB:.1f} GiB."
+        fault = {"pointer": "/outputs", "detail": detail}
+        hint = "Ask for fewer or smaller frames, or for fewer outputs."
+        raise Problem(_OF_RENDERINGS.reason, detail, errors=[fault], hint=hint)
+
+
+def _refusal(term: Term, estimated: str, limit: str, refusals: _Refusals) -> Problem:
+    detail = f"The job is estimated to take {estimated}; the limit is {limit}. Most of it is for {_count(term)}."
+    errors = [
+        {
+            "pointer": json_pointer((*refusals.within, *option)),
+            "detail": f"{_count(term)}: {estimated}, limit {limit}",
+        }
+        for option in term.options
+    ]
+    return Problem(refusals.reason, detail, errors=errors)
+
+
+def _count(term: Term) -> str:
+    return f"{term.count:,} {term.counts}"
+
+
+# The job id that follows from a request.
+#
+# Two requests whose results are the same are one job: asking twice costs nothing.
+
+_ID_DIGITS = 32
+_WITHOUT_EFFECT = frozenset({"label", "score"})
+"""Members of a detection that no result depends on."""
+
+
+def digest(value: Any) -> str:
+    """SHA-256, lower-case hexadecimal, of a JSON value in canonical spelling."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def functions_of(fields: Iterable[FieldRecord | None]) -> dict[str, str]:
+    """What was said of each field of which anything was: the same bytes with another description are another field."""
+    return {field.sha256: digest(field.description) for field in fields if field is not None and field.description}
+
+
+def job_id_of(request: JobRequest, functions: Mapping[str, str] | None = None) -> str:
+    """The job's id: a digest of what the result depends on, the engine's revision and the fields' functions included.
+
+    The webhook and a detection's label and score change nothing in a result, so they do not enter. The record of a
+    job that exists keeps the label and score of the request that made it, and gets the webhook of each later one.
+    """
+    asked = {name: _of_effect(value) for name, value in request.values().items() if name != "webhook"}
+    revisions: dict[str, Any] = {"engine": ENGINE_REVISION}
+    if isinstance(request, RenderingRequest):
+        revisions["renderer"] = RENDERER_REVISION
+    described = {"functions": dict(functions)} if functions else {}
+    return digest({"kind": kind_of(request), **revisions, "request": asked} | described)[:_ID_DIGITS]
+
+
+def _of_effect(value: Any) -> Any:
+    """A request's value without what has no effect in the detections in it."""
+    if isinstance(value, list):
+        return [_of_effect(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    without = _WITHOUT_EFFECT if "rotation_quaternion_xyzw" in value else frozenset()
+    return {name: _of_effect(one) for name, one in value.items() if name not in without}
+
 
 _KEY_LIFETIME_S = 24 * 3600
 _MAX_KEY_LENGTH = 255

@@ -6,13 +6,23 @@ register a name must not reach what only this service can reach.
 
 from __future__ import annotations
 
+import base64
+import binascii
+import hashlib
+import hmac
 import ipaddress
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from regnf_service.tokens import TokensError
+from regnf_service.problem import Problem
+from regnf_service.tokens import TokensError, read_lines
+from regnf_state.ownership import ANONYMOUS, CALLER_NAME
+from regnf_state.records import JobRecord
+from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
 
 _PORTS = {"http": 80, "https": 443}
 _MAX_URL_CHARS = 2000
@@ -91,3 +101,72 @@ def is_public(address: str) -> bool:
     if any(found in network for network in _SPECIAL) or (found.version == 6 and found not in _UNICAST):
         return False
     return found.is_global and not found.is_multicast and not found.is_reserved
+
+
+# Signatures as the Standard Webhooks specification 1.0 has them: HMAC-SHA256 over id, time and body.
+
+_PREFIX = "whsec_"
+_MIN_KEY_BYTES, _MAX_KEY_BYTES = 24, 64
+
+Secrets = Mapping[str, Sequence[bytes]]
+"""Each caller's keys. With several keys each message has a signature of each, while one key replaces another."""
+
+
+def read_secrets(entries: Iterable[str], file: Path | None) -> Secrets:
+    """The keys in entries ``caller:whsec_<base64>``, those of the file included. Raises TokensError."""
+    secrets: dict[str, list[bytes]] = {}
+    for entry in (*entries, *(read_lines(file) if file is not None else ())):
+        caller, _, text = entry.partition(":")
+        if not CALLER_NAME.fullmatch(caller):
+            raise TokensError(f"an entry of a webhook secret begins with no caller's name; without tokens: {ANONYMOUS}")
+        secrets.setdefault(caller, []).append(_key(caller, text))
+    return secrets
+
+
+def _key(caller: str, text: str) -> bytes:
+    try:
+        key = base64.b64decode(text.removeprefix(_PREFIX), validate=True) if text.startswith(_PREFIX) else b""
+    except binascii.Error:
+        key = b""
+    if not _MIN_KEY_BYTES <= len(key) <= _MAX_KEY_BYTES:
+        raise TokensError(f"the webhook secret of {caller} is not whsec_ and the base64 of 24 to 64 bytes")
+    return key
+
+
+def signed_headers(keys: Sequence[bytes], message_id: str, timestamp: int, body: bytes) -> dict[str, str]:
+    """The three headers of a message; ``timestamp`` in seconds since the epoch, the id without a full stop."""
+    content = f"{message_id}.{timestamp}.".encode() + body
+    signatures = (base64.b64encode(hmac.digest(key, content, hashlib.sha256)).decode() for key in keys)
+    return {
+        "webhook-id": message_id,
+        "webhook-timestamp": str(timestamp),
+        "webhook-signature": " ".join(f"v1,{signature}" for signature in signatures),
+    }
+
+
+# What the service knows of webhooks when a request names one: who may, to where, and how its message fares.
+
+_POINTER = "/webhook/url"
+
+
+@dataclass(frozen=True)
+class Webhooks:
+    """The hosts that are allowed, the callers' keys, and the outbox."""
+
+    allowed: AllowList
+    secrets: Secrets
+    outbox: RedisOutbox
+
+    def check(self, caller: str, url: str | None) -> None:
+        """Whether this caller may name this address. Raises Problem WEBHOOK_NOT_ALLOWED."""
+        if url is None:
+            return
+        if not self.allowed.allows(url):
+            raise Problem("WEBHOOK_NOT_ALLOWED", errors=[{"pointer": _POINTER, "detail": "no host that is allowed"}])
+        if caller not in self.secrets:
+            fault = {"pointer": _POINTER, "detail": "the service has no secret of yours to sign with"}
+            raise Problem("WEBHOOK_NOT_ALLOWED", errors=[fault])
+
+    def deliveries(self, record: JobRecord) -> list[Delivery]:
+        """The state of the message to each of the job's webhooks."""
+        return self.outbox.deliveries(record)

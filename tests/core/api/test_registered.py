@@ -19,7 +19,7 @@ import trimesh
 
 import regnf
 from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
-from regnf_core.viewing import window
+from regnf_core.viewing import registration_picture
 from tests.cli.conftest import DATA
 
 BOX = json.loads((DATA / "detection.json").read_text())
@@ -103,7 +103,7 @@ def test_save_writes_what_the_command_writes(found: regnf.Registered, tmp_path: 
 
 def test_plot_draws(found: regnf.Registered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[Any] = []
-    monkeypatch.setattr("regnf_core.api.registered.show", shown.append)
+    monkeypatch.setattr("regnf_core.api.show", shown.append)
     picture = found.plot(tmp_path / "chair.png")
     assert picture.size[0] > 1000
     assert (tmp_path / "chair.png").read_bytes().startswith(b"\x89PNG")
@@ -115,12 +115,14 @@ def test_plot_draws(found: regnf.Registered, tmp_path: Path, monkeypatch: pytest
 def test_a_window_needs_a_display(found: regnf.Registered, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert window.show(found) is False
+    assert registration_picture.show(found) is False
     drawn: list[tuple[str, int]] = []
-    monkeypatch.setattr(window, "has_display", lambda: True)
-    monkeypatch.setattr("regnf_core.viewing.window.importlib.import_module", lambda name: name)
-    monkeypatch.setattr(window, "_with_pyvista", lambda library, clouds: drawn.append((library, len(clouds))))
-    assert window.show(found) is True
+    monkeypatch.setattr(registration_picture, "has_display", lambda: True)
+    monkeypatch.setattr("regnf_core.viewing.registration_picture.importlib.import_module", lambda name: name)
+    monkeypatch.setattr(
+        registration_picture, "_with_pyvista", lambda library, clouds: drawn.append((library, len(clouds)))
+    )
+    assert registration_picture.show(found) is True
     assert drawn == [("pyvista", 2)]
 
 

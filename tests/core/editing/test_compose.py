@@ -20,17 +20,15 @@ from regnf_core import (
     open_field,
     render,
 )
-from regnf_core.editing.edits import Edit
-from regnf_core.editing.measured_matter import without_unseen
-from regnf_core.editing.parts import SCENE_PART
-from regnf_core.editing.standing import standing_alike
+from regnf_core.editing.compose import standing_alike
+from regnf_core.editing.edits import SCENE_PART, Edit
+from regnf_core.editing.region import without_unseen
 from regnf_core.editing.storing import write_field
 from regnf_core.errors import NoSurfaceError, RegnfError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.observation import Observation, ObservedField, observation_of
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.observation import Observation, ObservedField, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.schema.observation_grid import SURFACE
+from regnf_core.schema.description import SURFACE
 from tests.core.analytic import AnalyticField, boxes, sphere, union
 
 BOUNDS = [[-1.0, -1.0, -0.1], [1.0, 1.0, 1.0]]

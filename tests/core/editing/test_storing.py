@@ -10,7 +10,7 @@ from torch import Tensor
 
 from regnf_core import Sim3, Substitution, compose, open_field
 from regnf_core.editing.storing import write_field
-from regnf_core.fields.color import has_color
+from regnf_core.fields.observation import has_color
 from tests.core.analytic import AnalyticField, sphere
 
 RED, BLUE = torch.tensor([0.9, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields import cell_index
-from regnf_core.fields.cell_index import CellIndex
+from regnf_core.fields import voxel_blocks
+from regnf_core.fields.voxel_blocks import CellIndex
 
 
 def some_cells(count: int, reach: int) -> torch.Tensor:
@@ -28,7 +28,7 @@ def test_every_cell_is_found_and_no_other() -> None:
 @pytest.mark.parametrize("most", [1 << 18, 200])
 def test_the_nearest_cells_are_near(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
     """With a table of single cells exactly so; with a coarser one to the cells of the table."""
-    monkeypatch.setattr(cell_index, "_TABLE_CELLS", most)
+    monkeypatch.setattr(voxel_blocks, "_TABLE_CELLS", most)
     cells = some_cells(60, 8)
     index = CellIndex.of(cells)
     assert (index.step == 1) == (most > 16**3)

@@ -8,12 +8,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.color import ColoredField, has_color, inverse_deviation_of
-from regnf_core.fields.composite import BoxField, UnionField
-from regnf_core.fields.observation import Observation, ObservedField
-from regnf_core.fields.scaled import ScaledField
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.build import ScaledField
+from regnf_core.fields.composite import BoxField, TransformedField, UnionField
+from regnf_core.fields.observation import (
+    ColoredField,
+    Observation,
+    ObservedField,
+    SdfField,
+    has_color,
+    inverse_deviation_of,
+)
 from regnf_core.geometry.sim3 import Sim3
 from tests.core.analytic import sphere
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
+from regnf_core.fields.observation import SdfField
 
 DATA = Path(__file__).resolve().parents[3] / "examples" / "data"
 

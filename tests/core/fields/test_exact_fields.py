@@ -11,9 +11,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, SurfaceSource, UnionField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_mesh
 
 BOX = BoxField((-0.3, -0.2, -0.1), (0.3, 0.2, 0.5))

@@ -10,8 +10,8 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
-from regnf_core.fields.one_blob import OneBlob
-from regnf_core.schema.parsing import parse_description
+from regnf_core.fields.grid_mlp import OneBlob
+from regnf_core.schema.safe_format import parse_description
 from regnf_core.schema.tensor_check import TensorSpec
 
 GRID = {"levels": 3, "features_per_level": 2, "log2_table_size": 9, "base_resolution": 4, "per_level_scale": 2.0}

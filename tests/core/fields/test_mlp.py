@@ -13,10 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import SdfField, differentiable_signed_distance
 from regnf_core.fields.build import build_field, open_field
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import write_safe_field
+from regnf_core.fields.observation import SdfField, differentiable_signed_distance
+from regnf_core.schema.safe_format import parse_description, write_safe_field
 from tests.core.fields.reference import central_differences
 
 Array = NDArray[Any]

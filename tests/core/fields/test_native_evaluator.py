@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from regnf_core.fields.geometry_mlp import GeometryMlp
+from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.fields.native.evaluator import NativeEvaluator, native_evaluator, suits
 from regnf_core.fields.neus_facto import NeusFactoField
-from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_core.fields.positional_encoding import PositionalEncoding
+from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from tests.core.fields.native_builds import variants
 from tests.core.fields.reference import central_differences, field_slowly
 from tests.core.fields.small_field import GRID, tensors
-from tests.core.fields.test_neus_facto_planes import function as stored_function
-from tests.core.fields.test_neus_facto_planes import places as points_around
+from tests.core.fields.small_field import function as stored_function
+from tests.core.fields.small_field import places as points_around
 
 BOUNDS = torch.tensor([[-1.0] * 3, [1.0] * 3])
 NAMES = ("avx512", "avx2", "plain")

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.neus_facto import NeusFactoField, build_neus_facto
-from regnf_core.schema.parsing import parse_description
+from regnf_core.fields.observation import SdfField
+from regnf_core.schema.safe_format import parse_description
 from tests.core.fields.reference import central_differences, field_slowly
 from tests.core.fields.small_field import GRID, description, tensors
 from tests.devdata import dev_data

@@ -9,13 +9,11 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.build import open_field
-from regnf_core.fields.counting import CountingField
-from regnf_core.fields.observation import Observation, ObservedField, observation_of
-from regnf_core.fields.scaled import ScaledField
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.build import ScaledField, open_field
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.observation import CountingField, Observation, ObservedField, observation_of
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN, ObservationGrid
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from tests.core.analytic import sphere
 from tests.core.fields.small_field import description, tensors

@@ -12,13 +12,13 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.fields.onnx.graph import OPERATOR_FUNCTIONS
 from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.onnx_operators import MAX_ELEMENTS, OPERATORS, SHAPE_ONLY
-from regnf_core.schema.parsing import description_to_dict, parse_description
+from regnf_core.schema.safe_format import description_to_dict, parse_description
 from tests.core.importing.onnx_models import Initializers, model, nodes, sphere
 
 RNG = np.random.default_rng(0)

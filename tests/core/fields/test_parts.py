@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.fields.contraction import contract_linf, pull_back_linf
-from regnf_core.fields.geometry_mlp import GeometryMlp
-from regnf_core.fields.positional_encoding import PositionalEncoding
+from regnf_core.fields.color_head import PositionalEncoding
+from regnf_core.fields.neus_facto_function import GeometryMlp, contract_linf, pull_back_linf
 
 
 def test_contraction_by_hand() -> None:

@@ -16,8 +16,7 @@ from safetensors.numpy import load_file, save_file
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field, open_field
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import read_description, write_safe_field
+from regnf_core.schema.safe_format import parse_description, read_description, write_safe_field
 from tests.core.fields.small_field import GRID, description, tensors
 
 Tensors = dict[str, np.ndarray[Any, Any]]

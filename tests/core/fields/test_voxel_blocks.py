@@ -11,11 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field, open_field
-from regnf_core.fields.color import ColoredField, has_color
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import write_safe_field
+from regnf_core.fields.observation import ColoredField, SdfField, has_color
+from regnf_core.schema.safe_format import parse_description, write_safe_field
 from regnf_core.schema.tensor_check import TensorSpec
 from tests.core.fields.grids import numeric_gradient, slow_trilinear
 

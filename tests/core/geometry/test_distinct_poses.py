@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.geometry.pose_distance import displacement, distinct
+from regnf_core.geometry.metrics import displacement, distinct
 from regnf_core.geometry.sim3 import Sim3
 
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from regnf_core.geometry.euler import euler_from_rotation, rotation_from_euler
+from regnf_core.geometry.metrics import euler_from_rotation, rotation_from_euler
 from regnf_core.geometry.sim3 import Sim3
 
 _angle = st.floats(-3.1, 3.1)

@@ -10,7 +10,10 @@ from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.geometry.metrics import (
+    ContinuousSymmetry,
+    Symmetries,
     add_s,
+    diameter,
     errors_against_truth,
     euler_rmse,
     mssd,
@@ -19,9 +22,7 @@ from regnf_core.geometry.metrics import (
     scale_error,
     translation_rmse,
 )
-from regnf_core.geometry.points import diameter
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.geometry.symmetry import ContinuousSymmetry, Symmetries
 
 SQUARE = torch.tensor([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]], dtype=torch.float64)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.geometry.points import NearestNeighbors, diameter, gaps
+from regnf_core.geometry.metrics import NearestNeighbors, diameter, gaps
 
 
 def cloud(count: int, seed: int) -> torch.Tensor:

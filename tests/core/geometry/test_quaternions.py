@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from regnf_core.geometry.quaternions import matrix_from_quaternion, quaternion_from_matrix
+from regnf_core.geometry.exponential_map import matrix_from_quaternion, quaternion_from_matrix
 from regnf_core.rotations import rotation_rows
 
 

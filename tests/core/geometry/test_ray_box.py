@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.geometry.ray_box import ray_box_interval
+from regnf_core.geometry.box import ray_box_interval
 
 LOW, HIGH = torch.tensor([-1.0, -2.0, 0.0]).double(), torch.tensor([1.0, 2.0, 4.0]).double()
 

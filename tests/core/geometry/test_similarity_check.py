@@ -10,7 +10,7 @@ import torch
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.geometry.similarity_check import TOLERANCE, similarity_fault
+from regnf_core.rotations import TOLERANCE, similarity_fault
 
 NAN, INF = float("nan"), float("inf")
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from regnf_core.fields.build import build_field
-from regnf_core.fields.color import has_color
+from regnf_core.fields.observation import has_color
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.gate.cost_estimate import with_affordable_color
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import parse_description
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.test_families import ANGELO_GRID

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.schema.safe_format import read_description

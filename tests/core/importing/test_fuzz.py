@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.container import TorchArchive, read_archive
+from regnf_core.importing.containers.legacy_container import TorchArchive, read_archive
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.importing.families import convert_checkpoint

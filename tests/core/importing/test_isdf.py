@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core.fields.build import open_field
-from regnf_core.fields.positional_encoding import _ICOSAHEDRON
+from regnf_core.fields.color_head import _ICOSAHEDRON
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.fields.grids import numeric_gradient

@@ -15,9 +15,9 @@ from benchmarks.trainer_runs.run import WrittenRun
 from benchmarks.trainer_runs.trainers.monosdf import write_monosdf
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
-from regnf_core.importing.gate.ambiguity import AmbiguousError
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.reading import Companions
+from regnf_core.importing.gate.readings_beside import AmbiguousError
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.schema.safe_format import read_description
 from tests.core.importing.archives import assert_refused

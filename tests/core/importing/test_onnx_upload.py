@@ -21,8 +21,7 @@ from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.onnx import model as reader
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import write_safe_field
+from regnf_core.schema.safe_format import parse_description, write_safe_field
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.in_process import convert
 from tests.core.importing.onnx_models import model, nodes, sphere

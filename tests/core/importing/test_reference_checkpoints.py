@@ -12,7 +12,7 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
-from regnf_core.fields.color import has_color
+from regnf_core.fields.observation import has_color
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.report import ImportLimits

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.container import read_archive
+from regnf_core.importing.containers.legacy_container import read_archive
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.pickle.pickle_reader import read_pickle

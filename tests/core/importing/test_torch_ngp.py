@@ -12,8 +12,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.schema.hash_grid_config import HashGridConfig

@@ -13,9 +13,9 @@ import trimesh
 from numpy.typing import NDArray
 from safetensors import safe_open
 
+from regnf_core.errors import HINTS
 from regnf_core.fields.build import open_field
-from regnf_core.fields.color import has_color
-from regnf_core.hints import HINTS
+from regnf_core.fields.observation import has_color
 from regnf_core.importing.containers.euclidean import PROJECTIVE
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits

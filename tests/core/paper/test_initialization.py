@@ -10,9 +10,9 @@ from regnf_core.geometry.metrics import rotation_error
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import InitializationOptions, SamplingOptions
-from regnf_core.paper.initialization import initial_transform
+from regnf_core.paper.pipeline import initial_transform
 from regnf_core.paper.sampling import sample_object, sample_scene
-from regnf_core.surface.field_residuals import mean_residual
+from regnf_core.surface.result_clouds import mean_residual
 from tests.core.analytic import chair, chair_box, chair_pose, room
 
 OPTIONS = InitializationOptions()

@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import quad
 from scipy.special import k1
 
-from regnf_core.paper.kernel import SHAPE_RANGE, AdaptiveKernel, log_partition, robust_kernel
+from regnf_core.paper.optimization import SHAPE_RANGE, AdaptiveKernel, log_partition, robust_kernel
 
 R = torch.tensor([0.0, 1.0, -1.0, 3.0], dtype=torch.float64)
 

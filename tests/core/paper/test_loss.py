@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.paper.kernel import AdaptiveKernel, log_partition, robust_kernel
-from regnf_core.paper.loss import SampleSet, bidirectional_loss, regularizer, residuals
+from regnf_core.paper.optimization import (
+    AdaptiveKernel,
+    SampleSet,
+    bidirectional_loss,
+    log_partition,
+    regularizer,
+    residuals,
+    robust_kernel,
+)
 from tests.core.analytic import chair, chair_pose, room, sphere
 
 DOUBLED = Sim3.from_quaternion(2.0, [0, 0, 0, 1], [0.1, 0.0, 0.0])

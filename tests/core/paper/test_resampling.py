@@ -6,8 +6,7 @@ import torch
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import ResamplingOptions
-from regnf_core.paper.loss import SampleSet
-from regnf_core.paper.resampling import field_radius, resample
+from regnf_core.paper.optimization import SampleSet, field_radius, resample
 from tests.core.analytic import sphere
 
 OPTIONS = ResamplingOptions()

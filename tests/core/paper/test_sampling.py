@@ -14,8 +14,7 @@ from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfac
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene
-from regnf_core.surface.cameras import Rays, cast_rays
-from regnf_core.surface.surface_bounds import surface_bounds
+from regnf_core.surface.sphere_tracing import Rays, cast_rays, surface_bounds
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere
 
 OPTIONS = SamplingOptions(pixel_stride=16)

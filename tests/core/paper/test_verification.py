@@ -11,9 +11,9 @@ from regnf_core.errors import NoSurfaceError
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import SamplingOptions
+from regnf_core.paper.pipeline import INLIER_DISTANCE, Verification, evaluate, verify
 from regnf_core.paper.sampling import sample_scene
-from regnf_core.paper.verification import INLIER_DISTANCE, Verification, evaluate, verify
-from regnf_core.surface.surface_bounds import surface_bounds
+from regnf_core.surface.sphere_tracing import surface_bounds
 from tests.core.analytic import chair, chair_box, chair_pose, room, table
 
 OPTIONS = SamplingOptions()

@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 
 from regnf_core import Camera, RenderOptions, render
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.counting import CountingField
-from regnf_core.rendering.beams import free_start
-from regnf_core.rendering.distance_grid import DistanceGrid
-from regnf_core.rendering.tracing import Region, Start
-from regnf_core.surface.cameras import Rays
+from regnf_core.fields.observation import CountingField, SdfField
+from regnf_core.rendering.render import free_start
+from regnf_core.rendering.tracing import DistanceGrid, Region, Start
+from regnf_core.surface.sphere_tracing import Rays
 from tests.core.analytic import AnalyticField, boxes, sphere
 
 SIZE = (64, 48)

@@ -12,8 +12,7 @@ from regnf_core import Camera, RegnfError, RenderOptions, render
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.processes import can_fork
-from regnf_core.rendering.frame import NOTHING
-from regnf_core.rendering.paths import Orbit
+from regnf_core.rendering.camera import NOTHING, Orbit
 from regnf_core.rendering.render import render_frames
 from tests.core.analytic import AnalyticField, boxes, sphere
 

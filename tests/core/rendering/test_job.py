@@ -14,7 +14,7 @@ from PIL import Image
 
 from regnf_core import Sim3, open_field
 from regnf_core.errors import CancelledError, RegnfError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.rendering.job import run_render
 from regnf_core.rendering.request import RenderRequest
 from tests.core.analytic import AnalyticField, boxes, sphere

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from regnf_core.fields.observation import Observation, ObservedField
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from tests.core.analytic import AnalyticField, boxes, chair_pose, room, seen_from, union
 
 UNDER_THE_SEAT = ([-0.26, -0.27, -0.41], [0.26, 0.27, -0.03])

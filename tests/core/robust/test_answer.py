@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.model.object_model import model_object
+from regnf_core.robust.model import model_object
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.verdict.answer import Answer, choose
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import pose_odds
+from regnf_core.robust.verdict.answer import Answer, choose, pose_odds
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 from tests.core.analytic import boxes
 
 LONG = ([-0.4, -0.1, -0.1], [0.4, 0.1, 0.1])

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from regnf_core.registration import register
+from regnf_core.library import register
 from regnf_core.robust.constants import VERDICT
-from regnf_core.robust.search.features import feature_seeds
+from regnf_core.robust.search.distance_grid import feature_seeds
 from tests.core.analytic import chair, chair_pose, room
 from tests.core.robust.shapes import ROBUST, can, detection, placement_error
 

@@ -6,11 +6,9 @@ import pytest
 import torch
 
 from regnf_core.fields.observation import Observation, ObservedField
-from regnf_core.robust.clearance import clearance
 from regnf_core.robust.constants import OCCLUSION
-from regnf_core.robust.sampling import sample_object_surface
-from regnf_core.robust.working_frame import WorkingFrame, WorkingObservation
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.robust.working_frame import WorkingFrame, WorkingObservation, clearance, sample_object_surface
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from tests.core.analytic import boxes
 
 COUNT, VOXEL, MIDDLE = 40, 0.05, 20

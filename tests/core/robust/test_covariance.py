@@ -12,9 +12,8 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import COVARIANCE
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
-from regnf_core.robust.sampling import sample_object_surface
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors
-from regnf_core.robust.working_frame import WorkingFrame
+from regnf_core.robust.working_frame import WorkingFrame, sample_object_surface
 from tests.core.analytic import chair
 from tests.core.robust.shapes import random_pose
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.verdict.coverage import coverage
+from regnf_core.robust.verdict.evidence import coverage
 
 CENTERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
 

@@ -14,9 +14,9 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions, RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.verdict.criteria import PoseVerdict, evaluate_pose
+from regnf_core.robust.verdict.evaluation import PoseVerdict, evaluate_pose
 from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidence
+from regnf_core.robust.working_frame import Samples
 
 D = torch.float64
 UP = torch.tensor([0.0, 0.0, 1.0])

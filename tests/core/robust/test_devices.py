@@ -15,31 +15,23 @@ from torch import Tensor
 from regnf_core import OrientedBox, open_field
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import Observation
-from regnf_core.geometry.points import NearestNeighbors, nearest_of_all
+from regnf_core.geometry.metrics import NearestNeighbors, nearest_of_all
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from regnf_core.registration import register
-from regnf_core.robust import devices, working_frame
-from regnf_core.robust.fused.parts import parts_of
-from regnf_core.robust.fused.stacking import StackedSurfaces
-from regnf_core.robust.model.object_model import model_object
+from regnf_core.robust import working_frame
+from regnf_core.robust.model import model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.refine import levenberg_marquardt
-from regnf_core.robust.refine.coarse_to_fine import refined
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.refine.loss import adaptive_width, normal_equations
-from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.scene.occlusion_boundary import SingleView
-from regnf_core.robust.scene.scene_view import view_scene
+from regnf_core.robust.scene import SingleView, view_scene
 from regnf_core.robust.search import distance_grid
-from regnf_core.robust.search.scale_bound import ScaleBound, ScaleBounds
-from regnf_core.robust.stage import Stage
-from regnf_core.robust.verdict import pose_features as features_module
-from regnf_core.robust.verdict.evidence import gather_evidence
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR, pose_features
-from regnf_core.robust.working_frame import WorkingField, WorkingFrame
+from regnf_core.robust.search.bounds import ScaleBound
+from regnf_core.robust.verdict import evidence as features_module
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR, gather_evidence, pose_features
+from regnf_core.robust.working_frame import Samples, WorkingField, WorkingFrame
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
 from tests.core.robust.elsewhere import ELSEWHERE, Border
 from tests.core.robust.shapes import ROBUST, detection
@@ -133,27 +125,6 @@ def test_iterations_read_and_copy_nothing(neural: RegistrationProblem, max_offse
     assert border.copies == []
 
 
-@pytest.mark.parametrize("on_grids", [False, True])
-def test_iterations_of_several_pairs_read_and_copy_nothing(neural: RegistrationProblem, on_grids: bool) -> None:
-    pair, stage = observed(neural.fit), Stage(200, (0.03, 0.02), 0.02, keep=8, widest=0.04)
-    if on_grids:
-        pair = replace(pair, scene=neural.view.distance_grid, obj=neural.model.distance_grid)
-    few = [pair.subsample(limit, torch.Generator().manual_seed(0)) for limit in (150, 200)]
-    stacked = StackedSurfaces.of(few, stage.points)
-    parts = list(parts_of([20, 30], 32, ELSEWHERE))
-    candidates = PoseCandidates.start(poses(32), with_offsets=True)
-    assert len(parts) == 2
-    for part in parts:
-        there = stacked.of_part(part)
-        lengths = torch.ones(32, dtype=torch.float64, device=ELSEWHERE)
-        settings = Settings(stage.widest, ScaleBounds(lengths, lengths), lengths)
-        with Border() as border:
-            found = refined(there.pair, candidates, stage, settings, lambda: None)
-            broken = there.faulty()
-        assert found.scores.device == broken.device == ELSEWHERE
-        assert border.copies == []
-
-
 def test_evidence_and_features_stay_on_the_device(neural: RegistrationProblem, monkeypatch: pytest.MonkeyPatch) -> None:
     """But for the samples that are unexplained: which they are is read, once for a verdict."""
     states = Observation(torch.zeros(4, 4, 4, dtype=torch.uint8), torch.zeros(3).double(), 0.1)
@@ -226,15 +197,15 @@ def test_every_module_that_asks_where_a_tensor_is_was_asked_here() -> None:
         for name, module in sys.modules.items()
         if name.startswith("regnf_core.") and isinstance(module, ModuleType) and hasattr(module, "on_host")
     }
-    assert asking - {devices} == set(BRANCHING)
+    assert asking == set(BRANCHING)
 
 
 def test_where_float64_is_missing_the_cpu_works() -> None:
     def on(device: str) -> torch.device:
         field = sphere(1.0)
         monkeyed = type("Elsewhere", (type(field),), {"device": property(lambda self: torch.device(device))})
-        return devices.working_device(monkeyed(field.formula, field.bounds.tolist()))
+        return working_frame.working_device(monkeyed(field.formula, field.bounds.tolist()))
 
     assert [on(device).type for device in ("cpu", "cuda", "mps")] == ["cpu", "cuda", "cpu"]
-    assert devices.on_host(torch.zeros(1))
-    assert not devices.on_host(Tensor(torch.zeros(1, device=ELSEWHERE)))
+    assert working_frame.on_host(torch.zeros(1))
+    assert not working_frame.on_host(Tensor(torch.zeros(1, device=ELSEWHERE)))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from regnf_core.fields.transformed import TransformedField
-from regnf_core.geometry.pose_distance import displacement
-from regnf_core.robust.model.object_model import model_object
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.search.features import feature_seeds
+from regnf_core.fields.composite import TransformedField
+from regnf_core.geometry.metrics import displacement
+from regnf_core.robust.model import model_object
+from regnf_core.robust.search.distance_grid import feature_seeds
+from regnf_core.robust.working_frame import Samples
 from tests.core.analytic import AnalyticField, sphere, union
 from tests.core.robust.shapes import random_pose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.robust.model.hull import Hull
+from regnf_core.robust.model import Hull
 
 CORNERS = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3) * torch.tensor([1.0, 2.0, 3.0])
 

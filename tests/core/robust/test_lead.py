@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.model.self_symmetry import SelfSymmetry
-from regnf_core.robust.search.rotations import turns_about
-from regnf_core.robust.verdict.lead import apart, apart_from_answer, leads, merits
+from regnf_core.robust.model import SelfSymmetry
+from regnf_core.robust.search.bounds import turns_about
+from regnf_core.robust.verdict.answer import apart, apart_from_answer, leads, merits
 
 POINTS = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -7,19 +7,19 @@ from itertools import pairwise
 import pytest
 import torch
 
-from regnf_core.geometry.pose_distance import displacement
+from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.kernel import (
+from regnf_core.robust.refine.levenberg_marquardt import minimize
+from regnf_core.robust.refine.loss import robust_cost
+from regnf_core.robust.residuals import (
+    SurfacePair,
     geman_mcclure_agreement,
     geman_mcclure_curvature,
     geman_mcclure_loss,
     geman_mcclure_weight,
+    residuals,
 )
-from regnf_core.robust.refine.levenberg_marquardt import minimize
-from regnf_core.robust.refine.loss import robust_cost
-from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.samples import subsample
-from regnf_core.robust.sampling import sample_object_surface
+from regnf_core.robust.working_frame import sample_object_surface, subsample
 from tests.core.analytic import chair, seen_from
 from tests.core.robust.shapes import random_pose
 

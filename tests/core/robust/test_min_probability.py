@@ -33,12 +33,9 @@ def ambiguous(options: RegistrationOptions) -> RegistrationResult:
     return register(table_room(chair_pose(1.4)), slab_table(), SLAB_BOX, options, clouds=False)
 
 
-def in_batch(options: RegistrationOptions, memory: int | None) -> RegistrationResult:
-    """One pair after the other, or in lock step where the memory is given."""
-    values = options.to_dict()
-    values["robust"]["batch_memory"] = memory
+def in_batch(options: RegistrationOptions) -> RegistrationResult:
     box = chair_box(chair_pose())
-    found = register_batch(room(chair_pose()), [box], [chair()], options=RegistrationOptions.from_dict(values))
+    found = register_batch(room(chair_pose()), [box], [chair()], options=options)
     assert found[0].result is not None
     return found[0].result
 
@@ -57,8 +54,7 @@ WAYS: dict[str, Way] = {
     "register": registered,
     "from a start": started,
     "ambiguous": ambiguous,
-    "batch": partial(in_batch, memory=None),
-    "fused batch": partial(in_batch, memory=2**26),
+    "batch": in_batch,
     "search": searched,
 }
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.geometry.pose_distance import displacement
+from regnf_core.geometry.metrics import displacement
 from regnf_core.robust.constants import REFINEMENT, SEARCH
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.refine.loss import disagreement, normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair
-from regnf_core.robust.sampling import sample_object_surface
+from regnf_core.robust.working_frame import sample_object_surface
 from tests.core.analytic import boxes, union
 
 D = torch.float64

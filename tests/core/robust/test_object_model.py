@@ -9,11 +9,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.transformed import TransformedField
-from regnf_core.registration import WarmStart, register
-from regnf_core.robust.model.model_file import MODEL_VERSION, read_object_model, write_object_model
-from regnf_core.robust.model.object_model import model_object
-from regnf_core.robust.model.signature import SIGNATURE_LENGTH, signature
+from regnf_core.fields.composite import TransformedField
+from regnf_core.library import WarmStart, register
+from regnf_core.robust.model import (
+    MODEL_VERSION,
+    SIGNATURE_LENGTH,
+    model_object,
+    read_object_model,
+    signature,
+    write_object_model,
+)
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, table
 from tests.core.robust.shapes import ROBUST, can, detection, random_pose, slab_table
 
@@ -81,7 +86,7 @@ def test_the_signature_does_not_depend_on_the_frame_and_tells_shapes_apart() -> 
 
 
 def test_the_signature_of_two_points_is_what_the_bins_say() -> None:
-    from regnf_core.robust.samples import Samples
+    from regnf_core.robust.working_frame import Samples
 
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     up = torch.tensor([[0.0, 0.0, 1.0]] * 2)

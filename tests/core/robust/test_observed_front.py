@@ -11,12 +11,9 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.sampling import sample_object_surface
-from regnf_core.robust.scene.occlusion_boundary import SingleView
-from regnf_core.robust.scene.scene_view import view_scene
-from regnf_core.robust.working_frame import WorkingFrame, WorkingObservation
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.robust.scene import SingleView, view_scene
+from regnf_core.robust.working_frame import Samples, WorkingFrame, WorkingObservation, sample_object_surface
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from tests.core.analytic import AnalyticField
 
 COUNT, VOXEL = 20, 0.1

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import Observation, ObservedField
-from regnf_core.fields.transformed import TransformedField
-from regnf_core.registration import register
-from regnf_core.robust.model.object_model import model_object
-from regnf_core.robust.sampling import sample_object_surface
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.library import register
+from regnf_core.robust.model import model_object
+from regnf_core.robust.working_frame import sample_object_surface
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, union
 from tests.core.robust.shapes import ROBUST, detection, placement_error, random_pose
 

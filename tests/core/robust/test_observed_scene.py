@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.composite import TransformedField
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.registration import register
+from regnf_core.library import register
 from tests.core.analytic import boxes, chair, chair_pose, room, union
 from tests.core.robust.seen_in_part import CUSHION, UNDER_THE_SEAT, observed, over_closed
 from tests.core.robust.shapes import ROBUST, detection, placement_error, random_pose

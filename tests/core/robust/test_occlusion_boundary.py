@@ -7,8 +7,8 @@ from torch import Tensor
 
 from regnf_core.robust.refine.loss import normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.scene.occlusion_boundary import occlusion_boundary
+from regnf_core.robust.scene import occlusion_boundary
+from regnf_core.robust.working_frame import Samples
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.refine.loss import normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
-from regnf_core.robust.sampling import sample_object_surface
+from regnf_core.robust.working_frame import sample_object_surface
 from tests.core.analytic import AnalyticField, chair, chair_pose, room
 from tests.core.robust.shapes import detection, run
 

@@ -9,11 +9,11 @@ import torch
 
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from regnf_core.registration import register
 from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.pipeline import WarmStart
-from regnf_core.robust.search.pose_bound import PoseBound
+from regnf_core.robust.search.bounds import PoseBound
 from tests.core.robust.shapes import random_pose, reframed
 
 CORNERS = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)

@@ -9,11 +9,11 @@ import torch
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.robust.model.object_model import model_object
+from regnf_core.robust.model import model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.residuals import residuals
-from regnf_core.robust.scene.scene_view import view_scene
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR, pose_features
+from regnf_core.robust.scene import view_scene
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR, pose_features
 from tests.core.analytic import chair, chair_pose, room
 from tests.core.robust.shapes import detection
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from regnf_core.robust.constants import VERDICT
-from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import LEAD, PoseOdds, ProbabilityModel, pose_odds
+from regnf_core.robust.verdict.answer import LEAD, PoseOdds, ProbabilityModel, pose_odds
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 STORED: dict[str, Any] = {
     "bias": 2.0,

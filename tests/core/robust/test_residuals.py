@@ -8,7 +8,7 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.samples import Samples
+from regnf_core.robust.working_frame import Samples
 from tests.core.robust.shapes import random_pose
 
 SCALES = [0.05, 1.0, 20.0]

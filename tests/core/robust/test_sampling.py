@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidDetectionError, NoSurfaceError
-from regnf_core.fields.counting import CountingField
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.robust.sampling import sample_object_surface, sample_scene_surface
-from regnf_core.robust.scene.support_planes import support_planes
+from regnf_core.robust.scene import support_planes
+from regnf_core.robust.search.bounds import super_fibonacci, turns_about
 from regnf_core.robust.search.distance_grid import DistanceGrid
-from regnf_core.robust.search.rotations import super_fibonacci, turns_about
+from regnf_core.robust.working_frame import sample_object_surface, sample_scene_surface
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
 from tests.core.robust.shapes import detection, random_pose
 

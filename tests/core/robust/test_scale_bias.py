@@ -11,7 +11,7 @@ from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.refine.loss import normal_equations, observed_weight, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair
-from regnf_core.robust.samples import Samples
+from regnf_core.robust.working_frame import Samples
 from tests.core.robust.shapes import random_pose
 
 D = torch.float64

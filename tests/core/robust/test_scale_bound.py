@@ -9,14 +9,13 @@ import torch
 
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import register
 from regnf_core.options import RegistrationOptions, RobustOptions
-from regnf_core.registration import register
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.residuals import SurfacePair
-from regnf_core.robust.sampling import sample_object_surface
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
-from regnf_core.robust.search.seeds import seed_poses
+from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBound, seed_poses
 from regnf_core.robust.verdict.covariance import with_known_scale
+from regnf_core.robust.working_frame import sample_object_surface
 from tests.core.analytic import chair
 from tests.core.robust.shapes import placement_error, random_pose, reframed
 

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.scene.smoothing import smooth
-from regnf_core.robust.scene.support_planes import support_planes
+from regnf_core.robust.scene import smooth, support_planes
+from regnf_core.robust.working_frame import Samples
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.residuals import SurfacePair
-from regnf_core.robust.samples import Samples
-from regnf_core.robust.verdict.unexplained_surface import unexplained_samples
+from regnf_core.robust.verdict.evidence import unexplained_samples
+from regnf_core.robust.working_frame import Samples
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 

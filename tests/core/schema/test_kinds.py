@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.schema.kinds import KINDS
-from regnf_core.schema.parsing import description_to_dict, parse_description
+from regnf_core.schema.safe_format import description_to_dict, parse_description
 from tests.core.fields.small_field import description, tensors
 
 

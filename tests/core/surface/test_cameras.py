@@ -7,7 +7,7 @@ import torch
 
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis
-from regnf_core.surface.cameras import camera_positions, cast_rays
+from regnf_core.surface.sphere_tracing import camera_positions, cast_rays
 
 
 def test_cameras_stand_on_the_upper_half_sphere_and_apart() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.surface.field_residuals import object_residuals, scene_residuals
+from regnf_core.surface.result_clouds import object_residuals, scene_residuals
 from tests.core.analytic import sphere
 
 

@@ -12,7 +12,7 @@ import trimesh
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField
 from regnf_core.surface.isosurface import Lattice, Surface, extract_surface
 
 

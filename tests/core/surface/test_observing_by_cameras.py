@@ -17,7 +17,7 @@ from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.importing.observing.trajectory import Array, Axes, Intrinsics, Trajectory, trajectory_of
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_core.surface.observing import observe_by_cameras
 
 POINTS = 1_500_000

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.fields.counting import CountingField
-from regnf_core.surface.projection import newton_step, project_to_surface
+from regnf_core.fields.observation import CountingField
+from regnf_core.surface.result_clouds import newton_step, project_to_surface
 from tests.core.analytic import sphere
 
 

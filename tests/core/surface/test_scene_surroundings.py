@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.surface.scene_surroundings import sample_surroundings
+from regnf_core.surface.result_clouds import sample_surroundings
 from tests.core.analytic import AnalyticField, sphere
 
 FLOOR_AND_BALL = AnalyticField(

@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.fields.counting import CountingField
-from regnf_core.surface.cameras import Rays
-from regnf_core.surface.sphere_tracing import first_hits
+from regnf_core.fields.observation import CountingField
+from regnf_core.surface.sphere_tracing import Rays, first_hits
 from tests.core.analytic import AnalyticField, boxes, sphere
 
 

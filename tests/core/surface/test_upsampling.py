@@ -7,7 +7,7 @@ import torch
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import SamplingOptions
 from regnf_core.paper.sampling import sample_scene
-from regnf_core.surface.upsampling import upsample
+from regnf_core.surface.result_clouds import upsample
 from tests.core.analytic import sphere
 
 OPTIONS = SamplingOptions(pixel_stride=16)

@@ -9,19 +9,21 @@ import pytest
 import torch
 import trimesh
 
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.viewing.display_mesh import (
+from regnf_core.viewing.field_views import (
     COARSE_TRIANGLES,
     FINE_TRIANGLES,
     FINE_VERTICES,
     TooSlowError,
+    Triangles,
+    at_most,
+    clustered,
     display_meshes,
+    mesh_file,
 )
-from regnf_core.viewing.mesh_file import mesh_file
-from regnf_core.viewing.vertex_clustering import Triangles, at_most, clustered
 from tests.core.analytic import sphere
 
 

@@ -247,7 +247,7 @@ def test_a_full_disk_leaves_what_was_there(
 
 ALONE = """
 import os, sys, psutil, regnf
-import regnf_core.api.registered
+import regnf_core.api
 room, chair, path = sys.argv[1:]
 box = regnf.OrientedBox.from_corners([-0.84, -0.59, -0.50], [-0.29, 0.02, 0.02])
 result = regnf.register(room, chair, box)

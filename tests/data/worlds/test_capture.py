@@ -10,17 +10,26 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.random_worlds.fusing import (
+    BLACK,
+    GLOSSY,
+    PLAIN,
+    Capture,
+    Fusion,
+    RandomSensor,
+    capture,
+    draw_sensor,
+    drifted,
+    fuse,
+    mean_motion,
+    rendered_sensor,
+)
+from benchmarks.random_worlds.mesh import Array, ExactScene, ExactView, Mesh, ball, box, turned
+from benchmarks.random_worlds.models import Model
+from benchmarks.random_worlds.symmetries import measure_symmetries
 from regnf_core.fields.build import open_field
 from regnf_data.sensor import DepthSensor
 from regnf_data.trajectories import look_at
-from regnf_data.worlds.capture import Capture, capture
-from regnf_data.worlds.drift import drifted, mean_motion
-from regnf_data.worlds.exact import ExactScene, ExactView
-from regnf_data.worlds.fusing import Fusion, fuse
-from regnf_data.worlds.mesh import Array, Mesh, ball, box, turned
-from regnf_data.worlds.models import Model
-from regnf_data.worlds.sensors import BLACK, GLOSSY, PLAIN, RandomSensor, draw_sensor, rendered_sensor
-from regnf_data.worlds.symmetries import measure_symmetries
 
 SIZE = (60, 80)
 EXACT = RandomSensor(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from regnf_data.worlds.mesh import Array, Mesh, box, together
-from regnf_data.worlds.models import Model
+from benchmarks.random_worlds.mesh import Array, Mesh, box, together
+from benchmarks.random_worlds.models import Model
 
 
 def seen(mesh: Mesh) -> Array:

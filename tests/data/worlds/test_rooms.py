@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from regnf_data.worlds.mesh import ball, block, box, turned
-from regnf_data.worlds.models import Catalog, Model
-from regnf_data.worlds.placing import GAP_M, Placed, collides, rest, resting_turns, touching
-from regnf_data.worlds.rooms import KINDS, Kind, World, make_world
+from benchmarks.random_worlds.mesh import ball, block, box, turned
+from benchmarks.random_worlds.models import Catalog, Model
+from benchmarks.random_worlds.placing import GAP_M, Placed, collides, rest, resting_turns, touching
+from benchmarks.random_worlds.walks import KINDS, Kind, World, make_world
 
 FLOOR = Placed(None, np.eye(4), box((-2.0, -2.0, -0.1), (2.0, 2.0, 0.0)))
 UP = np.eye(4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import islice
 
-from regnf_data.worlds.split import PARTS, families, part_of, part_of_world, seeds_of
+from benchmarks.random_worlds.models import PARTS, families, part_of, part_of_world, seeds_of
 
 
 def test_a_name_always_belongs_to_the_same_part() -> None:

@@ -6,10 +6,10 @@ import torch
 
 from regnf_core.fields.build import open_field
 from regnf_core.geometry.exponential_map import rotation_exp
-from regnf_fit.images.camera_poses import CameraPoses, PoseErrors, expected_errors
-from regnf_fit.images.depth_spread import NO_SPREAD, DepthSpread
 from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.observing import NO_SPREAD, DepthSpread
 from regnf_fit.images.preparation import prepare
+from regnf_fit.images.trainer import CameraPoses, PoseErrors, expected_errors
 from tests.fit.images import scenes
 from tests.fit.images.test_reconstruct import SMALL, StoppedError, surface_errors
 

@@ -10,9 +10,9 @@ import pytest
 
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.capacity import suited
-from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.images.fit import suited
 from regnf_fit.images.preparation import prepare
+from regnf_fit.options import ReconstructionOptions
 from tests.fit.images import scenes
 
 

@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from regnf_core.fields.build import build_field
-from regnf_core.fields.color import has_color
-from regnf_core.schema.parsing import parse_description
-from regnf_fit.images.color_export import stored_color
-from regnf_fit.images.coloring import SurfaceColor, appearance_of, fit_color
-from regnf_fit.images.held_out import first_hits
+from regnf_core.fields.observation import has_color
+from regnf_core.schema.safe_format import parse_description
+from regnf_fit.images.coloring import RadianceField, SurfaceColor, appearance_of, first_hits, fit_color
+from regnf_fit.images.fit import stored_color
 from regnf_fit.images.held_out_images import held_out_images, structural_similarity
-from regnf_fit.images.network import RadianceField
-from regnf_fit.images.rays import PixelRays
+from regnf_fit.images.preparation import PixelRays
 from regnf_fit.network import StartShape
 from tests.fit.images.test_reconstruct import SMALL
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from regnf_fit.images.depth_normals import local_planes
+from regnf_fit.images.observing import local_planes
 
 
 def test_cosines_on_a_slanted_plane():

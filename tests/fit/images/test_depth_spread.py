@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from regnf_fit.images.depth_normals import local_planes
-from regnf_fit.images.depth_spread import depth_spread
+from regnf_fit.images.observing import depth_spread, local_planes
 from tests.fit.images import scenes
 
 COUNT = 60

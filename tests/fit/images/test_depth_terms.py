@@ -9,11 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_fit.images.depth_supervision import DepthSupervision, supervise
-from regnf_fit.images.depth_terms import depth_terms
-from regnf_fit.images.options import ReconstructionOptions
-from regnf_fit.images.preparation import prepare
-from regnf_fit.images.rays import PixelRays
+from regnf_fit.images.depth_supervision import DepthSupervision, depth_terms, supervise
+from regnf_fit.images.preparation import PixelRays, prepare
+from regnf_fit.options import ReconstructionOptions
 from tests.fit.images import scenes
 
 DEVIATION = 0.02

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.box import OrientedBox
-from regnf_fit.images.detail import in_boxes, uneven
+from regnf_fit.images.preparation import in_boxes, uneven
 
 SIZE = 5.0  # cells of 10 cm
 

@@ -11,14 +11,12 @@ import torch
 
 from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
-from regnf_core.fields.color import has_color
-from regnf_core.fields.observation import observation_of
-from regnf_core.schema.observation_grid import FREE, SURFACE
+from regnf_core.fields.observation import has_color, observation_of
+from regnf_core.schema.description import FREE, SURFACE
 from regnf_core.schema.safe_format import read_description
 from regnf_data.fusing import BlockGrid, DepthImages, fuse_blocks
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.fusion import FusionOptions, fuse_images
-from regnf_fit.images.measured import measured_rays
+from regnf_fit.images.fusion import FusionOptions, fuse_images, measured_rays
 from regnf_fit.images.observing import attach_observation
 from regnf_fit.images.preparation import prepare
 from tests.fit.images import scenes

@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from regnf_fit.images.color_terms import render_rays, samples_about_depth
-from regnf_fit.images.network import RadianceField
-from regnf_fit.images.options import ReconstructionOptions
-from regnf_fit.images.rays import rays_of_pixels
+from regnf_fit.images.coloring import RadianceField
+from regnf_fit.images.preparation import rays_of_pixels
+from regnf_fit.images.trainer import render_rays, samples_about_depth
 from regnf_fit.network import StartShape
+from regnf_fit.options import ReconstructionOptions
 from tests.fit.images import scenes
 
 OPTIONS = ReconstructionOptions(hidden_width=8, feature_width=4)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.held_out import HeldOutErrors, evaluate
-from regnf_fit.images.rays import rays_of_pixels
+from regnf_fit.images.coloring import HeldOutErrors, evaluate
+from regnf_fit.images.preparation import rays_of_pixels
 from tests.fit.images import scenes
 
 IMAGES = scenes.images(count=4, ball_alone=True)

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.map_distances import MapDistances, map_distances
-from regnf_fit.images.measured import measured_rays, sharp_width
+from regnf_fit.images.fusion import MapDistances, map_distances, measured_rays, sharp_width
 from regnf_fit.images.preparation import PreparedImages, prepare
 from tests.fit.images import scenes
 

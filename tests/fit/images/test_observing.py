@@ -12,12 +12,11 @@ import torch
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.depth_spread import DepthSpread
 from regnf_fit.images.fit import FitFiles, reconstruct
-from regnf_fit.images.observing import observe
-from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.images.observing import DepthSpread, observe
+from regnf_fit.options import ReconstructionOptions
 from tests.fit.images.scenes import BOUNDS, distance, images
 
 VOXELS = 48

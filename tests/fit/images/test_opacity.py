@@ -3,7 +3,7 @@ import math
 import numpy as np
 import torch
 
-from regnf_fit.images.opacity import least_sharpness, render_weights
+from regnf_fit.images.trainer import least_sharpness, render_weights
 
 
 def test_weights_of_a_ray_computed_by_hand():

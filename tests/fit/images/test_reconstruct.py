@@ -7,16 +7,15 @@ import torch
 
 from regnf_core.errors import DatasetError, FitDivergedError, InvalidInputError
 from regnf_core.fields.build import open_field
-from regnf_core.fields.color import has_color
-from regnf_core.fields.observation import observation_of
+from regnf_core.fields.observation import has_color, observation_of
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
 from regnf_fit.images import fit
+from regnf_fit.images.coloring import RadianceField
 from regnf_fit.images.fit import FitFiles, reconstruct
-from regnf_fit.images.map_distances import map_distances
-from regnf_fit.images.network import RadianceField
-from regnf_fit.images.options import LossWeights, ReconstructionOptions
+from regnf_fit.images.fusion import map_distances
 from regnf_fit.images.preparation import prepare
+from regnf_fit.options import LossWeights, ReconstructionOptions
 from tests.core.importing.in_process import convert
 from tests.fit.images import scenes
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.options import Start
 from regnf_fit.images.preparation import prepare
+from regnf_fit.options import Start
 from tests.fit.images import scenes
 
 RADIUS = 0.5

@@ -10,17 +10,16 @@ import torch
 import trimesh
 
 from regnf_core.errors import CancelledError, InvalidInputError
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
-from regnf_core.fields.composite import BoxField
+from regnf_core.fields.composite import BoxField, TransformedField
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.transformed import TransformedField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
-from regnf_fit.mesh.fit import fit_field
-from regnf_fit.mesh.options import FitOptions
+from regnf_fit.mesh import fit_field
 from regnf_fit.network import StartShape, TrainableField
+from regnf_fit.options import FitOptions
 from tests.core.analytic import AnalyticField, sphere
 
 OPTIONS = FitOptions(

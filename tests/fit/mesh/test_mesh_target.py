@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import trimesh
 
-from regnf_fit.mesh.file import mesh_target
+from regnf_fit.mesh import mesh_target
 
 TOP = trimesh.creation.box(bounds=[[-1.0, -1.0, 0.8], [1.0, 1.0, 1.0]])
 LEG = trimesh.creation.box(bounds=[[-0.2, -0.2, -1.0], [0.2, 0.2, 0.7]])

@@ -16,8 +16,7 @@ from typing import Any
 from redis import Redis
 
 from regnf_state.blobs.local import LocalBlobStore
-from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.journal.journaled_records import JournaledRecordStore, Rebuilder
 from regnf_state.manifest import Artifact, Manifest, manifest_key
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from regnf_core.importing.settings.documents import Documents, mappings
+from regnf_core.importing.settings.facts import scaled_and_moved
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.similarity import scaled_and_moved
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 _BASE = 16

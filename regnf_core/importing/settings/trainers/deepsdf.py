@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families.shared import contradiction
+from regnf_core.importing.families.layers import contradiction
 from regnf_core.importing.settings.documents import Documents, mappings
+from regnf_core.importing.settings.facts import scaled_and_moved
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.similarity import scaled_and_moved
 
 _NETWORK = "NetworkSpecs"
 _HIDDEN = "lin0.bias"

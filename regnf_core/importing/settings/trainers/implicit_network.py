@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from regnf_core.importing.families.shared import contradiction
+from regnf_core.importing.families.layers import contradiction
 from regnf_core.importing.settings.documents import Documents, mappings
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said

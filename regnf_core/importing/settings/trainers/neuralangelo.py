@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from regnf_core.importing.settings.documents import Documents, mappings
+from regnf_core.importing.settings.facts import scaled_and_moved
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.similarity import scaled_and_moved
 
 _SDF = "model.object.sdf"
 _WARM_UP = 5000

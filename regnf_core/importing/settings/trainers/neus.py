@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from regnf_core.importing.settings.documents import Documents, mappings, optional_arrays
+from regnf_core.importing.settings.facts import is_similarity
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.similarity import is_similarity
 from regnf_core.importing.settings.trainers.skips import agree_on_skips
 
 _NETWORK = "model.sdf_network"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from regnf_core.importing.families.shared import contradiction
-from regnf_core.importing.pickle.pickle_values import Placeholder
+from regnf_core.importing.families.layers import contradiction
+from regnf_core.importing.pickle.pickle_machine import Placeholder
 from regnf_core.importing.settings.documents import Documents, mappings
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said

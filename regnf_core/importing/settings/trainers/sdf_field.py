@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from regnf_core.importing.settings.documents import Documents, mappings
-from regnf_core.importing.settings.keys import Keys
-from regnf_core.importing.settings.plain import malformed
+from regnf_core.importing.settings.facts import after_scaling, inverse_of, is_similarity
+from regnf_core.importing.settings.keys import Keys, malformed
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.similarity import after_scaling, inverse_of, is_similarity
 
 _FIELD = "pipeline.model.sdf_field"
 _PREFIX = "glin"

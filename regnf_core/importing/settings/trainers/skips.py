@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from regnf_core.importing.families.shared import contradiction
+from regnf_core.importing.families.layers import contradiction
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
 

@@ -11,19 +11,24 @@ from starlette.responses import JSONResponse, Response
 from regnf_service.batches import Posting, cancel, find_batch, is_waiting, results_page, state_of
 from regnf_service.concurrency import PARSING, blocking, in_thread
 from regnf_service.http import body
-from regnf_service.http.batch_intake import Intake, portions
-from regnf_service.http.batch_lines import lines_of
-from regnf_service.http.by_reference import read_library
-from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
-from regnf_service.http.pace import Pace
-from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.batch_intake import Intake, lines_of, portions, read_library
+from regnf_service.http.body import (
+    CallerDep,
+    LimitQuery,
+    Pace,
+    PageTokenQuery,
+    PrefixDep,
+    ServicesDep,
+    WaitQuery,
+    wait_for,
+)
+from regnf_service.http.middleware import fair_key
+from regnf_service.http.query import decode_token, encode_token
 from regnf_service.http.routes.documentation import BATCH_LINKS, BINARY, FILE, header, refusals
 from regnf_service.http.schemas.batches import BatchDocument, BatchPage, BatchPair, BatchResult, ResultStatus
 from regnf_service.http.schemas.batches import batch_document as document_of
 from regnf_service.http.schemas.batches import summary_document as summary_of
-from regnf_service.http.schemas.references import reference
-from regnf_service.http.turns import fair_key
-from regnf_service.http.waiting import wait_for
+from regnf_service.http.schemas.reading import reference
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch

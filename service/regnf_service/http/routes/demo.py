@@ -10,9 +10,9 @@ from fastapi import APIRouter
 from starlette.responses import FileResponse, JSONResponse
 
 from regnf_service.concurrency import blocking
-from regnf_service.http.dependencies import PrefixDep, ServicesDep
+from regnf_service.http.body import PrefixDep, ServicesDep
 from regnf_service.http.routes.documentation import BINARY, get_and_head, refusals
-from regnf_service.http.schemas.meta import DemoDocument
+from regnf_service.http.schemas.results import DemoDocument
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 from fastapi import APIRouter
 
 from regnf_service.http.problems import MEDIA_TYPE
-from regnf_service.http.schemas.common import ProblemDocument
-from regnf_service.http.schemas.references import reference
+from regnf_service.http.schemas.reading import reference
+from regnf_service.http.schemas.results import ProblemDocument
 from regnf_state.reasons import REASONS
 
 _PROBLEM = reference(ProblemDocument)

@@ -10,20 +10,24 @@ from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
+from regnf_core.errors import MOST_CANDIDATES
+from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
-from regnf_service.fields.redescribe import redescribe
-from regnf_service.fields.views import missing_view
+from regnf_service.fields.redescribe import missing_view, redescribe
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
+from regnf_service.http.body import (
+    CallerDep,
+    LimitQuery,
+    PageTokenQuery,
+    PrefixDep,
+    ServicesDep,
+    WaitQuery,
+    read_json,
+    wait_for,
+)
 from regnf_service.http.description_change import described_anew
-from regnf_service.http.digests import is_sha256
-from regnf_service.http.etags import IfNoneMatch, IfNoneMatchDep, field_etag
-from regnf_service.http.page_requests import wants_page
-from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.parsing import read_json
-from regnf_service.http.ranges import file_answer
+from regnf_service.http.query import decode_token, encode_token, wants_page
+from regnf_service.http.ranges import IfNoneMatch, IfNoneMatchDep, field_etag, file_answer, is_sha256
 from regnf_service.http.routes.documentation import (
     BINARY,
     FIELD_LINKS,
@@ -35,15 +39,14 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
-from regnf_service.http.schemas.references import reference
-from regnf_service.http.waiting import wait_for
+from regnf_service.http.schemas.reading import reference
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.field_views import view_key
-from regnf_state.originals import candidate_key
 from regnf_state.ownership import reference_of
+from regnf_state.pieces import view_key
 from regnf_state.queue import Work
 from regnf_state.records import FieldRecord
+from regnf_state.room import candidate_key
 
 router = APIRouter(tags=["fields"])
 _PATCHES = (JSON, "application/merge-patch+json")

@@ -11,16 +11,14 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http import sse
-from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
-from regnf_service.http.etags import IfNoneMatchDep
-from regnf_service.http.page_requests import wants_page
-from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.body import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery, wait_for
+from regnf_service.http.query import decode_token, encode_token, wants_page
+from regnf_service.http.ranges import IfNoneMatchDep
 from regnf_service.http.routes.documentation import NOT_MODIFIED, header, refusals
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document, request_document
-from regnf_service.http.waiting import wait_for
-from regnf_service.jobs.identity import digest
-from regnf_service.jobs.lookup import find_job
+from regnf_service.jobs.edits import find_job
+from regnf_service.jobs.submit import digest
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.queue import Work

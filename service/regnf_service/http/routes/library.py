@@ -11,12 +11,9 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from regnf_core.library_entries import MAX_NAME, MAX_TAG, EntryNotes
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep
-from regnf_service.http.etags import IfNoneMatch
-from regnf_service.http.page_requests import wants_page
-from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.parsing import read_json
-from regnf_service.http.ranges import file_answer
+from regnf_service.http.body import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, read_json
+from regnf_service.http.query import decode_token, encode_token, wants_page
+from regnf_service.http.ranges import IfNoneMatch, file_answer
 from regnf_service.http.routes.documentation import BINARY, JSON, header, refusals
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.library import (
@@ -27,12 +24,12 @@ from regnf_service.http.schemas.library import (
     SaidSymmetry,
     entry_document,
 )
-from regnf_service.http.schemas.references import reference
+from regnf_service.http.schemas.reading import reference
 from regnf_service.library import add_entry, change_entry, find_entry, remove_entry
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.library import LibraryEntry
 from regnf_state.ownership import sha256_of
+from regnf_state.record_store import LibraryEntry
 
 router = APIRouter(tags=["library"])
 _PATCHES = (JSON, "application/merge-patch+json")

@@ -15,13 +15,13 @@ from starlette.responses import FileResponse, JSONResponse, Response
 
 from regnf_core import __version__
 from regnf_service.concurrency import PROBES, blocking, in_thread
+from regnf_service.http.body import PrefixDep, ServicesDep
 from regnf_service.http.contract import contract_json, contract_yaml
-from regnf_service.http.dependencies import PrefixDep, ServicesDep
-from regnf_service.http.page_requests import wants_page
 from regnf_service.http.problems import problem_of
+from regnf_service.http.query import wants_page
 from regnf_service.http.routes.documentation import get_and_head, refusals
 from regnf_service.http.routes.pages import HTML, page
-from regnf_service.http.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
+from regnf_service.http.schemas.results import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.records import RecordError, RecordsFullError

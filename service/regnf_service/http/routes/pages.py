@@ -8,9 +8,9 @@ from fastapi import APIRouter
 from starlette.responses import FileResponse
 
 from regnf_service.concurrency import blocking
-from regnf_service.http.dependencies import ServicesDep
+from regnf_service.http.body import ServicesDep
 from regnf_service.http.routes.documentation import get_and_head, refusals
-from regnf_service.jobs.lookup import find_job
+from regnf_service.jobs.edits import find_job
 from regnf_state.ownership import ANONYMOUS
 
 router = APIRouter(tags=["results"])

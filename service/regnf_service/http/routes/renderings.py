@@ -13,12 +13,10 @@ from regnf_core.rendering.camera_poses import poses_of_transforms
 from regnf_core.rendering.request import RenderRequest
 from regnf_service.concurrency import in_thread
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
-from regnf_service.http.json_size import MOST_VALUES_WITH_CAMERAS
-from regnf_service.http.parsing import read_json
+from regnf_service.http.body import CallerDep, PrefixDep, ServicesDep, read_json
 from regnf_service.http.routes.documentation import JSON, refusals
 from regnf_service.http.routes.examples import RENDER_EXAMPLES
-from regnf_service.http.routes.submitting import (
+from regnf_service.http.routes.registrations import (
     JOB_REFUSALS,
     JOB_RESPONSES,
     Asking,
@@ -28,14 +26,15 @@ from regnf_service.http.routes.submitting import (
     answer,
 )
 from regnf_service.http.schemas.jobs import JobDocument
-from regnf_service.http.schemas.references import reference
-from regnf_service.http.schemas.renderings import MOST_CAMERAS, RenderBody
-from regnf_service.http.schemas.transforms import rows_of
+from regnf_service.http.schemas.reading import reference
+from regnf_service.http.schemas.registrations import rows_of
+from regnf_service.http.schemas.scenes import MOST_CAMERAS, RenderBody
+from regnf_service.http.strict_json import MOST_VALUES_WITH_CAMERAS
 from regnf_service.jobs.edits import plain_edits
 from regnf_service.jobs.submit import check_fields, check_idempotency_key
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.rendering_request import RenderingRequest, objects_of
+from regnf_state.registration_request import RenderingRequest, objects_of
 
 router = APIRouter(tags=["renderings"])
 

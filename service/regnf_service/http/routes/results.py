@@ -9,14 +9,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_service.concurrency import blocking
-from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
-from regnf_service.http.etags import IfNoneMatchDep
-from regnf_service.http.ranges import RangeDep, file_answer
+from regnf_service.http.body import CallerDep, PrefixDep, ServicesDep, wait_for
+from regnf_service.http.ranges import IfNoneMatchDep, RangeDep, file_answer
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
-from regnf_service.http.schemas.renderings import RenderResultDocument
 from regnf_service.http.schemas.results import ResultDocument
-from regnf_service.http.waiting import wait_for
-from regnf_service.jobs.lookup import find_job, manifest_of, result_of
+from regnf_service.http.schemas.scenes import RenderResultDocument
+from regnf_service.jobs.edits import find_job, manifest_of, result_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.manifest import MEDIA_TYPES, Manifest

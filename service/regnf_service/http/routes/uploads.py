@@ -18,13 +18,18 @@ from regnf_service.fields.ingest import Beside, StoredUpload, check_room, room_f
 from regnf_service.fields.piecewise import finish_pieces
 from regnf_service.fields.uploads import Received, SettingsUpload, Upload, open_settings, open_upload, settings_limit
 from regnf_service.http import body
-from regnf_service.http.content_range import PATTERN, content_range
-from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
-from regnf_service.http.digests import announced_digest, is_sha256
-from regnf_service.http.etags import field_etag
-from regnf_service.http.multipart import boundary_of, read_parts
-from regnf_service.http.pace import Pace
-from regnf_service.http.piece_upload import Piece, receive_piece
+from regnf_service.http.body import (
+    CallerDep,
+    Pace,
+    Piece,
+    PrefixDep,
+    ServicesDep,
+    boundary_of,
+    read_parts,
+    receive_piece,
+)
+from regnf_service.http.middleware import fair_key
+from regnf_service.http.ranges import PATTERN, announced_digest, content_range, field_etag, is_sha256
 from regnf_service.http.routes.documentation import (
     FIELD_LINKS,
     FILE,
@@ -35,9 +40,7 @@ from regnf_service.http.routes.documentation import (
     refusals,
 )
 from regnf_service.http.schemas.fields import FieldDocument, UploadProgress, field_document
-from regnf_service.http.schemas.reading import read_model
-from regnf_service.http.schemas.references import reference
-from regnf_service.http.turns import fair_key
+from regnf_service.http.schemas.reading import read_model, reference
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 

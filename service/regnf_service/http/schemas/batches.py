@@ -7,10 +7,19 @@ from typing import Any, Literal
 from pydantic import Field
 
 from regnf_service.batches import COUNTED, BatchState
-from regnf_service.http.paging import NEXT_PAGE
-from regnf_service.http.schemas.common import Label, Links, Moment, Outgoing, ProblemDocument
+from regnf_service.http.query import NEXT_PAGE
 from regnf_service.http.schemas.registrations import RegisterRequest
-from regnf_service.http.schemas.results import AlternativeDocument, TransformDocument, UncertaintyDocument, Verdict
+from regnf_service.http.schemas.results import (
+    AlternativeDocument,
+    Label,
+    Links,
+    Moment,
+    Outgoing,
+    ProblemDocument,
+    TransformDocument,
+    UncertaintyDocument,
+    Verdict,
+)
 from regnf_service.times import rfc3339
 from regnf_state.batches import Batch
 from regnf_state.batches import BatchSummary as Summary

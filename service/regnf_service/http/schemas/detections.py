@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 from regnf_core.detections import Detection as ParsedDetection
 from regnf_core.detections import parse_detection
 from regnf_core.errors import InvalidDetectionError
-from regnf_service.http.schemas.common import Coordinate, Incoming, Label
+from regnf_service.http.schemas.results import Coordinate, Incoming, Label
 
 DETECTION_FAULT = "invalid_detection"
 """The type of a fault whose context says the place within the detection, the message and the hint."""

@@ -8,8 +8,8 @@ from urllib.parse import quote
 from pydantic import AfterValidator, Discriminator, Field, StringConstraints, Tag, model_validator
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.labels import LABEL_PATTERN
 from regnf_core.library_entries import (
+    LABEL_PATTERN,
     MAX_NAME,
     MAX_NOTE,
     MAX_ORDER,
@@ -20,12 +20,11 @@ from regnf_core.library_entries import (
     checked_tags,
     text_pattern,
 )
-from regnf_service.http.paging import NEXT_PAGE
-from regnf_service.http.schemas.common import Incoming, Links, Moment, Outgoing, Sha256
-from regnf_service.http.schemas.results import SymmetryDocument
+from regnf_service.http.query import NEXT_PAGE
+from regnf_service.http.schemas.results import Incoming, Links, Moment, Outgoing, Sha256, SymmetryDocument
 from regnf_service.times import rfc3339
-from regnf_state.library import LibraryEntry
 from regnf_state.ownership import sha256_of
+from regnf_state.record_store import LibraryEntry
 
 MAX_SELECTED = 512
 """Objects that one search takes."""

@@ -3,23 +3,54 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
-from regnf_core.hints import suggestion
+from regnf_core.errors import suggestion
 from regnf_core.options import UNKNOWN_OPTION, did_you_mean
-from regnf_service.http.json_size import MOST_VALUES
 from regnf_service.http.schemas.detections import DETECTION_FAULT
-from regnf_service.http.schemas.edits import KINDS as EDIT_KINDS
 from regnf_service.http.schemas.library import BY_DIGEST, BY_LIBRARY
-from regnf_service.http.schemas.members import members_at
 from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
-from regnf_service.http.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
-from regnf_service.http.strict_json import parse_json
+from regnf_service.http.schemas.registrations import SPELLINGS as TRANSFORM_SPELLINGS
+from regnf_service.http.schemas.scenes import KINDS as EDIT_KINDS
+from regnf_service.http.strict_json import MOST_VALUES, parse_json
 from regnf_service.problem import MAX_ERRORS, Problem, json_pointer
+
+# Which members a schema knows at a place, to name the one that was meant.
+
+
+def members_at(model: Any, place: Sequence[str | int]) -> set[str]:
+    """The names of the members that ``model`` takes at ``place``, the members' names and list indices from the top."""
+    schema = _schema_of(model)
+    found = [schema]
+    for part in place:
+        found = [below for node in found for below in _below(schema, node, part)]
+    return {name for node in found for variant in _variants(schema, node) for name in variant.get("properties", {})}
+
+
+@cache
+def _schema_of(model: Any) -> dict[str, Any]:
+    return TypeAdapter(model).json_schema()
+
+
+def _below(schema: dict[str, Any], node: dict[str, Any], part: str | int) -> Iterator[dict[str, Any]]:
+    for variant in _variants(schema, node):
+        below = variant.get("items") if isinstance(part, int) else variant.get("properties", {}).get(part)
+        if isinstance(below, dict):
+            yield below
+
+
+def _variants(schema: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The node itself, what it refers to, and what it is a choice of."""
+    if reference := node.get("$ref"):
+        yield from _variants(schema, schema["$defs"][reference.rsplit("/", 1)[1]])
+    for choice in (*node.get("anyOf", ()), *node.get("oneOf", ())):
+        yield from _variants(schema, choice)
+    yield node
+
 
 _REASONS = {
     "detection": "INVALID_DETECTION",
@@ -143,3 +174,15 @@ def _hash_fault(text: str) -> str:
     if len(text) != _HASH_DIGITS:
         return f"It has {len(text)} characters, {expected}."
     return f"It has other characters than digits and a to f, {expected}."
+
+
+# Schemas that routes name in the contract by hand: naming one enters it into the contract.
+
+REFERENCED: dict[str, type] = {}
+"""Every model that was named, by its name in the contract."""
+
+
+def reference(model: type) -> dict[str, Any]:
+    """A reference to a model's schema; the contract lists the schema itself."""
+    REFERENCED[model.__name__] = model
+    return {"$ref": f"#/components/schemas/{model.__name__}"}

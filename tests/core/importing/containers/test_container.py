@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from regnf_core.importing.containers.container import TorchArchive, read_archive
+from regnf_core.importing.containers.legacy_container import TorchArchive, read_archive
 from regnf_core.importing.containers.zip_members import MAX_ENTRIES
 from tests.core.importing.archives import (
     PICKLE_OF_NOTHING,

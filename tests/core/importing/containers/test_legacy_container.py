@@ -14,7 +14,7 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.legacy_container import LegacyArchive, read_legacy
-from regnf_core.importing.pickle.pickle_values import Placeholder, TensorRef
+from regnf_core.importing.pickle.pickle_machine import Placeholder, TensorRef
 from regnf_core.importing.tensor_source import TensorSource
 from tests.core.importing.archives import assert_refused, integer, numbers, text
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from regnf_core.importing.cost.cloud_work import affordable_depth
+from regnf_core.importing.cost.mesh_work import affordable_depth
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
-from regnf_core.importing.cost.calls import SAMPLES, calls_of_check
-from regnf_core.importing.cost.mesh_work import mesh_seconds, mesh_work
+from regnf_core.importing.cost.mesh_work import SAMPLES, calls_of_check, mesh_seconds, mesh_work
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.archives import assert_refused, saved

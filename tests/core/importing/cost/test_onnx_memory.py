@@ -11,10 +11,10 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.onnx import graph
-from regnf_core.importing.cost.onnx_memory import onnx_bytes
+from regnf_core.importing.cost.onnx_work import onnx_bytes
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import MIB, ImportLimits
-from regnf_core.schema.kinds.onnx import last_uses
+from regnf_core.schema.kinds import last_uses
 from tests.core.importing.archives import saved
 from tests.core.importing.cost.test_onnx_work import HALF, LAST, SPHERE, chain, described, ints
 from tests.core.importing.onnx_models import model

@@ -14,16 +14,15 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.onnx.graph import OPERATOR_FUNCTIONS, Step, run_step
-from regnf_core.importing.cost.onnx_shapes import RULES
-from regnf_core.importing.cost.onnx_work import walk
+from regnf_core.importing.cost.onnx_work import RULES, walk
 from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.kinds import OnnxDescription
 from regnf_core.schema.onnx_operators import OPERATORS
-from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import parse_description
 from tests.core.fields.test_onnx import GRAPHS
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.onnx_models import Initializers, model

@@ -7,7 +7,7 @@ from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
-from regnf_core.importing.containers.container import read_archive
+from regnf_core.importing.containers.legacy_container import read_archive
 from tests.core.importing.fuzzing.archive_model import Record, archive_bytes
 
 EMPTY = "90"
@@ -85,8 +85,8 @@ def make_seeds(folder: Path) -> Seeds:
 
 
 def _tensors_of(body: bytes) -> tuple[tuple[str, str, tuple[int, ...]], ...]:
+    from regnf_core.importing.pickle.pickle_machine import TensorRef
     from regnf_core.importing.pickle.pickle_reader import read_pickle
-    from regnf_core.importing.pickle.pickle_values import TensorRef
 
     state = read_pickle(memoryview(body))["pipeline"]
     refs = {name: ref for name, ref in state.items() if isinstance(ref, TensorRef) and name.startswith("_model.field.")}

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.container import read_archive
+from regnf_core.importing.containers.legacy_container import read_archive
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
 from regnf_core.importing.gate.cost_estimate import require_affordable
-from regnf_core.importing.gate.placement import placed
 from regnf_core.importing.gate.reading import Companions
-from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.gate.report import ImportLimits, placed
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.run.opened import SettingsFile
 from regnf_core.importing.settings.facts import Facts

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 
-from regnf_core.importing.gate.system_calls import refuse_system_calls
+from regnf_core.importing.gate.sandbox import refuse_system_calls
 
 _PR_SET_NO_NEW_PRIVS = 38
 _HANGS_AFTER_S = 20

@@ -11,14 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.field_candidates import MOST_CANDIDATES, Candidate
+from regnf_core.errors import MOST_CANDIDATES, Candidate, FieldFormatError
 from regnf_core.importing.families.converted import Reading
-from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
 from regnf_core.importing.gate.candidate_pictures import draw_candidates
-from regnf_core.importing.gate.candidates import read_candidates
-from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.gate.gate import import_field, read_candidates
 from regnf_core.importing.gate.picture import CANDIDATE_BYTES, candidate_name
+from regnf_core.importing.gate.readings_beside import AmbiguousError, OpenCandidate
 from regnf_core.viewing.field_picture import SMALL
 from tests.core.importing.gate.test_picture import png
 

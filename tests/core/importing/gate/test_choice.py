@@ -11,11 +11,11 @@ import torch
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
 from regnf_core.importing.families.converted import ConvertedField, converted_of
-from regnf_core.importing.families.grid_field import grid_readings
-from regnf_core.importing.gate.ambiguity import AmbiguousError
+from regnf_core.importing.families.grid_search import grid_readings
 from regnf_core.importing.gate.choice import choose_reading
+from regnf_core.importing.gate.readings_beside import AmbiguousError
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import parse_description
 from tests.core.importing.grids import Array, ball_table, passing_network
 
 VALUES = {"levels": 5, "features_per_level": 1, "log2_table_size": 16, "base_resolution": 16}

@@ -19,9 +19,8 @@ import psutil
 import pytest
 
 from regnf_core.importing.gate import gate
-from regnf_core.importing.gate.child import run_child
+from regnf_core.importing.gate.child import MAX_THREADS, run_child
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.importing.gate.watch import MAX_THREADS
 from tests.processes import alive
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -30,7 +29,7 @@ import ctypes, errno, json, os, resource, signal, socket, sys, threading
 sys.path.insert(0, {str(ROOT)!r})
 from regnf_core.importing.gate import sandbox
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.importing.gate.watch import MAX_THREADS
+from regnf_core.importing.gate.child import MAX_THREADS
 request = json.load(sys.stdin)
 
 def attempt(action):

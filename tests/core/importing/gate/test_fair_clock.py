@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.importing.gate.fair_clock import FairClock, waited_s
+from regnf_core.importing.gate.child import FairClock, waited_s
 
 
 @pytest.mark.parametrize(

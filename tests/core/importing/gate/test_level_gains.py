@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.importing.families.converted import Reading
-from regnf_core.importing.gate.evidence import Trial
-from regnf_core.importing.gate.interpolation import told_interpolation
-from regnf_core.importing.gate.level_gains import LevelGains, level_gains
+from regnf_core.importing.gate.choice import told_interpolation
+from regnf_core.importing.gate.evidence import LevelGains, Trial, level_gains
 from regnf_core.importing.gate.readings_beside import readings_beside, readings_written_near
 from regnf_core.schema.hash_grid_config import HashGridConfig
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from regnf_core.importing.families.converted import Reading
+from regnf_core.importing.gate.choice import chosen_by_misfit
 from regnf_core.importing.gate.evidence import Trial
-from regnf_core.importing.gate.misfit_choice import chosen_by_misfit
 
 POINTS = 2000
 

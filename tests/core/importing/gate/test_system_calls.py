@@ -18,8 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.importing.gate.allowed_calls import MACHINES, Machine, conditions
-from regnf_core.importing.gate.system_calls import filter_code
+from regnf_core.importing.gate.sandbox import MACHINES, Machine, conditions, filter_code
 from tests.core.importing.gate.native_calls import apart, call
 
 ROOT = Path(__file__).resolve().parents[4]

@@ -12,7 +12,7 @@ import pytest
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
-from regnf_core.importing.meshes import geometry
+from regnf_core.importing.meshes import triangle_files
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.in_process import convert
@@ -158,7 +158,7 @@ def test_faulty_stl_files(data: bytes) -> None:
 
 
 def test_more_triangles_than_anybody_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(geometry, "MAX_TRIANGLES", 100)
+    monkeypatch.setattr(triangle_files, "MAX_TRIANGLES", 100)
     for kind in ("ply", "stl", "obj", "glb"):
         assert_rejected(exported(kind), "MESH_TOO_LARGE")
 

@@ -12,8 +12,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from regnf_core.fields.build import build_field
-from regnf_core.fields.color import has_color
-from regnf_core.schema.parsing import parse_description
+from regnf_core.fields.observation import has_color
+from regnf_core.schema.safe_format import parse_description
 from tests.core.importing.meshes.mesh_files import BALL, FACES, converted, off
 
 PAINT = np.random.default_rng(3).integers(0, 256, (len(BALL.vertices), 3))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.triangles import mesh_field
-from regnf_core.importing.meshes.geometry import Geometry
+from regnf_core.importing.meshes.triangle_files import Geometry
 from regnf_core.importing.upload_description import UploadDescription
 
 ROOM = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.5]])

@@ -19,7 +19,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, s
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import read_mesh
-from regnf_core.importing.meshes.lzf import unpack_lzf
+from regnf_core.importing.meshes.point_files import unpack_lzf
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.in_process import convert

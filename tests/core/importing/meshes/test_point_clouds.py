@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.importing.families import point_cloud
+from regnf_core.importing.families import mesh
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
@@ -54,7 +54,7 @@ def test_points_at_one_place_are_compared_once(monkeypatch: pytest.MonkeyPatch) 
         built.append(places)
         return cKDTree(places)
 
-    monkeypatch.setattr(point_cloud, "cKDTree", tree)
+    monkeypatch.setattr(mesh, "cKDTree", tree)
     around = directions(400)
     again = np.concatenate((around, around[:20].repeat(50, axis=0)))
     assert len(field_of(converted(ply(again, again))).faces) > 1000
@@ -112,7 +112,7 @@ def test_clouds_of_no_surface(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Refused before the surface is made, which takes long."""
-    monkeypatch.setattr(point_cloud, "_poisson", lambda *_: pytest.fail("a surface was made of it"))
+    monkeypatch.setattr(mesh, "_poisson", lambda *_: pytest.fail("a surface was made of it"))
     with pytest.raises(FieldFormatError, match=says) as caught:
         converted(ply(points, normals))
     assert caught.value.reason == reason
@@ -189,7 +189,7 @@ def test_noisy_clouds_of_thin_boards_and_edges_are_not_taken_for_turned(
     chosen = random.permutation(len(cloud[0]))[:count]
     points, normals = cloud[0][chosen], cloud[1][chosen]
     apart = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
-    point_cloud._require_agreeing(points + spacings * apart * random.normal(size=points.shape), normals)
+    mesh._require_agreeing(points + spacings * apart * random.normal(size=points.shape), normals)
 
 
 def test_who_insists_is_given_the_surface_of_turned_normals() -> None:

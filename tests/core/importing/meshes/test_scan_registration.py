@@ -10,13 +10,13 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.meshes import read_mesh
-from regnf_core.registration import register
-from regnf_core.schema.parsing import parse_description
+from regnf_core.library import register
+from regnf_core.schema.safe_format import parse_description
 from tests.core.importing.meshes.test_facing import converted, parts, together, without
 from tests.devdata import dev_data
 

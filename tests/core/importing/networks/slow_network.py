@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.fields.positional_encoding import _ICOSAHEDRON
+from regnf_core.fields.color_head import _ICOSAHEDRON
 
 Array = NDArray[np.float64]
 State = Mapping[str, Any]

@@ -13,7 +13,7 @@ from safetensors.numpy import load_file
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
 from regnf_core.importing.observing.by_weights import observed_by_weights
-from regnf_core.schema.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.schema.description import FREE, OBSERVATION, SURFACE, UNSEEN, ObservationGrid
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from tests.core.importing.in_process import convert
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from regnf_core.importing.containers.container import read_archive
+from regnf_core.importing.containers.legacy_container import read_archive
+from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder, TensorRef
 from regnf_core.importing.pickle.pickle_reader import read_pickle
-from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder, TensorRef
 from tests.core.importing.archives import assert_refused, integer, storage, tensor, text
 
 PROTO = b"\x80\x02"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.run.checkpoint_names import choose_checkpoint
-from regnf_core.importing.run.settings_names import choose_settings
+from regnf_core.importing.run.opened import choose_checkpoint, choose_settings
 from tests.core.importing.archives import assert_refused
 
 

@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 
-from regnf_core.importing.settings.hocon_reader import read_hocon
-from regnf_core.importing.settings.json_reader import read_json
-from regnf_core.importing.settings.plain import Tagged
-from regnf_core.importing.settings.yaml_reader import read_yaml
+from regnf_core.importing.settings.documents import read_hocon, read_yaml
+from regnf_core.importing.settings.keys import Tagged, read_json
 from tests.core.importing.archives import assert_refused
 
 

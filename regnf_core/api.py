@@ -1,0 +1,475 @@
+"""What users call: the engine's functions, with fields by their paths and options as dictionaries."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+import regnf_core.batch as engine_batch
+import regnf_core.library as engine
+from regnf_core.batch import ModeledObject
+from regnf_core.detections.parsing import BoxLike, detection_of
+from regnf_core.editing.compose import compose as engine_compose
+from regnf_core.editing.edited_scene import EditedScene
+from regnf_core.editing.edits import Edit
+from regnf_core.errors import (
+    InvalidDetectionError,
+    InvalidInputError,
+    InvalidOptionsError,
+    NoSurfaceError,
+    RegnfError,
+    filled_folder,
+    verdict_in_words,
+)
+from regnf_core.field_files import library_files, require_file
+from regnf_core.field_notes import FieldNotes
+from regnf_core.field_source import FieldSource, Role, find_source
+from regnf_core.fields.observation import SdfField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.in_memory import FieldWarning, HasGeometry, HasPoints, HasVertices, field_of
+from regnf_core.library import Candidate, LibraryObject, model_object, search_library
+from regnf_core.loading import import_smallest_first, load_field
+from regnf_core.object_models import object_model
+from regnf_core.options import OptionsLike, RobustOptions, options_of, seed_of
+from regnf_core.pairs import pairs_of
+from regnf_core.rendering.camera import Camera, Frame
+from regnf_core.rendering.render import render as engine_render
+from regnf_core.rendering.request import RenderOptions
+from regnf_core.result import ProgressCallback, RegistrationResult
+from regnf_core.robust.pipeline import WarmStart
+from regnf_core.texts import json_value
+from regnf_core.viewing.document import result_document, uncertainty, write_artifacts
+from regnf_core.viewing.recording import write_recording
+from regnf_core.viewing.registration_picture import registration_picture, show
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+# A field as a user names it.
+
+FieldLike = SdfField | str | os.PathLike[str] | HasVertices | HasPoints | HasGeometry
+"""An open field; the path of a file, a training run's folder or an archive of one; or a mesh or a cloud in memory, see
+:func:`regnf_core.in_memory.field_of`."""
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A field, its name, and what its import said; both None for a field that the caller has opened."""
+
+    field: SdfField
+    name: str | None = None
+    notes: FieldNotes | None = None
+
+
+def opened(field: FieldLike, role: Role | None = None) -> Opened:
+    """The field that is meant; a path is opened, as what it will be used as. Raises what ``open_field`` does."""
+    if isinstance(field, str | os.PathLike):
+        loaded = load_field(find_source(Path(field), role=role))
+        for warning in loaded.notes.warnings:
+            warnings.warn(f"{field}: {warning}", FieldWarning, stacklevel=4)
+        return Opened(loaded.field, str(field), loaded.notes)
+    return Opened(field_of(field, role))
+
+
+def opened_pair(scene: FieldLike, obj: FieldLike) -> tuple[Opened, Opened]:
+    """Both; what is refused is refused before a large file is imported. Raises what ``open_field`` does."""
+    given: dict[Role, FieldLike] = {"scene": scene, "object": obj}
+    sources = {
+        role: find_source(Path(one), role=role) for role, one in given.items() if isinstance(one, str | os.PathLike)
+    }
+    found = {role: opened(one, role) for role, one in given.items() if role not in sources}
+    import_smallest_first(sources.values())
+    for role in sources:
+        found[role] = opened(given[role], role)
+    return found["scene"], found["object"]
+
+
+def opened_several(fields: Sequence[FieldLike], role: Role) -> list[Opened]:
+    """The same for a list. Raises InvalidInputError (NO_FIELD) for what is no list."""
+    if isinstance(fields, str | os.PathLike | SdfField) or not isinstance(fields, Sequence):
+        message = f"the {role}s are a {type(fields).__name__}, expected a list"
+        raise InvalidInputError(message, reason="NO_FIELD", hint=f"Write a list: [{role}].")
+    return [opened(one, role) for one in fields]
+
+
+def notes_of(scene: Opened, obj: Opened) -> dict[str, FieldNotes] | None:
+    """What is known of the imports, by role; None where nothing is."""
+    found = {"scene": scene.notes, "object": obj.notes}
+    return {name: notes for name, notes in found.items() if notes is not None} or None
+
+
+# A registration's result as a user holds it: it prints, draws and saves itself.
+
+
+class ArrayTensor(Tensor):
+    """A tensor of which ``numpy.array`` makes a copy: torch's own does not know the argument, and numpy warns of it."""
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray[Any, Any]:
+        return np.array(self.detach().cpu().numpy(), dtype=dtype, copy=copy)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ArrayTensor:
+        copied: ArrayTensor = memo.setdefault(id(self), self.clone())
+        return copied
+
+
+def _for_numpy(value: Any) -> Any:
+    """The same with such tensors."""
+    if isinstance(value, Tensor):
+        return value.as_subclass(ArrayTensor)
+    if isinstance(value, list | tuple):
+        return type(value)(map(_for_numpy, value))
+    if isinstance(value, Mapping):
+        return {name: _for_numpy(one) for name, one in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{one.name: _for_numpy(getattr(value, one.name)) for one in fields(value)})
+    return value
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Registered(RegistrationResult):
+    """The outcome of one registration, with what is needed to show it.
+
+    object_name: the object's path, if it was given by one · notes: what the imports of scene and object said ·
+    detection: the box, scene frame.
+    """
+
+    object_name: str | None = None
+    notes: Mapping[str, FieldNotes] | None = None
+    detection: OrientedBox | None = None
+
+    @classmethod
+    def of(
+        cls,
+        result: RegistrationResult,
+        object_name: str | None = None,
+        notes: Mapping[str, FieldNotes] | None = None,
+        detection: OrientedBox | None = None,
+    ) -> Registered:
+        """The engine's result."""
+        values = {one.name: _for_numpy(getattr(result, one.name)) for one in fields(RegistrationResult)}
+        return cls(**values, object_name=object_name, notes=notes, detection=_for_numpy(detection))
+
+    @property
+    def scale(self) -> float:
+        """Object units per scene unit."""
+        return float(self.T_object_scene.scale)
+
+    @property
+    def uncertainty(self) -> dict[str, Any] | None:
+        """One standard deviation of where the object's center is (``center_scene``, along the scene's x, y, z, scene
+        units), of the rotation (``rotation_deg``, about the object's x, y, z) and of the scale (``scale_percent``).
+        None from the preset `paper`."""
+        if self.covariance is None:
+            return None
+        return uncertainty(self.covariance, self.T_object_scene, self.center_object)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result document: plain values, as result.json has them."""
+        return result_document(self, object_name=self.object_name, fields=self.notes)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write result.json, the clouds, the pose and a picture into a folder, as ``regnf register --output`` does."""
+        self._require_clouds()
+        target = Path(folder)
+        if target.exists() and not target.is_dir():
+            hint = "Name a folder; it is made if need be."
+            raise InvalidInputError(f"{target}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
+        with filled_folder(target) as folder:
+            names = write_artifacts(self, folder, object_name=self.object_name, fields=self.notes)
+        return [target / name for name in names]
+
+    def plot(self, path: str | Path | None = None, window: bool | None = None) -> Image:
+        """The picture of the registration, written to ``path`` too if there is one.
+
+        window: whether a window of PyVista or Open3D is opened, where one of them and a display are there; None: only
+        if no ``path`` is given.
+        """
+        self._require_clouds()
+        picture = registration_picture(self)
+        if path is not None:
+            picture.save(path)
+        if window or (window is None and path is None):
+            show(self)
+        return picture
+
+    def save_recording(self, path: str | Path) -> Path:
+        """Write how the registration went as a recording (.rrd) for the viewer of rerun; the path.
+
+        Needs the extra ``rerun``. See docs/how-to/recording.md for what it holds.
+        Raises MissingExtraError, InvalidOptionsError, and InvalidInputError (NO_CLOUDS, FILE_IS_FOLDER,
+        RECORDING_DISABLED).
+        """
+        self._require_clouds()
+        return write_recording(self, path, self.detection, self.object_name)
+
+    def _require_clouds(self) -> None:
+        if not self.residuals:
+            hint = "Register without clouds=False."
+            raise InvalidInputError("the result has no point clouds to show", reason="NO_CLOUDS", hint=hint)
+
+    def __repr__(self) -> str:
+        sure = "" if self.probability is None else f", probability {self.probability:.3f}"
+        return f"<{self.verdict}: {self.verdict_reason}, scale {self.scale:.4g}{sure}>"
+
+    def _repr_png_(self) -> bytes | None:
+        """For notebooks."""
+        if not self.residuals:
+            return None
+        stream = io.BytesIO()
+        registration_picture(self).save(stream, "PNG")
+        return stream.getvalue()
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        reason = verdict_in_words(self.verdict_reason, self.verdict_limit) or self.verdict_reason
+        rows = "".join(
+            "<tr>" + "".join(f"<td style='text-align:right'>{value:.4f}</td>" for value in row) + "</tr>"
+            for row in self.T_scene_object.matrix().tolist()
+        )
+        png = self._repr_png_()
+        data = "" if png is None else base64.b64encode(png).decode()
+        picture = f"<img alt='registration' src='data:image/png;base64,{data}'>" if data else ""
+        words = f"<b>{escape(self.verdict)}</b>: {escape(reason)} Scale {self.scale:.4g}."
+        caption = "<caption>T_scene_object, the object's pose in the scene</caption>"
+        return f"<div><p>{words}</p><table>{caption}{rows}</table>{picture}</div>"
+
+
+# ``register`` and ``register_batch`` as users call them.
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
+
+    detection: int
+    object: int
+    result: Registered | None
+    error: RegnfError | None = None
+
+
+def register(
+    scene: FieldLike,
+    obj: FieldLike,
+    detection: BoxLike,
+    options: OptionsLike = None,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+    warm_start: WarmStart | None = None,
+    clouds: bool = True,
+) -> Registered:
+    """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
+
+    scene, obj: fields, their paths, or meshes of trimesh or Open3D · detection: a box of regnf or Open3D, two corners,
+    a detection's JSON, or the path of its file ·
+    options: RegistrationOptions, or a dictionary of those that are not to have their defaults · progress: called with
+    the phase and the overall share done, 0..1 · warm_start: a pose to try first, and the object's model · clouds: False
+    saves time when nothing is drawn or saved.
+    Deterministic for a seed, on one machine and with the same number of threads.
+    Raises InvalidOptionsError, InvalidDetectionError, FieldFormatError, InvalidInputError (NO_FIELD, FILE_NOT_FOUND,
+    FIELD_NOT_FINITE), NoSurfaceError, InitializationError.
+    """
+    chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
+    place, thing = opened_pair(scene, obj)
+    result = engine.register(place.field, thing.field, box, chosen, seed, progress, warm_start, clouds)
+    return Registered.of(result, thing.name, notes_of(place, thing), box)
+
+
+def register_batch(
+    scene: FieldLike,
+    detections: Sequence[BoxLike],
+    objects: Sequence[FieldLike | ModeledObject],
+    pairs: Sequence[tuple[int, int]] | None = None,
+    options: OptionsLike = None,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+    clouds: bool = True,
+) -> list[BatchOutcome]:
+    """Register pairs of detection and object, by their numbers (None: each with each), by the preset `robust`.
+
+    What they share is made once; a pair that fails does not stop the others. Arguments as of ``register``.
+    Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN, NO_FIELD).
+    """
+    chosen, boxes, seed = options_of(options), [box_of(one) for one in _several(detections)], seed_of(seed)
+    pairs_of(pairs, len(boxes), len(objects))  # before any field is opened
+    place = opened(scene, "scene")
+    fields = [one if isinstance(one, ModeledObject) else opened_several([one], "object")[0] for one in objects]
+    plain = [one.field if isinstance(one, Opened) else one for one in fields]
+    found = engine_batch.register_batch(place.field, boxes, plain, pairs, chosen, seed, progress, clouds)
+    return [_outcome(one, place, fields[one.object], boxes[one.detection]) for one in found]
+
+
+def box_of(detection: BoxLike) -> OrientedBox:
+    """The box that is meant. Raises InvalidDetectionError, and InvalidInputError (FILE_NOT_FOUND, MALFORMED_JSON)."""
+    if isinstance(detection, str | os.PathLike):
+        require_file(Path(detection))
+        return OrientedBox.from_dict(json_value(Path(detection).read_bytes(), f"detection {detection}: "))
+    return detection if isinstance(detection, OrientedBox) else OrientedBox.from_detection(detection_of(detection))
+
+
+def _several(detections: Sequence[BoxLike]) -> Sequence[BoxLike]:
+    if isinstance(detections, OrientedBox | str | os.PathLike) or not isinstance(detections, Sequence):
+        raise InvalidDetectionError("the detections are one box, expected a list", hint="Write a list: [box].")
+    return detections
+
+
+def _outcome(
+    one: engine_batch.BatchOutcome, scene: Opened, obj: Opened | ModeledObject, detection: OrientedBox
+) -> BatchOutcome:
+    if one.result is None:
+        return BatchOutcome(one.detection, one.object, None, one.error)
+    known = obj if isinstance(obj, Opened) else Opened(obj.field)
+    result = Registered.of(one.result, known.name, notes_of(scene, known), detection)
+    return BatchOutcome(one.detection, one.object, result)
+
+
+# ``search`` as users call it: which of several objects a detection shows.
+
+Objects = str | Path | Sequence[FieldLike | LibraryObject] | Mapping[str, FieldLike]
+"""A folder of fields, a list of fields or their paths, or fields by names of your own."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """ranking: every object, the likeliest first · unusable: those without a surface, and why · result: the
+    registration of the first."""
+
+    ranking: list[Candidate]
+    result: Registered
+    unusable: dict[str, str]
+
+    def __repr__(self) -> str:
+        return f"<{self.ranking[0].name} of {len(self.ranking)} objects, {self.result!r}>"
+
+
+def search(
+    scene: FieldLike,
+    objects: Objects,
+    detection: BoxLike,
+    options: OptionsLike = None,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+    clouds: bool = True,
+) -> Search:
+    """Which object stands in the box, and where, by the preset `robust`.
+
+    An object's model is made once and kept in the user's cache, for objects that are given by their paths. Other
+    arguments as of ``register``. Raises InvalidInputError (LIBRARY_EMPTY), InvalidOptionsError
+    (LIBRARY_SEARCH_UNSUPPORTED), NoSurfaceError, and what ``register`` raises.
+    """
+    chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
+    chosen.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
+    named = _named(objects)
+    given: list[tuple[FieldLike | LibraryObject, Role]] = [
+        (scene, "scene"),
+        *((one, "object") for one in named.values()),
+    ]
+    import_smallest_first(
+        find_source(Path(one), role=role) for one, role in given if isinstance(one, str | os.PathLike)
+    )
+    place = opened(scene, "scene")
+    library, unusable = [], {}
+    for name, one in named.items():
+        try:
+            library.append(_modeled(name, one, chosen.robust))
+        except NoSurfaceError as error:
+            unusable[name] = error.reason
+    if not library:
+        raise NoSurfaceError("none of the objects has a surface", reason="NO_SURFACE_IN_OBJECT")
+    found = search_library(place.field, box, library, chosen, seed, progress, clouds)
+    first = found.ranking[0].name
+    notes = None if place.notes is None else {"scene": place.notes}
+    return Search(found.ranking, Registered.of(found.result, first, notes, box), unusable)
+
+
+def _named(objects: Objects) -> dict[str, FieldLike | LibraryObject]:
+    """The objects by their names. Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE, NO_FIELD)."""
+    if isinstance(objects, str | os.PathLike):
+        return {str(path): path for path in library_files([Path(objects)])}
+    if isinstance(objects, Mapping):
+        named: dict[str, FieldLike | LibraryObject] = dict(objects)
+    elif isinstance(objects, Sequence):
+        named = {_name(one, number): one for number, one in enumerate(objects)}
+    else:
+        hint = "Give a folder, a list of fields or paths, or a dictionary of them by name."
+        raise InvalidInputError(f"the objects are a {type(objects).__name__}", reason="NO_FIELD", hint=hint)
+    if not named:
+        raise InvalidInputError("the library has no objects", reason="LIBRARY_EMPTY", hint="Give at least one object.")
+    return named
+
+
+def _name(one: FieldLike | LibraryObject, number: int) -> str:
+    if isinstance(one, LibraryObject):
+        return one.name
+    return str(one) if isinstance(one, str | os.PathLike) else f"object {number}"
+
+
+def _modeled(name: str, one: FieldLike | LibraryObject, options: RobustOptions) -> LibraryObject:
+    if isinstance(one, LibraryObject):
+        return one
+    if isinstance(one, str | os.PathLike):
+        source = find_source(Path(one), role="object")
+        return LibraryObject(name, partial(_field_of, source), object_model(source, options))
+    field = opened(one, "object").field
+    return LibraryObject(name, lambda: field, model_object(field, options))
+
+
+def _field_of(source: FieldSource) -> SdfField:
+    return load_field(source).field
+
+
+# ``render`` and ``compose`` as users call them.
+
+RenderOptionsLike = RenderOptions | Mapping[str, Any] | None
+
+
+def render(
+    field: FieldLike,
+    camera: Camera,
+    options: RenderOptionsLike = None,
+    progress: Callable[[float], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> Frame:
+    """One frame of a field, or of the field at a path: color or shading, depth, normals, opacity.
+
+    options: RenderOptions, or a dictionary of those that are not to have their defaults. ``cancelled`` is asked before
+    each tile; CancelledError is raised once it says so.
+    Raises InvalidInputError: NO_FIELD, CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and
+    NoSurfaceError (NO_SURFACE_IN_SCENE).
+    """
+    chosen = _render_options(options)
+    return engine_render(opened(field).field, camera, chosen, progress, cancelled)
+
+
+def compose(
+    scene: FieldLike, edits: Sequence[Edit], seed: int = 0, progress: Callable[[float], None] | None = None
+) -> EditedScene:
+    """The scene, or that at a path, with all edits done: a field as any other. See docs/editing.md.
+
+    Raises InvalidInputError: NO_FIELD, INVALID_TRANSFORM, EDIT_INVALID, EDITS_OVERLAP, EDIT_OUTSIDE_SCENE; and
+    NoSurfaceError (NO_SURFACE_IN_OBJECT).
+    """
+    if not isinstance(edits, Sequence):
+        hint = "Write a list: [Removal(box)]."
+        raise InvalidInputError("edits must be a list", reason="EDIT_INVALID", hint=hint)
+    return engine_compose(opened(scene, "scene").field, edits, seed_of(seed), progress)
+
+
+def _render_options(options: RenderOptionsLike) -> RenderOptions:
+    if options is None or isinstance(options, RenderOptions):
+        return options or RenderOptions()
+    if isinstance(options, Mapping):
+        return RenderOptions.from_dict(dict(options))
+    hint = 'Write {"mode": "surface"} or RenderOptions(mode="surface").'
+    raise InvalidOptionsError(f"options is a {type(options).__name__}, expected a dictionary", hint=hint)

@@ -1,0 +1,226 @@
+"""PCD (Point Cloud Library): points and their normals, as text, binary or compressed."""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, not_numbers, require_room
+
+# LZF, the compression of PCD files, by its published layout: literals, and copies of what was unpacked before.
+
+_LITERALS, _LONG = 32, 7
+
+
+def unpack_lzf(packed: memoryview, size: int) -> memoryview:
+    """The ``size`` bytes that ``packed`` holds; never more are made. Raises FieldFormatError (MESH_INVALID)."""
+    if size > 264 * len(packed):  # a copy of three bytes makes 264 at most
+        raise _faulty()
+    source, made = bytes(packed), bytearray()
+    at = 0
+    try:
+        while at < len(source):
+            control = source[at]
+            at += 1
+            if control < _LITERALS:
+                made += source[at : at + control + 1]
+                at += control + 1
+                if at > len(source):
+                    raise _faulty()
+            else:
+                length = control >> 5
+                if length == _LONG:
+                    length += source[at]
+                    at += 1
+                back = ((control & 31) << 8 | source[at]) + 1
+                at += 1
+                _copy(made, back, length + 2)
+            if len(made) > size:
+                raise _faulty()
+    except IndexError as error:
+        raise _faulty() from error
+    if len(made) != size:
+        raise _faulty()
+    return memoryview(bytes(made))
+
+
+def _copy(made: bytearray, back: int, length: int) -> None:
+    """Append ``length`` bytes from so far back; they may reach into what is appended."""
+    start = len(made) - back
+    if start < 0:
+        raise _faulty()
+    piece = bytes(made[start : start + length])
+    made += (piece * (length // len(piece) + 1))[:length]
+
+
+def _faulty() -> Exception:
+    return malformed("the PCD file's compressed points do not unpack to the size that it says")
+
+
+# Numbers between spaces, as many text formats have them.
+
+
+def numbers_of(text: bytes, format_: str) -> Float64Array:
+    """All numbers of a text. Raises FieldFormatError (MESH_INVALID) where a word is none."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return np.fromstring(text.decode("ascii"), dtype=np.float64, sep=" ")
+    except (ValueError, DeprecationWarning) as error:
+        raise not_numbers(f"the {format_} file holds a word that is not a number", text) from error
+
+
+_MAX_HEADER, _MAX_FIELDS, _MAX_COLUMNS = 1 << 14, 64, 1 << 10
+_TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
+    (sign.upper(), size): f"<{sign}{size}" for sign in ("i", "u") for size in (1, 2, 4, 8)
+}
+_PLACES, _NORMALS = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
+
+
+@dataclass(frozen=True)
+class _Header:
+    """One row of a point: ``types`` and ``counts`` by name of the field. The header takes ``size`` bytes."""
+
+    types: dict[str, np.dtype[np.generic]]
+    counts: dict[str, int]
+    points: int
+    data: str
+    size: int
+
+    @property
+    def row_bytes(self) -> int:
+        return sum(self.types[name].itemsize * count for name, count in self.counts.items())
+
+
+def read_pcd(data: memoryview) -> Geometry:
+    """The points of a PCD file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
+    header = _header(data)
+    require_room(header.points, 0)
+    body = data[header.size :]
+    if header.data == "ascii":
+        table = _from_text(header, body)
+    elif header.data == "binary":
+        table = _from_rows(header, body)
+    else:
+        table = _from_columns(header, _unpacked(header, body))
+    normals = np.stack([table[name] for name in _NORMALS], axis=1) if table.keys() >= set(_NORMALS) else None
+    return Geometry(np.stack([table[name] for name in _PLACES], axis=1), np.zeros((0, 3), np.int64), normals)
+
+
+def _header(data: memoryview) -> _Header:
+    said: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in said:
+        line, newline, _ = bytes(data[at : at + _MAX_HEADER]).partition(b"\n")
+        at += len(line) + 1
+        if not newline or at > _MAX_HEADER:
+            raise malformed("no end of the PCD header in sight")
+        words = line.decode("latin-1").partition("#")[0].split()
+        if words:
+            said[words[0]] = words[1:]
+    names = said.get("FIELDS", [])
+    sizes, kinds, counts = (_row(said, key, len(names)) for key in ("SIZE", "TYPE", "COUNT"))
+    try:
+        types = {name: np.dtype(_TYPES[kind, int(size)]) for name, kind, size in zip(names, kinds, sizes, strict=True)}
+        columns = {name: int(count) for name, count in zip(names, counts, strict=True)}
+        points = (
+            int(said["POINTS"][0]) if said.get("POINTS") else math.prod(int(said[k][0]) for k in ("WIDTH", "HEIGHT"))
+        )
+    except (KeyError, IndexError, ValueError) as error:
+        raise malformed("the PCD header has a line that makes no sense") from error
+    if len(names) > _MAX_FIELDS or len(types) != len(names) or not types.keys() >= set(_PLACES):
+        raise malformed("the PCD header names a field twice, too many, or not x, y and z")
+    singles = {*_PLACES, *_NORMALS} & types.keys()
+    if not 0 <= points < 1 << 40 or not all(1 <= count <= _MAX_COLUMNS for count in columns.values()):
+        raise malformed("the PCD header has a count that makes no sense")
+    if any(columns[name] != 1 for name in singles) or said["DATA"][:1] not in (
+        ["ascii"],
+        ["binary"],
+        ["binary_compressed"],
+    ):
+        raise malformed("the PCD header names no known form of its points")
+    return _Header(types, columns, points, said["DATA"][0], at)
+
+
+def _row(said: dict[str, list[str]], key: str, count: int) -> list[str]:
+    row = said.get(key, ["1"] * count if key == "COUNT" else [])
+    if len(row) != count:
+        raise malformed(f"the PCD header's {key} is not of as many parts as its FIELDS")
+    return row
+
+
+def _from_text(header: _Header, body: memoryview) -> dict[str, Float64Array]:
+    width = sum(header.counts.values())
+    numbers = numbers_of(bytes(body), "PCD")
+    if len(numbers) < header.points * width:
+        raise malformed("the PCD file ends within its points")
+    rows = numbers[: header.points * width].reshape(header.points, width)
+    starts = np.cumsum([0, *header.counts.values()])
+    return {name: rows[:, start] for name, start in zip(header.counts, starts, strict=False)}
+
+
+def _from_rows(header: _Header, body: memoryview) -> dict[str, Float64Array]:
+    row = np.dtype([(name, header.types[name], (count,)) for name, count in header.counts.items()])
+    if header.points * row.itemsize > len(body):
+        raise malformed("the PCD file ends within its points")
+    rows = np.frombuffer(body, row, header.points)
+    return {name: rows[name][:, 0].astype(np.float64) for name in header.counts}
+
+
+def _unpacked(header: _Header, body: memoryview) -> memoryview:
+    packed, size = (int.from_bytes(body[at : at + 4], "little") for at in (0, 4))
+    if len(body) < 8 or packed > len(body) - 8 or size != header.points * header.row_bytes:
+        raise malformed("the PCD file's compressed points have another size than the header says")
+    return unpack_lzf(body[8 : 8 + packed], size)
+
+
+def _from_columns(header: _Header, body: memoryview) -> dict[str, Float64Array]:
+    """Compressed points lie field by field."""
+    table, at = {}, 0
+    for name, count in header.counts.items():
+        type_ = header.types[name]
+        table[name] = np.frombuffer(body, type_, header.points * count, at)[::count].astype(np.float64)
+        at += header.points * count * type_.itemsize
+    return table
+
+
+# Points in lines of numbers: .xyz, .pts, .txt. Which columns are the normals is told by their length of one.
+
+_COMMENT = re.compile(rb"(?:#|//)[^\n]*")
+_MOST_COLUMNS = 16
+_UNIT = 0.02
+"""How far from one a normal's length may be; of so many ..."""
+_SHARE = 0.9
+"""... of the points."""
+
+
+def read_xyz(data: memoryview) -> Geometry:
+    """The points of a text file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
+    text = _COMMENT.sub(b"", bytes(data)).replace(b",", b" ").replace(b";", b" ").lstrip()
+    first, _, rest = text.partition(b"\n")
+    if len(first.split()) == 1:  # .pts begins with the number of points
+        text = rest.lstrip()
+        first = text.partition(b"\n")[0]
+    columns = len(first.split())
+    if not 3 <= columns <= _MOST_COLUMNS:
+        raise malformed(f"lines of {columns} numbers are no points")
+    require_room(text.count(b"\n"), 0)
+    numbers = numbers_of(text, "point")
+    if len(numbers) % columns:
+        raise malformed("the points' lines are not of one length")
+    rows = numbers.reshape(-1, columns)
+    require_room(len(rows), 0)
+    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows))
+
+
+def _normals(rows: Float64Array) -> Float64Array | None:
+    """The three neighboring columns behind the place whose rows have length one; None where there are none."""
+    for start in range(3, rows.shape[1] - 2):
+        found = rows[:, start : start + 3]
+        if len(rows) and (np.abs(np.linalg.norm(found, axis=1) - 1.0) < _UNIT).mean() >= _SHARE:
+            return found
+    return None

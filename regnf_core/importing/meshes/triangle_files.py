@@ -1,0 +1,350 @@
+"""What a mesh file holds that a field needs, and the limits that all readers share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from regnf_core.errors import FieldFormatError
+
+Float64Array = npt.NDArray[np.float64]
+Int64Array = npt.NDArray[np.int64]
+
+Siblings = Mapping[str, memoryview]
+"""The files that came with a mesh in one archive, by their names relative to it."""
+
+MAX_TRIANGLES = 2_000_000
+MAX_VERTICES = 6_000_000
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Points, and the triangles between them; nothing of it is checked but its shapes."""
+
+    vertices: Float64Array
+    """(V, 3), the file's own frame and unit."""
+    faces: Int64Array
+    """(F, 3) indices; F is 0 for a point cloud."""
+    normals: Float64Array | None = None
+    """(V, 3), where the file has one a vertex."""
+    colors: Float64Array | None = None
+    """(V, 3) in [0, 1], R, G, B, where the file has one a vertex."""
+    left_out: tuple[str, ...] = ()
+    """What the file holds or names that was not read, a few words each: the shape is the same without."""
+    not_applied: tuple[str, ...] = ()
+    """The same of what changes the shape: it is warned of."""
+
+
+def not_numbers(message: str, text: bytes) -> FieldFormatError:
+    """The error for words that are no numbers, which says so where the reason is how decimals are written."""
+    commas = re.search(rb"\d,\d", text) is not None
+    return malformed(message + (": decimals have points, not commas" if commas else ""))
+
+
+def malformed(message: str) -> FieldFormatError:
+    """The error for a file that breaks its own format."""
+    return FieldFormatError(message, reason="MESH_INVALID")
+
+
+def elsewhere(message: str) -> FieldFormatError:
+    """The error for a file whose geometry lies in another file, or that would have a command run."""
+    return FieldFormatError(message, reason="MESH_EXTERNAL_REFERENCE")
+
+
+def unsupported(message: str) -> FieldFormatError:
+    """The error for a sound file that uses a part of its format which is not read here."""
+    return FieldFormatError(message, reason="FORMAT_NOT_SUPPORTED")
+
+
+def require_room(vertices: int, triangles: int) -> None:
+    """Raise FieldFormatError (MESH_TOO_LARGE) beyond the limits. Ask before arrays of these lengths are made."""
+    if vertices > MAX_VERTICES:
+        raise FieldFormatError(f"{vertices} vertices, at most {MAX_VERTICES} are taken", reason="MESH_TOO_LARGE")
+    if triangles > MAX_TRIANGLES:
+        raise FieldFormatError(f"{triangles} triangles, at most {MAX_TRIANGLES} are taken", reason="MESH_TOO_LARGE")
+
+
+def within_unit(colors: Float64Array, top: float = 1.0) -> Float64Array:
+    """Colors of numbers up to ``top`` as such in [0, 1]; what is no number is black."""
+    return np.nan_to_num(colors / top, nan=0.0, posinf=1.0, neginf=0.0).clip(0.0, 1.0)
+
+
+def fans(polygons: npt.NDArray[Any]) -> Int64Array:
+    """(F, 3) triangles from (P, n) polygons of n >= 3 corners each, as fans round their first corner."""
+    corners = np.asarray(polygons, dtype=np.int64)
+    parts = [corners[:, [0, i, i + 1]] for i in range(1, corners.shape[1] - 1)]
+    triangles: Int64Array = np.concatenate(parts) if parts else np.zeros((0, 3), np.int64)
+    return triangles
+
+
+def strips(order: npt.NDArray[Any]) -> Int64Array:
+    """(F, 3) triangles from corners (N,) in strips, which -1 parts; every second triangle of a strip is turned."""
+    corners = np.asarray(order, dtype=np.int64)
+    if len(corners) < 3:
+        return np.zeros((0, 3), np.int64)
+    place = np.arange(len(corners))
+    begun = np.maximum.accumulate(np.where(corners == -1, place + 1, 0))
+    triangles = np.stack((corners[:-2], corners[1:-1], corners[2:]), axis=1)
+    turned = ((place - begun)[:-2] % 2 == 1)[:, None]
+    triangles = np.where(turned, triangles[:, [1, 0, 2]], triangles)
+    whole: Int64Array = triangles[(triangles != -1).all(axis=1)]
+    return whole
+
+
+def fan(order: npt.NDArray[Any]) -> Int64Array:
+    """(N - 2, 3) triangles of corners (N,) round the first of them."""
+    corners = np.asarray(order, dtype=np.int64)
+    return fans(corners[None]) if len(corners) >= 3 else np.zeros((0, 3), np.int64)
+
+
+# Wavefront OBJ: vertices and polygons. Everything else is ignored; no other file is opened.
+
+_COMMANDS = (b"call", b"csh")
+_NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"l": "lines", b"p": "points"}
+_SURFACE = b"surf"
+
+
+def read_obj(data: memoryview) -> Geometry:
+    """The polygons of an OBJ file, as fans of triangles. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, or
+    MESH_EXTERNAL_REFERENCE for one that would have a command run.
+    """
+    vertices: list[list[float]] = []
+    colors: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    left_out: set[str] = set()
+    flat = surfaces = 0
+    for line in bytes(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == b"v":
+            vertices.append(_place(words))
+            colors.extend(_color(words))
+        elif words[0] == b"f":
+            corners = [_index(word, len(vertices)) for word in words[1:]]
+            flat += len(corners) < 3
+            triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
+            require_room(len(vertices), len(triangles))
+        elif words[0] in _COMMANDS:
+            raise elsewhere("the OBJ file refers to another file or to a command")
+        elif words[0] == _SURFACE:
+            surfaces += 1
+        elif words[0] in _NOTED:
+            left_out.add(_NOTED[words[0]])
+    require_room(len(vertices), len(triangles))
+    return Geometry(
+        np.array(vertices, dtype=np.float64).reshape(-1, 3),
+        np.array(triangles, dtype=np.int64).reshape(-1, 3),
+        colors=_shares(np.array(colors)) if vertices and len(colors) == len(vertices) else None,
+        left_out=(*sorted(left_out), *([f"{flat} faces of fewer than three corners"] if flat else [])),
+        not_applied=(f"{surfaces} free-form surfaces",) if surfaces else (),
+    )
+
+
+def _place(words: list[bytes]) -> list[float]:
+    try:
+        x, y, z = map(float, words[1:4])  # a fourth number is a weight, more are a color
+    except ValueError as error:
+        raise not_numbers("an OBJ vertex is not three numbers", b" ".join(words)) from error
+    return [x, y, z]
+
+
+def _shares(colors: Float64Array) -> Float64Array:
+    """Colors in [0, 1]; no standard says what 1 is, and some write numbers up to 255."""
+    return within_unit(colors, 255.0 if colors.max() > 1.0 else 1.0)
+
+
+def _color(words: list[bytes]) -> list[list[float]]:
+    """The three numbers behind a vertex's place, if there are so many and they are numbers."""
+    try:
+        return [list(map(float, words[-3:]))] if len(words) in (7, 8) else []
+    except ValueError:
+        return []
+
+
+def _index(word: bytes, so_far: int) -> int:
+    """A corner as v, v/vt, v//vn or v/vt/vn: counted from 1, or backwards from the latest vertex."""
+    try:
+        number = int(word.partition(b"/")[0])
+    except ValueError as error:
+        raise malformed("an OBJ face has a corner that is not a number") from error
+    if number == 0 or abs(number) >= 1 << 62:
+        raise malformed("an OBJ face has a corner of no vertex")
+    return number - 1 if number > 0 else so_far + number
+
+
+# STL, binary and text: loose triangles.
+
+_COUNT_AT, _FACETS_AT, _FACET_BYTES = 80, 84, 50
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def read_stl(data: memoryview) -> Geometry:
+    """The triangles of an STL file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
+    count = int.from_bytes(data[_COUNT_AT:_FACETS_AT], "little")
+    behind = len(data) - (_FACETS_AT + _FACET_BYTES * count)
+    text = bytes(data).lstrip(b"\xef\xbb\xbf \t\r\n")
+    is_text = text[:5].lower() == b"solid"
+    if len(data) >= _FACETS_AT and (behind == 0 or (behind > 0 and not is_text)):
+        require_room(3 * count, count)
+        facets = np.frombuffer(data[_FACETS_AT:], dtype=_FACET, count=count)
+        found = _loose(facets["corners"].reshape(-1, 3).astype(np.float64))
+        return replace(found, left_out=(f"{behind} bytes behind the triangles",)) if behind else found
+    if not is_text:
+        raise malformed(f"the STL file ends within its {count} facets")
+    return _loose(_corners_of_text(text.partition(b"\n")[2] if b"\n" in text else text))  # its name may say `vertex`
+
+
+def _corners_of_text(text: bytes) -> Float64Array:
+    words = text.split()
+    at = [i for i, word in enumerate(words) if word.lower() == b"vertex"]
+    require_room(len(at), len(at) // 3)
+    try:
+        return np.array([[float(word) for word in words[i + 1 : i + 4]] for i in at], dtype=np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise not_numbers("an STL vertex is not three numbers", text) from error
+
+
+def _loose(corners: Float64Array) -> Geometry:
+    if len(corners) % 3:
+        raise malformed("an STL facet without three vertices")
+    return Geometry(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
+
+
+# OFF (Geomview), text and binary: vertices, their normals and colors, polygons. Texture coordinates are ignored.
+
+_MAGIC = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?(C)?(N)?(4)?(n)?OFF(?:[ \t]*BINARY)?")
+_MAX_CORNERS, _MAX_COLORS = 255, 8
+_MOST_HEAD = 16 * 1024  # comments may stand before the magic word
+_TRIANGLE_INTS = 5
+
+
+def read_off(data: memoryview) -> Geometry:
+    """The polygons of an OFF file, as fans of triangles. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, or
+    FORMAT_NOT_SUPPORTED for one of another dimension than three.
+    """
+    head = bytes(data[:_MOST_HEAD])
+    magic = _MAGIC.match(head)
+    if magic is None:
+        raise malformed("no OFF file")
+    texture, color, normal, four, any_dimension = (group is not None for group in magic.groups())
+    if four or any_dimension:
+        raise unsupported("an OFF file of other than three dimensions")
+    if magic.group().endswith(b"BINARY"):
+        line = head.find(b"\n", magic.end())
+        if line < 0:
+            raise malformed("an OFF file that ends within its first line")
+        return _binary(data[line + 1 :], 3 + 3 * normal + 4 * color + 2 * texture, normal, color)
+    return _text(bytes(data[magic.end() :]), normal, color)
+
+
+def _text(text: bytes, normal: bool, color: bool) -> Geometry:
+    lines = _lines(text)
+    vertices, faces = _counts([int(_number(word)) for word in next(lines, [])[:3]])
+    places, colors = [], []
+    for _ in range(vertices):
+        words = next(lines, [])
+        places.append(_places(words, normal))
+        colors.extend(_off_color(words[6 if normal else 3 :]) if color else [])
+    triangles: list[tuple[int, int, int]] = []
+    for _ in range(faces):
+        corners = _corners(next(lines, []))
+        triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
+        require_room(vertices, len(triangles))
+    table = np.array(places, dtype=np.float64).reshape(vertices, 6 if normal else 3)
+    painted = np.array(colors) if colors and len(colors) == vertices else None
+    return _geometry(table, np.array(triangles, dtype=np.int64).reshape(-1, 3), normal, painted)
+
+
+def _lines(text: bytes) -> Iterator[list[bytes]]:
+    """The words of every line that says something."""
+    for line in text.splitlines():
+        words = line.partition(b"#")[0].split()
+        if words:
+            yield words
+
+
+def _counts(numbers: list[int]) -> tuple[int, int]:
+    if len(numbers) < 2 or min(numbers) < 0:
+        raise malformed("an OFF file without the numbers of its vertices and faces")
+    require_room(numbers[0], numbers[1])
+    return numbers[0], numbers[1]
+
+
+def _places(words: list[bytes], normal: bool) -> list[float]:
+    wanted = 6 if normal else 3
+    if len(words) < wanted:
+        raise malformed("an OFF vertex of too few numbers, or none")
+    return [_number(word) for word in words[:wanted]]
+
+
+def _corners(words: list[bytes]) -> list[int]:
+    count = int(_number(words[0])) if words else 0
+    if not 1 <= count <= _MAX_CORNERS or len(words) <= count:
+        raise malformed("an OFF face of too few corners, or none")
+    return [int(_number(word)) for word in words[1 : count + 1]]
+
+
+def _number(word: bytes) -> float:
+    try:
+        number = float(word)
+    except ValueError as error:
+        raise not_numbers("an OFF file holds a word that is not a number", word) from error
+    if not abs(number) < 1e300:
+        raise malformed("an OFF file holds a number that is not finite")
+    return number
+
+
+def _off_color(words: list[bytes]) -> list[list[float]]:
+    """The first three numbers, if there are so many; whole ones are shares of 255."""
+    try:
+        numbers = [float(word) for word in words[:3]]
+    except ValueError:
+        return []
+    top = 1.0 if any(b"." in word for word in words[:3]) else 255.0
+    return [[number / top for number in numbers]] if len(numbers) == 3 else []
+
+
+def _binary(data: memoryview, columns: int, normal: bool, color: bool) -> Geometry:
+    if len(data) < 12:
+        raise malformed("an OFF file without the numbers of its vertices and faces")
+    vertices, faces = _counts(np.frombuffer(data[:12], ">i4").tolist())
+    size = 4 * columns * vertices
+    if 12 + size > len(data):
+        raise malformed("the OFF file ends within its vertices")
+    table = np.frombuffer(data[12 : 12 + size], ">f4").reshape(vertices, columns).astype(np.float64)
+    start = 6 if normal else 3
+    return _geometry(
+        table, _binary_faces(data[12 + size :], faces), normal, table[:, start : start + 3] if color else None
+    )
+
+
+def _binary_faces(data: memoryview, faces: int) -> Int64Array:
+    size = 4 * _TRIANGLE_INTS * faces
+    if size <= len(data):
+        rows = np.frombuffer(data[:size], ">i4").reshape(faces, _TRIANGLE_INTS)
+        if (rows[:, 0] == 3).all() and (rows[:, 4] == 0).all():
+            return fans(rows[:, 1:4])
+    found: list[Int64Array] = []
+    at = triangles = 0
+    for _ in range(faces):
+        count = int.from_bytes(data[at : at + 4], "big")
+        end = at + 4 + 4 * count
+        colors = int.from_bytes(data[end : end + 4], "big") if count <= _MAX_CORNERS else 0
+        if not 1 <= count <= _MAX_CORNERS or colors > _MAX_COLORS or end + 4 + 4 * colors > len(data):
+            raise malformed("the OFF file has a face of no corners or too many, or ends within its faces")
+        found.append(fan(np.frombuffer(data[at + 4 : end], ">i4")))
+        triangles += max(count - 2, 0)
+        require_room(0, triangles)
+        at = end + 4 + 4 * colors
+    return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
+
+
+def _geometry(table: Float64Array, triangles: Int64Array, normal: bool, colors: Float64Array | None) -> Geometry:
+    painted = None if colors is None else within_unit(colors)
+    return Geometry(table[:, :3], triangles, table[:, 3:6] if normal else None, painted)
