@@ -66,7 +66,7 @@ AFTER: list[tuple[Case, Call]] = [
 ]  # fmt: skip
 
 
-def check(case: Case, call: Callable[[], object]) -> None:
+def assert_refused(case: Case, call: Callable[[], object]) -> None:
     with pytest.raises(RegnfError) as caught:
         call()
     assert caught.value.reason == case.reason, caught.value
@@ -77,13 +77,13 @@ def check(case: Case, call: Callable[[], object]) -> None:
 
 @pytest.mark.parametrize(("case", "call"), [pytest.param(*one, id=one[0].name) for one in BEFORE])
 def test_what_is_refused_before_anything_is_sent(case: Case, call: Call, client: Client, counted: Counted) -> None:
-    check(case, lambda: call(client))
+    assert_refused(case, lambda: call(client))
     assert counted.requests == []
 
 
 @pytest.mark.parametrize(("case", "call"), [pytest.param(*one, id=one[0].name) for one in AFTER])
 def test_what_the_service_refuses(case: Case, call: Call, client: Client) -> None:
-    check(case, lambda: call(client))
+    assert_refused(case, lambda: call(client))
 
 
 MADE = [
@@ -96,22 +96,22 @@ MADE = [
 
 @parametrized(MADE)
 def test_what_no_client_is_made_of(case: Case) -> None:
-    check(case, lambda: Client(**case.how))
+    assert_refused(case, lambda: Client(**case.how))
 
 
 def test_a_service_that_does_not_run() -> None:
     case = Case("", "SERVICE_UNAVAILABLE", 0, "http://127.0.0.1:1", "does not answer", "regnf serve")
     with Client("http://127.0.0.1:1", retries=0) as client:
-        check(case, client.jobs)
+        assert_refused(case, client.jobs)
 
 
 def test_a_service_that_is_another() -> None:
     case = Case("", "SERVICE_ERROR", 0, "the answer is no Job", "id", "another service's")
-    check(case, lambda: pretended(lambda _: httpx.Response(200, json={"status": "fine"})).job("j"))
+    assert_refused(case, lambda: pretended(lambda _: httpx.Response(200, json={"status": "fine"})).job("j"))
     case = Case(
         "", "SERVICE_ERROR", 0, "HTTP status 200 from http://service/jobs/j", "no regnf service", "Check address"
     )
-    check(case, lambda: pretended(lambda _: httpx.Response(200, text="<html>")).job("j"))
+    assert_refused(case, lambda: pretended(lambda _: httpx.Response(200, text="<html>")).job("j"))
 
 
 @pytest.mark.parametrize("token", [None, "the-secret-of-eve"])
@@ -120,4 +120,4 @@ def test_a_token_that_is_missing_or_wrong(token: str | None, tmp_path: Path, any
     transport = AppTransport(world.app)
     case = Case("", "UNAUTHENTICATED", 401, "token|Authorization", "valid token|token", "REGNF_API_TOKEN")
     with world.client, Client("http://localhost", token, transport=transport) as client:
-        check(case, client.jobs)
+        assert_refused(case, client.jobs)

@@ -226,6 +226,7 @@ def test_several_files_become_entries_and_leaving_meanwhile_is_asked_about(
     for route in held:
         route.continue_()
     expect(page.locator("#entry-dialog")).to_be_hidden(timeout=20_000)
+    expect(page.locator(".tile h2")).to_have_count(2)  # the list is asked for anew once the dialog is closed
     assert sorted(page.locator(".tile h2").all_inner_texts()) == ["chair", "stool"]
     expect(page.get_by_role("button", name="Show the tag seat")).to_have_count(2)
     assert not page.evaluate(asks)
