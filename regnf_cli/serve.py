@@ -7,8 +7,13 @@ from typing import Annotated
 
 import typer
 
-from regnf_cli.demo import demo_folder
 from regnf_cli.guard import require
+from regnf_core.errors import InvalidInputError
+
+_PACKAGED = Path(__file__).with_name("demo_files")
+_CHECKOUT = Path(__file__).resolve().parents[1] / "examples" / "data"
+FILES = ("mix-room.safetensors", "armchair.safetensors", "detection.json", "truth.json")
+"""What the demo needs; the build of the wheel copies these files into the package."""
 
 
 def serve(
@@ -37,6 +42,18 @@ def serve(
         settings = settings.model_copy(update={"demo_dir": demo_folder()})
     configure_logging(settings.log_format)
     Supervisor(settings).run(ready=lambda address: typer.echo(f"regnf serves {address} (Ctrl+C stops it)"))
+
+
+def demo_folder() -> Path:
+    """The folder that holds all of ``FILES``. Raises InvalidInputError (DEMO_DATA_MISSING)."""
+    for folder in (_PACKAGED, _CHECKOUT):
+        if all((folder / name).is_file() for name in FILES):
+            return folder
+    raise InvalidInputError(
+        f"the demo's files ({', '.join(FILES)}) are neither in {_PACKAGED} nor in {_CHECKOUT}; "
+        "install regnf from its wheel or run from a checkout",
+        reason="DEMO_DATA_MISSING",
+    )
 
 
 if __name__ == "__main__":

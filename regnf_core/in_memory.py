@@ -103,8 +103,8 @@ def from_grid(values: Any, origin: Any, spacing: Any, description: Said = None) 
     Raises FieldFormatError: TENSOR_SHAPE, TENSOR_DTYPE, TENSOR_NOT_FINITE, BOUNDS_INVALID, NO_ZERO_LEVEL,
     FIELD_IMPLAUSIBLE, INVALID_DESCRIPTION.
     """
+    from regnf_core.importing.arrays import finite_float32
     from regnf_core.importing.families.dense_grid import grid_field
-    from regnf_core.importing.upload_description import finite_float32
 
     array = _array("values", values, "TENSOR_DTYPE")
     if array.ndim != 3 or min(array.shape) < 2:

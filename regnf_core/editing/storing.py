@@ -14,8 +14,9 @@ from torch import Tensor
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import ColoredField, SdfField, has_color, observation_of
-from regnf_core.schema.description import COLOR, OBSERVATION, VALUES, ValueColor, color_tensors, moved_box, shift_rows
+from regnf_core.schema.description import COLOR, OBSERVATION, VALUES, ValueColor, color_tensors
 from regnf_core.schema.safe_format import write_safe_field
+from regnf_core.schema.similarity import moved_box, shift_rows
 from regnf_core.surface.isosurface import Lattice
 
 _SLAB_POINTS = 1 << 18

@@ -22,7 +22,7 @@ from regnf_core.fields.observation import (
     observation_of,
 )
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.description import local_origin
+from regnf_core.schema.similarity import local_origin
 
 
 @runtime_checkable

@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
 from regnf_core.importing.containers.legacy_container import Entry
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder, StorageRef, TensorRef
-from regnf_core.importing.upload_description import Float32Array, finite_float32, require_possible, tensor_error
 
 _STORED: dict[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),

@@ -21,7 +21,7 @@ from regnf_core.geometry.metrics import Symmetries, errors_against_truth, paper_
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.result import Alternative, Considered, ConsideredPose, IterationRecord, RegistrationResult
-from regnf_core.schema.description import local_origin
+from regnf_core.schema.similarity import local_origin
 from regnf_core.version import __version__
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, registration_picture
 

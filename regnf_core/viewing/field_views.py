@@ -20,8 +20,8 @@ from regnf_core.field_notes import FieldViews
 from regnf_core.fields.build import open_field
 from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import SdfField, has_color
-from regnf_core.schema.description import local_origin
 from regnf_core.schema.safe_format import read_description
+from regnf_core.schema.similarity import local_origin
 from regnf_core.surface.isosurface import extract_surface
 from regnf_core.viewing.field_picture import field_picture
 

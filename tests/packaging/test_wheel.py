@@ -13,8 +13,8 @@ from zipfile import ZipFile
 import pytest
 import yaml
 
-from regnf_cli.demo import FILES
 from regnf_cli.manual import pages_of
+from regnf_cli.serve import FILES
 from regnf_core.version import __version__
 from scripts import wheel_hook
 from tests.packaging.environments import ROOT, build_wheel, clean_environment, install_wheel, run

@@ -40,10 +40,10 @@ def test_nothing_that_is_loaded_starts_threads_and_a_child_computes() -> None:
 def test_what_starts_threads_is_refused() -> None:
     code = """
 import threading
-from regnf_worker import preload
+from regnf_worker import main
 threading.Thread(target=threading.Event().wait, daemon=True).start()
-preload._MODULES = ()
-preload.preload()
+main._MODULES = ()
+main.preload()
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert "PreloadError" in ended.stderr

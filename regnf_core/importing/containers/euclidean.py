@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from regnf_core.importing.upload_description import Float32Array, tensor_error
-from regnf_core.schema.description import local_origin
+from regnf_core.importing.arrays import Float32Array, tensor_error
+from regnf_core.schema.similarity import local_origin
 
 # What maps of voxel blocks share, whatever wrote them: unobserved voxels, the bounds, the weights.
 

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from numpy.lib import format as npy
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
 from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, malformed, read_members
-from regnf_core.importing.upload_description import Float32Array, finite_float32, require_possible, tensor_error
 
 # The header of a .npy array, read by numpy. Nothing behind the header is read, so no pickle is ever opened.
 #

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.upload_description import StoredArray
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.schema.description import COLOR, FieldDescription, NetworkColor
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.kinds import NeuralPointsDescription

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.mesh_work import GRADIENT, Calls
 from regnf_core.importing.cost.onnx_numbers import (
     Attributes,
@@ -24,7 +25,6 @@ from regnf_core.importing.cost.onnx_numbers import (
     needed,
 )
 from regnf_core.importing.cost.onnx_shaping import SHAPING_RULES
-from regnf_core.importing.upload_description import StoredArray
 from regnf_core.schema.kinds import NodeDescription, OnnxDescription, last_uses
 
 # The shape of every operator's results, from the shapes of what goes in: ONNX's rules, nothing is evaluated.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import require_shape, tensor_error
 from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces, space_readings
@@ -26,7 +27,7 @@ from regnf_core.importing.families.layers import (
     strip_prefix,
 )
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import GridDescription, UploadDescription, require_shape, tensor_error
+from regnf_core.importing.upload_description import GridDescription, UploadDescription
 
 FAMILY = "co_slam"
 _NETWORK, _TABLE, _COLORS = "decoder.sdf_net.model.", "embed_fn.params", "decoder.color_net."

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.upload_description import StoredArray
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.schema.description import FREE, OBSERVATION, UNSEEN, ObservationGrid
 
 

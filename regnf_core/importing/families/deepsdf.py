@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
@@ -29,7 +30,7 @@ from regnf_core.importing.families.layers import (
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
 from regnf_core.importing.pickle.pickle_machine import TensorRef
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY, IGR = "deepsdf", "igr"
 _PREFIXES = ("module.lin", "lin")

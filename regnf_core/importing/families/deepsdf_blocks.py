@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.deepsdf import at_code, latent_code
 from regnf_core.importing.families.layers import (
@@ -26,7 +27,7 @@ from regnf_core.importing.families.layers import (
 )
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import UploadDescription, require_shape, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "deepsdf_blocks"
 _USUAL = 3

@@ -9,18 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
 from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface, filled_nodes, stored_weights
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.upload_description import (
-    Float32Array,
-    StoredArray,
-    UploadDescription,
-    require_shape,
-    tensor_error,
-)
-from regnf_core.schema.description import local_origin
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.similarity import local_origin
 
 FAMILY = "dense_sdf_grid"
 _VALUES = ("sdf", "values")

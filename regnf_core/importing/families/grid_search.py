@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.families.grid_space import MAX_BASE, GridInterval, GridSpace, solve
 from regnf_core.importing.families.layers import contradiction
-from regnf_core.importing.upload_description import Float32Array, GridDescription
+from regnf_core.importing.upload_description import GridDescription
 from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig, Interpolation
 
 _MAX_LEVELS = 32

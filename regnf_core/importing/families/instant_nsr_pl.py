@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.color import instant_nsr_pl as color
 from regnf_core.importing.families.color.head import with_color, with_deviation, with_hidden_factor
 from regnf_core.importing.families.converted import ConvertedField, Reading, Variant, converted_of
@@ -33,7 +34,7 @@ from regnf_core.importing.families.layers import (
     strip_prefix,
 )
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape
+from regnf_core.importing.upload_description import UploadDescription
 
 # Whether a network began as the distance to a sphere (Atzmon and Lipman 2020): what is left of it after training.
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import (
     layer_names,
@@ -23,7 +24,7 @@ from regnf_core.importing.families.layers import (
 )
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import UploadDescription, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "isdf"
 _INPUT_SCALE, _OUTPUT_SCALE = 0.05937489, 0.14

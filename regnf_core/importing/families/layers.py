@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.pickle.pickle_machine import TensorRef
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
-from regnf_core.schema.description import shift_rows
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.similarity import shift_rows
 from regnf_core.schema.tensor_check import MAX_LAYERS
 
 # Chains of linear layers in a state dictionary: each sees what the one before gives, perhaps with the input again.

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, tensor_error
 from regnf_core.importing.families.converted import ConvertedField, Reading, Variant, converted_of
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
@@ -27,7 +28,7 @@ from regnf_core.importing.families.layers import (
 from regnf_core.importing.families.network import Form, Network, OpenForm, encoding_order, network_field
 from regnf_core.importing.families.offset_grids import offset_readings, read_table
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import Float32Array, UploadDescription, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "monosdf"
 _ENTRIES = ("hash", "use_grid", "positional_encoding", "output_column")

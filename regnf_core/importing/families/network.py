@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array
 from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
 from regnf_core.importing.families.layers import Layers, contradiction, require_extra_columns
-from regnf_core.importing.upload_description import Float32Array, UploadDescription
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds import LEAKY_SLOPE
 
 OMEGA, BETA = 30.0, 100.0

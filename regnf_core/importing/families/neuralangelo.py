@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces, most_usual, space_readings, step_of
@@ -29,7 +30,7 @@ from regnf_core.importing.families.layers import (
     strip_prefix,
 )
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, GridDescription, UploadDescription, require_shape
+from regnf_core.importing.upload_description import GridDescription, UploadDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 FAMILY = "neuralangelo"

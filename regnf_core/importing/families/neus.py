@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.color import neus as color
 from regnf_core.importing.families.color.head import ReadColor, understood, with_color, with_deviation, without_color
 from regnf_core.importing.families.converted import ConvertedField
@@ -39,7 +40,7 @@ from regnf_core.importing.families.network import (
     told,
 )
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import UploadDescription, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "neus"
 _SCALES = (1.0, 3.0)

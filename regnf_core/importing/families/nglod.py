@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
@@ -19,7 +20,7 @@ from regnf_core.importing.families.layers import (
     strip_prefix,
 )
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "nglod"
 

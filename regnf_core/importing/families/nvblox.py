@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
 from regnf_core.importing.containers.euclidean import (
     PROJECTIVE,
     BoolArray,
@@ -21,13 +22,7 @@ from regnf_core.importing.containers.euclidean import (
 from regnf_core.importing.containers.sqlite_source import TableSource
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.upload_description import (
-    Float32Array,
-    StoredArray,
-    UploadDescription,
-    finite_float32,
-    tensor_error,
-)
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "nvblox"
 _DATA, _SETTINGS = "_data", "_metadata"

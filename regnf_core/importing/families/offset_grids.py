@@ -14,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.families.grid_search import finest_of, grid_readings, most_usual
 from regnf_core.importing.families.grid_space import GridInterval, GridSpace
 from regnf_core.importing.families.layers import contradiction
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, GridDescription, require_shape, tensor_error
+from regnf_core.importing.upload_description import GridDescription
 from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig, Interpolation
 
 _MAX_LOG2_SIZE = 24

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
@@ -19,7 +20,7 @@ from regnf_core.importing.families.layers import (
     shared_entries,
 )
 from regnf_core.importing.onnx.model import Array, Attribute, Model, Node, Port, as_of_13, read_model, unsupported
-from regnf_core.importing.upload_description import StoredArray, UploadDescription
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds import MAX_BATCH, MAX_NUMBERS
 from regnf_core.schema.onnx_operators import OPERATORS
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import (
@@ -25,7 +26,7 @@ from regnf_core.importing.families.layers import (
 )
 from regnf_core.importing.pickle.pickle_machine import Placeholder
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import Float32Array, UploadDescription, require_shape, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "pin_slam"
 _OBJECT = "NeuralPoints"

@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from regnf_core.importing.arrays import Float32Array
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import Layers, contradiction, refuse_other_entries, require_family
 from regnf_core.importing.families.network import FORM_ENTRIES
 from regnf_core.importing.families.plain_network import FAMILY, plain_field
-from regnf_core.importing.upload_description import Float32Array, UploadDescription
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.tensor_check import MAX_LAYERS
 
 _NAME = re.compile(r"(kernel|weights?|bias(es)?|w|b)", re.IGNORECASE)

@@ -9,10 +9,11 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.field_notes import WARNINGS, kept_warnings
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.containers.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import refuse_other_entries, require_family
-from regnf_core.importing.upload_description import StoredArray, UploadDescription
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.description import COLOR, OBSERVATION, split_color
 from regnf_core.schema.safe_format import read_description
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.color import studio
 from regnf_core.importing.families.color.head import with_assumption, with_color, with_deviation
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
@@ -31,7 +32,7 @@ from regnf_core.importing.families.layers import (
 )
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder
 from regnf_core.importing.tensor_source import TensorSource, as_tensor, lookup
-from regnf_core.importing.upload_description import Float32Array, GridDescription, UploadDescription, require_shape
+from regnf_core.importing.upload_description import GridDescription, UploadDescription
 from regnf_core.schema.kinds import SKIP_LAYER
 
 _RADIUS = 2.0

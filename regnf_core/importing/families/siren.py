@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
@@ -18,7 +19,7 @@ from regnf_core.importing.families.layers import (
 )
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import UploadDescription, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "siren"
 OMEGAS = (30.0, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 60.0, 100.0)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces, most_usual, space_readings
 from regnf_core.importing.families.layers import (
@@ -31,13 +32,7 @@ from regnf_core.importing.families.layers import (
 )
 from regnf_core.importing.families.offset_grids import not_recognized, offset_readings, read_table
 from regnf_core.importing.tensor_source import TensorSource, lookup
-from regnf_core.importing.upload_description import (
-    Float32Array,
-    GridDescription,
-    UploadDescription,
-    require_shape,
-    tensor_error,
-)
+from regnf_core.importing.upload_description import GridDescription, UploadDescription
 
 FAMILY = "torch_ngp"
 _OWN, _TCNN = ("encoder.embeddings", "encoder.offsets", "backbone.0.weight"), ("encoder.params", "backbone.params")

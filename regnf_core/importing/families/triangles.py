@@ -29,7 +29,7 @@ from regnf_core.importing.families.facing import (
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.description import local_origin
+from regnf_core.schema.similarity import local_origin
 
 # Parts of a mesh whose faces look into them, while those of the rest face free space: they would be no matter.
 #

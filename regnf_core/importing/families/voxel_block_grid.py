@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, StoredArray, tensor_error
 from regnf_core.importing.containers.euclidean import (
     PROJECTIVE,
     IntArray,
@@ -26,7 +27,7 @@ from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.color.head import with_values
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.upload_description import Float32Array, StoredArray, UploadDescription, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "open3d_voxel_block_grid"
 _NEEDED = ("key", "block_resolution", "voxel_size", "attr_name_tsdf")

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.mesh_work import (
     COLOR_POINTS,
     SAMPLES,
@@ -24,7 +25,6 @@ from regnf_core.importing.cost.onnx_work import onnx_bytes, onnx_work
 from regnf_core.importing.families.color.head import ASSUMED, LEFT_OUT
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.importing.upload_description import StoredArray
 from regnf_core.schema.description import COLOR, FieldDescription, NetworkColor, split_color
 from regnf_core.schema.kinds import MeshDescription, OnnxDescription
 from regnf_core.schema.safe_format import parse_description, tensor_specs

@@ -23,8 +23,8 @@ from regnf_core.fields.grid_mlp import BoxExtension, GridMlpFunction
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.fields.observation import SdfField
 from regnf_core.fields.user_fields import FunctionField
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.families.converted import Reading
-from regnf_core.importing.upload_description import StoredArray
 from regnf_core.schema.safe_format import parse_description
 
 # How much each level of a hash grid does for the gradient's norm: what a level read by another layout cannot do.

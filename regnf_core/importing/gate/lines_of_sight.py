@@ -14,11 +14,12 @@ import torch
 from regnf_core.errors import FieldFormatError, InvalidInputError
 from regnf_core.fields.build import build_field
 from regnf_core.fields.observation import SdfField
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.mesh_work import Calls
 from regnf_core.importing.gate.cost_estimate import seconds_of
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.observing.trajectory import Array, Trajectory
-from regnf_core.importing.upload_description import StoredArray, UploadDescription
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.description import OBSERVATION, ObservationGrid
 from regnf_core.schema.safe_format import parse_description
 from regnf_core.surface.observing import observe_by_cameras

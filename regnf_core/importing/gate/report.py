@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.processes import memory_of_the_machine
-from regnf_core.schema.description import moved_box, product, shift_rows
+from regnf_core.schema.similarity import moved_box, product, shift_rows
+
+if TYPE_CHECKING:
+    from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.upload_description import UploadDescription
 
 MIB = 1024 * 1024
 

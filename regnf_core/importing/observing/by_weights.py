@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.upload_description import StoredArray
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.schema.description import FARTHEST, FREE, MAX_COUNT, SURFACE, UNSEEN, ObservationGrid
 from regnf_core.schema.kinds import WEIGHTS
 

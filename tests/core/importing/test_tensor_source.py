@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import require_shape
 from regnf_core.importing.containers.legacy_container import read_archive
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import require_shape
 from tests.core.importing.archives import assert_refused, patched, tensor, torch_zip, zip_bytes
 
 SIX = struct.pack("<6f", *range(6))

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
 from regnf_core.importing.families.layers import folded_weight
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import Float32Array, StoredArray, require_shape, tensor_error
 from regnf_core.schema.description import COLOR, VALUES, NetworkColor, ValueColor, color_tensors
 from regnf_core.schema.tensor_check import MAX_LAYERS
 

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.color.head import ColorNetwork, Pair, read_network, read_pair, understood
 from regnf_core.importing.families.layers import strip_prefix
 from regnf_core.importing.tensor_source import TensorSource
-from regnf_core.importing.upload_description import ColorOverrides, Float32Array, require_shape, tensor_error
+from regnf_core.importing.upload_description import ColorOverrides
 from regnf_core.schema.description import DirectionEncoding, NetworkColor
 
 _PREFIX = "model.texture."

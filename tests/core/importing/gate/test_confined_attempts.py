@@ -31,7 +31,7 @@ PROGRAM = f"""
 import ctypes, json, os, sys
 sys.path.insert(0, {str(ROOT)!r})
 from pathlib import Path
-from regnf_core.importing.gate import landlock, sandbox
+from regnf_core.importing.gate import sandbox
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.attempts import run_all
 where = json.load(sys.stdin)
@@ -44,7 +44,7 @@ elif where["layer"] != "nothing":
     if where["layer"] == "filter":
         granted = {{"filter": sandbox.refuse_system_calls()}}
     else:
-        granted = {{"landlock": landlock.restrict_files([upload, *sandbox._readable()], home)}}
+        granted = {{"landlock": sandbox.restrict_files([upload, *sandbox._readable()], home)}}
 print(json.dumps([granted, run_all(where)]))
 """
 Results = tuple[dict[str, bool], dict[str, str]]

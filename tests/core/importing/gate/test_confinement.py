@@ -218,7 +218,7 @@ def test_there_are_no_privileges_and_none_can_be_gained(tmp_path: Path) -> None:
 
 def test_a_kernel_without_landlock_is_told(tmp_path: Path) -> None:
     """The filter and the namespace hold; only the report says that files are as readable as the user makes them."""
-    program = "from regnf_core.importing.gate import landlock\nlandlock._CREATE_RULESET = 100_000\n" + CONFINE
+    program = "from regnf_core.importing.gate import sandbox\nsandbox._CREATE_RULESET = 100_000\n" + CONFINE
     granted = tell(tmp_path, program + "print(json.dumps(granted))")
     assert granted["files_restricted"] is False
     assert granted["no_new_privileges"] is True
