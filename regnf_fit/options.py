@@ -93,10 +93,10 @@ class FitReport:
 
 Start = Literal["auto", "object", "room"]
 """The shape a field starts from: a ball in free space, a hollow ball in matter, or what the images
-suggest (:mod:`.starting`)."""
+suggest (`images/preparation.py`)."""
 
 OF_IMAGES = grid_of_levels(8)
-"""Stands for the grid that the images ask for (:mod:`.capacity`), where no other one is given."""
+"""Stands for the grid that the images ask for (`images/fit.py`), where no other one is given."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ class ReconstructionOptions(NetworkOptions):
     """At least so far before it, in standard deviations of one image's depths from another's, and half as far behind:
     the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
-    """The share of rays or of the map's points that are drawn from those at detail (:mod:`.detail`): where the surface
-    is not flat, or in the boxes of the dataset's instances, if any; and the share of free points drawn from within
+    """The share of rays or of the map's points that are drawn from those at detail (`images/preparation.py`): where the
+    surface is not flat, or in the boxes of the dataset's instances, if any; and the share of free points drawn from within
     these boxes."""
     weights: LossWeights = field(default_factory=LossWeights)
     levels_at_start: int = 4

@@ -152,7 +152,7 @@ def _averaged(points: NDArray[np.float32], voxel: float) -> NDArray[np.float64]:
 # RGB-D Surface Reconstruction") have it, with two changes for a field that shall be a distance, not one along a ray:
 # the distance along the ray is shortened by the cosine between ray and surface, and free points are given their
 # distance to the nearest measured surface (as Ortiz et al. 2022, "iSDF") in place of the truncation. In rooms, unless
-# poses are corrected, the map that all depths fuse to (:mod:`.map_distances`) tells distances near surfaces instead
+# poses are corrected, the map that all depths fuse to (`fusion.py`) tells distances near surfaces instead
 # of single rays.
 
 _MORE_MATTER = 0.3

@@ -193,7 +193,7 @@ def _error(path: Path, rays: PixelRays) -> float:
     return float(open_field(path).signed_distance(ends_of(rays.take(chosen))).abs().median())
 
 
-# Signed distances near the measured surface, from the map that all depths fuse to (:mod:`.measured_map`).
+# Signed distances near the measured surface, from the map that all depths fuse to.
 #
 # A ray tells the distance along itself, with its own noise; the map has the mean of all rays that pass a place. Its
 # places are drawn evenly over the surface, so that near surfaces and far ones count alike.

@@ -86,7 +86,7 @@ def _alike(symmetry: SelfSymmetry) -> Sim3:
 #
 # There are two such sums. One knows the pose ``alone``. The other knows the candidates ``among`` which it is: its
 # further feature is the pose's lead, how far its log odds alone, less the score's share, lie above those of the next
-# other answer (:mod:`.lead`).
+# other answer (`leads`).
 #
 # "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make
 # equal. The functions are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).

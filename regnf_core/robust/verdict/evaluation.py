@@ -24,7 +24,7 @@ from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidenc
 
 # The verdict on a pose: whether it is probable enough, and where it is not, what is wrong with it in words.
 #
-# The probability (:mod:`.probability`) holds all the evidence together. Below the option ``min_probability`` nothing
+# The probability (`verdict/answer.py`) holds all the evidence together. Below the option ``min_probability`` nothing
 # is accepted. Below ``share_limits_below`` a pose has to keep the limits of three shares too, which are options:
 # another object of the same kind, a chair in another chair's place, may be as probable, but little of its surface
 # agrees, or much of it stands in free space. In addition

@@ -85,7 +85,7 @@ class Evidence:
 class HeldOut:
     """What the held-out samples tell of H poses, on the CPU: all that a verdict is made of, asked of the fields once.
 
-    features: each (H,), by its name, see :mod:`.pose_features` · admitted: (H,) bool, which of the poses the detection
+    features: each (H,), by its name, see `pose_features` · admitted: (H,) bool, which of the poses the detection
     allows.
     """
 
