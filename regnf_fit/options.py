@@ -161,8 +161,8 @@ class ReconstructionOptions(NetworkOptions):
     the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
     """The share of rays or of the map's points that are drawn from those at detail (`images/preparation.py`): where the
-    surface is not flat, or in the boxes of the dataset's instances, if any; and the share of free points drawn from within
-    these boxes."""
+    surface is not flat, or in the boxes of the dataset's instances, if any; and the share of free points drawn from
+    within these boxes."""
     weights: LossWeights = field(default_factory=LossWeights)
     levels_at_start: int = 4
     """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""
