@@ -1,6 +1,6 @@
 """Batches, renderings and imports while every process of the service is killed in turn: what is lost, what is twice.
 
-    python -m benchmarks.service_load.kills [--kills 40] [--every 10] [--pairs 300] [--renders 20] [--imports 20]
+    python -m benchmarks.service_load.kills [--kills 40] [--every 6] [--pairs 900] [--renders 60] [--imports 60]
 
 Killed are, in turn: the API, a worker, a job's own process, Redis. The clients ask as anybody would who wants to
 have everything: a call that fails is made again. In the end every pair, rendering and field must be there, each once,
@@ -134,9 +134,9 @@ def run(folder: Path, asked: argparse.Namespace) -> tuple[list[str], bool]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, usual in (("kills", 40), ("pairs", 300), ("renders", 20), ("imports", 20), ("workers", 2)):
+    for name, usual in (("kills", 40), ("pairs", 900), ("renders", 60), ("imports", 60), ("workers", 2)):
         parser.add_argument(f"--{name}", type=int, default=usual)
-    parser.add_argument("--every", type=float, default=10.0, help="seconds between two kills")
+    parser.add_argument("--every", type=float, default=6.0, help="seconds between two kills")
     parser.add_argument("--output", type=Path)
     asked = parser.parse_args()
     before = load()
