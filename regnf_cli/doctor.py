@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
 
 import typer
-from rich.table import Table
+from rich.markup import escape
+from rich.table import Column, Table
 
 from regnf_cli.checks.libraries import Finding, check_gpu, check_libraries, check_native
 from regnf_cli.guard import require
@@ -65,9 +66,9 @@ def check_all() -> Iterator[Finding]:
 
 
 def _show(findings: list[Finding]) -> None:
-    table = Table(box=None, show_header=False)
+    table = Table("", "", Column(overflow="fold"), box=None, show_header=False)
     for one in findings:
-        table.add_row(f"[{_COLORS[one.state]}]{one.state}[/]", one.subject, one.found)
+        table.add_row(f"[{_COLORS[one.state]}]{one.state}[/]", one.subject, escape(one.found))
     out.print(table)
     for one in findings:
         if one.hint is not None:

@@ -85,7 +85,10 @@ HINTS: dict[str, str] = {
     "of the library.",
     "SURFACE_UNEXPLAINED": "Most often the object is a similar one, for example a chair without its cushion. If "
     "something lies on it, try a tighter box.",
-    "FREE_SPACE_VIOLATED": "Most often it is another object, or the scene's field lacks parts of this one.",
+    "FREE_SPACE_VIOLATED": (
+        "Most often it is another object, or the scene's field lacks parts of this one. "
+        "If neither is so, set up_axis (the object stands upright), or try another seed."
+    ),
     "LOW_PROBABILITY": "Most often it is another object, or one of another shape of the same kind. Otherwise try more "
     "views of it.",
     "OUTSIDE_DETECTION": "Most often it is another object. Around a part of the object, increase the option "

@@ -23,8 +23,11 @@ fi
 # Python compiles what is used, when it is: .venv is a quarter of a gigabyte smaller.
 install=(.venv/bin/python -m pip --disable-pip-version-check --quiet install --no-compile -c constraints.txt)
 echo "Installing into .venv (the first time takes a few minutes) ..."
-# torch first and by its pinned version: an open range may resolve to a build with gigabytes of GPU libraries.
+# torch first and by its pinned version: an open range may resolve to another build.
 "${install[@]}" torch
+if compgen -G '.venv/lib/python*/site-packages/nvidia' >/dev/null && ! [[ -e /dev/nvidia0 ]]; then
+    echo "torch came with 4 GB of libraries for GPUs, and this machine shows none: docs/start/install.md, for CPUs." >&2
+fi
 if [[ ${1-} == demo ]]; then
     "${install[@]}" -e '.[all]'
     stamp+=-demo

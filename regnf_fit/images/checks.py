@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,7 +54,8 @@ def check_seen(images: PosedImages, shown: int) -> None:
     if shown >= _MIN_PIXELS:
         return
     text = f"only {shown} pixels show anything within the bounds, {_box(images.bounds)}"
-    if np.array_equal(images.bounds, USUAL_BOUNDS):
+    is_default = np.array_equal(images.bounds, USUAL_BOUNDS)
+    if is_default:
         text += " (the default where meta_data.json has no scene_box)"
     origins, rays, depths = sampled_rays(images)
     if len(depths) == 0:
@@ -60,7 +63,11 @@ def check_seen(images: PosedImages, shown: int) -> None:
         raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
     ends = np.quantile(origins + depths[:, None] * rays, [0.05, 0.95], axis=0)
     text += f"; depths are {np.median(depths):.4g} in the median and end within {_box(ends)}"
-    hint = _unit_hint(images, origins, rays, depths)
+    if is_default:  # nobody chose these bounds: that another unit would fit them says nothing
+        box = json.dumps({"scene_box": {"aabb": np.round(ends, 3).tolist()}})[1:-1]
+        hint = f"Say in meta_data.json what the field is to cover. Around the depths: {box}"
+    else:
+        hint = _unit_hint(images, origins, rays, depths)
     raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from regnf_cli import doctor
 from regnf_cli.checks import libraries, machine, stores
 from regnf_cli.checks.libraries import Finding
 from regnf_core.fields.native import library
@@ -119,3 +120,8 @@ def test_an_extra_that_one_option_needs_may_be_missing(monkeypatch: pytest.Monke
     found = {extra: libraries._extra(extra) for extra in ("rerun", "embedded")}
     assert {extra: one.state for extra, one in found.items()} == {"rerun": "ok", "embedded": "warning"}
     assert "pip install 'regnf[rerun]'" in found["rerun"].found
+
+
+def test_what_is_printed_can_be_copied(capsys: pytest.CaptureFixture[str]) -> None:
+    doctor._show([Finding("rerun", "warning", "not installed: pip install 'regnf[rerun]'", None)])
+    assert "pip install 'regnf[rerun]'" in capsys.readouterr().out

@@ -101,7 +101,7 @@ def test_from_files_to_a_registered_chair(visit: Visit, files: tuple[Path, Path]
         turn = found["Turn about the up axis, degrees"]
         assert (turn - np.degrees(room.CHAIR_TURN) + 45) % 90 == pytest.approx(45, abs=5)
         page.click("#register")
-        expect(page.locator(".run strong")).to_have_text("Registered: chair.glb")
+        expect(page.locator(".run strong")).to_have_text("Box 1, registered: chair.glb")
         page.click(".run a")
         expect(page.locator("#verdict-word")).to_have_text("Registered")
         page.goto(f"{address}/jobs")

@@ -90,7 +90,7 @@ def test_four_actions_to_a_registered_chair(visit: Visit, serving: str, tmp_path
     page.wait_for_selector("#runs progress")
     recording.frame("4-running")
     page.wait_for_selector(".run[data-verdict], .run .bad", timeout=PATIENCE_MS)
-    expect(page.locator(".run strong")).to_have_text("Registered: chair.glb")
+    expect(page.locator(".run strong")).to_have_text("Box 1, registered: chair.glb")
     page.wait_for_function("() => document.querySelectorAll('#handles button:not([hidden])').length === 0")
     recording.frame("5-registered")
     expect(page.locator(".run")).to_contain_text(f"scale {room.CHAIR_SCALE:.2f}"[:-1])

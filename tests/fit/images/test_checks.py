@@ -60,8 +60,9 @@ def test_bounds_that_were_not_given_are_said(tmp_path: Path) -> None:
     far = images.T_world_camera.copy()
     far[:, :3, 3] += (5.0, 0.0, 0.0)
     cube = np.array([[-1.0] * 3, [1.0] * 3])
-    with pytest.raises(DatasetError, match=r"where meta_data.json has no scene_box.*end within \(4"):
+    with pytest.raises(DatasetError, match=r"where meta_data.json has no scene_box.*end within \(4") as caught:
         fuse_images(replace(images, T_world_camera=far, bounds=cube), tmp_path / "map.safetensors")
+    assert '"scene_box": {"aabb": [[4' in str(caught.value.hint)
 
 
 def test_masks_that_leave_nothing(tmp_path: Path) -> None:

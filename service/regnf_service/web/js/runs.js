@@ -78,7 +78,7 @@ export class Runs {
       `${seconds(took / 1000)} from the click on Register`,
     ].filter(Boolean);
     row.replaceChildren(
-      el('strong', { 'data-tone': tone }, `${words(result.verdict)}: ${nameOf(object)}`),
+      el('strong', { 'data-tone': tone }, `Box ${id}, ${words(result.verdict).toLowerCase()}: ${nameOf(object)}`),
       el('span', {}, result.verdict_detail || words(result.verdict_reason)),
       ...(result.verdict_hint ? [el('span', { className: 'note' }, result.verdict_hint)] : []),
       el('span', { className: 'note' }, facts.join(', ')),
