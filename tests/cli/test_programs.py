@@ -11,7 +11,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = sorted((ROOT / "examples" / "programs").glob("*.py"))
 SAID = {"one": "registered 1.2", "batch": "0 <registered", "search": "registered 1.2"}
-pytestmark = pytest.mark.slow
 
 
 def test_all_three_are_there() -> None:

@@ -179,7 +179,7 @@ def fuzzed(seeds: Seeds, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return results
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
     """No other exception, no import, no file left or opened, nothing slow, nothing large."""
@@ -187,7 +187,7 @@ def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
     assert sum(fuzzed["outcomes"].values()) == CASES
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_the_fuzzer_reaches_what_lies_deep(fuzzed: dict[str, Any]) -> None:
     """A fuzzer whose cases all fail at the first check would find nothing."""
