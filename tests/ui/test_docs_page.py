@@ -32,8 +32,8 @@ def open_docs(visit: Visit, service: RealService, anchor: str = "") -> Page:
 def test_every_operation_is_listed_and_folded(visit: Visit, service: RealService) -> None:
     page = open_docs(visit, service)
     expect(page.locator("nav[aria-label='Addresses'] a[href='#register']")).to_have_text("POST /register")
-    assert page.locator("details.operation[open]").count() == 0
-    assert page.locator("details.operation").count() == page.locator("nav[aria-label='Addresses'] a").count()
+    expect(page.locator("details.operation[open]")).to_have_count(0)
+    expect(page.locator("details.operation")).to_have_count(page.locator("nav[aria-label='Addresses'] a").count())
     page.locator("nav[aria-label='Addresses'] a[href='#register']").click()
     expect(page.locator("#register textarea")).to_be_visible()
     assert visit.complaints == []
