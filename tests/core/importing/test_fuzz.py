@@ -40,7 +40,7 @@ CASES = 4_500
 
 LIMITS = PickleLimits(opcodes=20_000)
 quick = settings(
-    max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
+    max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 
 Edit = tuple[int, int, bytes]
