@@ -177,13 +177,11 @@ def test_compiled_libraries_do_not_complain_of_what_is_left_over(tmp_path: Path)
 @pytest.mark.parametrize(
     "command",
     [
-        ["--help"],
         ["register", "--help"],
-        ["manual"],
         ["manual", "api"],
         ["--version"],
-        ["inspect", PAIR[1]],
-        ["doctor"],
+        ["inspect", CHAIR],
+        *(pytest.param(one, marks=pytest.mark.long) for one in (["--help"], ["manual"], ["doctor"])),
     ],
     ids=" ".join,
 )
