@@ -82,20 +82,15 @@ def phone(context_options: dict[str, Any]) -> None:
 
 
 @pytest.mark.usefixtures("phone")
-@pytest.mark.parametrize("story", ["done", "ambiguous", "searched", "failed", "locked"])
-def test_nothing_overflows_on_a_phone(visit: Visit, story: str) -> None:
-    page = visit.open(story)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 360
-    spilling = page.evaluate(
-        """() => [...document.body.querySelectorAll('*')].filter((node) => node.checkVisibility()
-            && !node.closest('.unseen, .skip') && node.getBoundingClientRect().right > 361)
-            .map((node) => node.outerHTML)"""
-    )
-    assert spilling == []
-
-
-@pytest.mark.usefixtures("phone")
-def test_touch_turns_the_view_on_a_phone(visit: Visit) -> None:
-    page = visit.open("done")
+def test_nothing_overflows_on_a_phone_and_touch_turns_the_view(visit: Visit) -> None:
+    for story in ("ambiguous", "searched", "failed", "locked", "done"):
+        page = visit.open(story)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360, story
+        spilling = page.evaluate(
+            """() => [...document.body.querySelectorAll('*')].filter((node) => node.checkVisibility()
+                && !node.closest('.unseen, .skip') && node.getBoundingClientRect().right > 361)
+                .map((node) => node.outerHTML)"""
+        )
+        assert spilling == [], story
     assert colored(canvas_pixels(page), "blue").mean() > 0.005
     assert page.locator("#canvas").evaluate("node => getComputedStyle(node).touchAction") == "none"
