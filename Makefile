@@ -1,5 +1,5 @@
 # Two commands matter: `make demo` and `make test`. Each sets up what it needs.
-.PHONY: setup demo test lint docs sbom clean
+.PHONY: setup demo test test-long lint docs sbom clean
 
 setup:
 	@scripts/setup.sh
@@ -11,6 +11,10 @@ demo:
 test: setup
 	@scripts/system-packages.sh test
 	@scripts/run-tests.sh
+
+test-long: setup
+	@scripts/system-packages.sh test
+	@scripts/run-tests.sh -m long
 
 lint: setup
 	@scripts/lint.sh

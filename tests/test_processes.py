@@ -6,8 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 
 import psutil
 import pytest
@@ -48,30 +46,3 @@ def test_a_process_that_has_ended_is_no_error() -> None:
     assert processor_seconds(ended.pid) == 0.0
     with pytest.raises(psutil.NoSuchProcess):
         children_of(ended.pid)
-
-
-def test_processes_that_end_while_they_are_looked_at_are_no_error() -> None:
-    stop = threading.Event()
-
-    def start_and_end() -> None:
-        while not stop.is_set():
-            subprocess.run(["/bin/true"], check=True)
-
-    thread = threading.Thread(target=start_and_end)
-    thread.start()
-    try:
-        seen = {" ".join(command_of(pid)) for _ in range(300) for pid in descendants_of(os.getpid())}
-    finally:
-        stop.set()
-        thread.join()
-    assert any("/bin/true" in command for command in seen), "some were looked at"
-
-
-def test_processor_seconds_are_those_of_the_kernel() -> None:
-    before, kernels = processor_seconds(os.getpid()), os.times()
-    deadline = time.process_time() + 0.3
-    while time.process_time() < deadline:
-        pass
-    used, told = processor_seconds(os.getpid()) - before, sum(os.times()[:4]) - sum(kernels[:4])
-    assert abs(used - told) <= 0.02, "two ticks"
-    assert used >= 0.28

@@ -7,7 +7,7 @@ With y = T x for scene points x, w = T^-1 z for object points z, g the fields' g
 
 Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them. What is
 differentiated is the residual as a length of the scene, r/s: as a length of the object it would fall with s alone, and
-so make every object that is seen from one side too large (docs/adr/0035-residuals-in-scene-units.md).
+so make every object that is seen from one side too large (benchmarks/notes/refinement.md).
 
 Fields learned from images are too thick or too thin by about the same amount everywhere. The two surfaces are then an
 offset d apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.

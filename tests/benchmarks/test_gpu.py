@@ -44,7 +44,6 @@ def test_without_a_gpu_it_says_so_in_a_line(
     assert "no CUDA device" in said.err
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_everything_runs_on_the_cpu(one_pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "gpu.md"

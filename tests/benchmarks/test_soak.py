@@ -9,7 +9,7 @@ import pytest
 from benchmarks.service_load.soak import Plan, judged, soak
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_job_ends_as_it_should_while_its_process_and_redis_are_killed(tmp_path: Path) -> None:
     actions = (("job", 2), ("redis", 1))
     plan = Plan(9, seed=1, clients=4, workers=1, questions=1, actions=actions, pauses_s=(0.3, 1.0), max_actions=4)

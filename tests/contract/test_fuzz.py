@@ -12,7 +12,7 @@ from tests.contract.live import live_service
 REDUCED = ["--phases", "examples,fuzzing,stateful", "--max-examples", "4", "--seed", "1", "--no-shrink"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_request_is_answered_against_the_contract(tmp_path: Path) -> None:
     (tmp_path / "state").mkdir()
     with live_service(tmp_path / "state", **fuzz_contract.SETTINGS, preload=True) as live:

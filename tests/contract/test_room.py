@@ -15,7 +15,7 @@ from tests.contract.world import BOX, World, assert_refused, field_bytes, make_w
 from tests.redis_server import private_redis
 
 TOKENS = {"greedy": {"Authorization": "Bearer greedy-token"}, "honest": {"Authorization": "Bearer honest-token"}}
-_ROOM = 3 * 1024 * 1024
+_ROOM = 3 * 512 * 1024
 
 
 @pytest.fixture
@@ -58,14 +58,14 @@ def limit(redis: Redis, room: int) -> None:
 
 
 def test_a_caller_who_registers_and_cancels_stops_nobody(tmp_path: Path, redis: Redis) -> None:
-    """On fb7e8d8 some three hundred pairs fill these three megabytes; then nobody writes for seven days."""
+    """Without bounds some hundred and fifty pairs fill this room; then nobody writes for seven days."""
     world = served(tmp_path, redis, max_upload_bytes=4096)
     with world.client:
         requests = {caller: ready(world, caller) for caller in TOKENS}
         first = register(world, "honest", requests["honest"], 0).json()["id"]
         world.succeed(first)
         limit(redis, _ROOM)
-        for seed in range(500):
+        for seed in range(250):
             register_and_cancel(world, "greedy", requests["greedy"], seed)
         answer = register(world, "honest", requests["honest"], 1)
         assert answer.status_code == 202, answer.text
@@ -85,7 +85,7 @@ def test_a_reserve_is_kept_for_what_goes_on(tmp_path: Path, redis: Redis) -> Non
         running = register(world, "honest", requests["honest"], 0).json()["id"]
         world.run(running)
         limit(redis, _ROOM)
-        answers = [register(world, "greedy", requests["greedy"], seed) for seed in range(700)]
+        answers = [register(world, "greedy", requests["greedy"], seed) for seed in range(350)]
         refused = [answer for answer in answers if answer.status_code != 202]
         assert refused
         for answer in refused:

@@ -157,7 +157,6 @@ print(result.T_object_scene.matrix().numpy().tobytes().hex())
 """
 
 
-@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result_in_another_process() -> None:
     root = Path(__file__).resolve().parents[2]
     command = [sys.executable, "-c", _OTHER_PROCESS]
@@ -199,7 +198,6 @@ def test_a_field_that_breaks_down_on_the_way_is_reported() -> None:
     assert caught.value.reason == "FIELD_NOT_FINITE"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.8, 1.25])
 def test_golden_chair_with_published_options(scale: float) -> None:
     T = chair_pose(scale)

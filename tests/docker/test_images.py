@@ -75,7 +75,7 @@ def test_a_wrong_result_does_not(result: dict[str, Any], wrong: str) -> None:
         check(changed)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("action", ["build", "try", "demo"])
 def test_the_images_are_built_and_do_what_is_documented(action: str) -> None:

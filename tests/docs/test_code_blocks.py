@@ -70,7 +70,7 @@ def is_ready(port: int) -> bool:
         return False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(DOCS)))
 def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:

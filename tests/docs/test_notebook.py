@@ -22,7 +22,7 @@ nbformat.write(notebook, sys.argv[3])
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_notebook_runs(tmp_path: Path) -> None:
     paths = os.pathsep.join(str(ROOT / part) for part in ("", "service", "worker"))
     kernels = tmp_path / "kernels" / "kernels" / "python3"

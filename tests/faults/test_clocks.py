@@ -22,6 +22,7 @@ from tests.faults.stores import Folder
 from tests.restartable_redis import restartable_redis
 from tests.worker.bench import eventually
 
+pytestmark = pytest.mark.long
 Clocks = dict[str, SteppedClock]
 HOUR_S = 3600
 ONE_AFTER_THE_OTHER = [{name: step} for name in ("redis", "api", "worker") for step in (HOUR_S, -HOUR_S)]

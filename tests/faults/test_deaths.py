@@ -142,6 +142,7 @@ def test_sigterm_of_the_api_during_a_job(house: House) -> None:
         check_promise(house, [job_id])
 
 
+@pytest.mark.long
 def test_kill_of_the_api_during_an_upload(folder_house: House) -> None:
     """What had come of the upload goes when the next API process starts; the upload may be sent again."""
     house = folder_house
@@ -165,6 +166,7 @@ def test_kill_of_the_api_during_an_upload(folder_house: House) -> None:
     check_promise(house, [house.submit()])
 
 
+@pytest.mark.long
 def test_kill_of_the_api_between_a_job_s_record_and_its_queue(house: House) -> None:
     """The reaper of the next API process queues what no queue holds."""
     first, _ = house.start_both()
@@ -180,6 +182,7 @@ def test_kill_of_the_api_between_a_job_s_record_and_its_queue(house: House) -> N
         check_promise(house, [job_id])
 
 
+@pytest.mark.long
 def test_kill_of_the_api_in_the_middle_of_a_batch(folder_house: House) -> None:
     """The lines, posted again, are one batch with a job each; once it is accepted, Redis and the API may go."""
     house = folder_house

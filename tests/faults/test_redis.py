@@ -99,6 +99,7 @@ def test_redis_emptied(house: House) -> None:
         eventually(lambda name=name, count=count: len(house.client.get(f"/{name}").json()[name]) == count, house.log)
 
 
+@pytest.mark.long
 def test_redis_out_of_memory(house: House) -> None:
     """New requests are told 507; what runs waits with its result until Redis takes it."""
     _, worker = house.start_both()
@@ -121,6 +122,7 @@ def test_redis_out_of_memory(house: House) -> None:
     assert worker.poll() is None
 
 
+@pytest.mark.long
 def test_redis_frozen(house: House) -> None:
     """Calls are told 503 within four seconds, then at once; pages come, streams end; then everything goes on."""
     _, worker = house.start_both()
@@ -147,6 +149,7 @@ def test_redis_frozen(house: House) -> None:
     assert worker.poll() is None
 
 
+@pytest.mark.long
 def test_redis_100_ms_away(far_house: House, network: Proxy) -> None:
     """Each of eight jobs takes some six seconds longer, and nothing else changes."""
     house = far_house
@@ -160,6 +163,7 @@ def test_redis_100_ms_away(far_house: House, network: Proxy) -> None:
     assert {job["attempts"] for job in done.values()} == {1}
 
 
+@pytest.mark.long
 def test_connections_to_redis_reset(far_house: House, network: Proxy) -> None:
     """Commands are repeated, which changes nothing that was done already; what fell out of a queue is queued again."""
     house = far_house

@@ -20,6 +20,7 @@ from tests.object_store import ObjectServer
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import eventually
 
+pytestmark = pytest.mark.long
 MIB = 1 << 20
 
 

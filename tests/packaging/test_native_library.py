@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -18,13 +19,20 @@ pytestmark = pytest.mark.xdist_group("packaging")
 SOURCES = ROOT / native_library.FOLDER
 
 
-@pytest.fixture
-def built(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("built") / NAME
     try:
-        build(SOURCES, tmp_path / NAME)
+        build(SOURCES, path)
     except NotBuiltError as error:
         pytest.skip(f"no native evaluator: {error}")
-    return tmp_path / NAME
+    return path
+
+
+@pytest.fixture
+def built(compiled: Path, tmp_path: Path) -> Path:
+    """A copy of what is compiled once."""
+    return shutil.copy(compiled, tmp_path / NAME)
 
 
 def test_the_checkouts_own_library_is_of_these_sources() -> None:
@@ -101,6 +109,7 @@ def test_fields_are_evaluated_without_the_library(monkeypatch: pytest.MonkeyPatc
     torch.testing.assert_close(slope, gradient, rtol=0, atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("switch", ["0", "1"])
 def test_a_wheel_is_for_every_platform_unless_it_has_the_library(
     built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, switch: str

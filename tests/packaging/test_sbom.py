@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -11,7 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from packaging.utils import canonicalize_name
+
+from regnf_core.version import __version__
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = Path(os.environ.get("REGNF_SBOM_TOOLS", ROOT / "build" / "sbom-tools"))
@@ -116,3 +120,12 @@ def test_the_tools_are_pinned() -> None:
     lines = (ROOT / "scripts" / "sbom-tools.txt").read_text(encoding="utf-8").splitlines()
     assert all(line.count("==") == 1 for line in lines)
     assert {"cyclonedx-bom", "pip_audit"} <= {line.partition("==")[0] for line in lines}
+
+
+def test_one_place_says_the_version() -> None:
+    chart = yaml.safe_load((ROOT / "deploy/helm/regnf/Chart.yaml").read_text(encoding="utf-8"))
+    contract = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    newest = re.search(r"^## \[(\d+\.\d+\.\d+)\]", changelog, flags=re.M)
+    assert newest is not None
+    assert {chart["appVersion"], contract["info"]["version"], newest[1]} == {__version__}

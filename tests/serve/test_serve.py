@@ -13,29 +13,30 @@ import httpx
 import pytest
 
 from tests.processes import alive, command_of
+from tests.redis_server import private_redis
 from tests.serve.service import DEADLINE_S, Service, command, environment, start
 from tests.worker.bench import eventually
 
 
-@pytest.fixture
-def service(tmp_path: Path) -> Iterator[Service]:
-    started = start(tmp_path / "state")
+@contextmanager
+def started(state_dir: Path, *arguments: str, **settings: object) -> Iterator[Service]:
+    """A service that has ended with all its processes once the context is left. A worker takes most of the start."""
+    service = start(state_dir, *arguments, **settings)
     try:
-        yield started
+        yield service
     finally:
-        started.end()
-        eventually(started.all_gone, "the end of every process", DEADLINE_S)
+        service.end()
+        eventually(service.all_gone, "the end of every process", DEADLINE_S)
+
+
+NO_WORKER = ("--workers", "0")
 
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """One for the tests that leave it as they found it."""
-    started = start(tmp_path_factory.mktemp("shared") / "state")
-    try:
-        yield started
-    finally:
-        started.end()
-        eventually(started.all_gone, "the end of every process", DEADLINE_S)
+    with started(tmp_path_factory.mktemp("shared") / "state") as service:
+        yield service
 
 
 def test_it_comes_up_with_nothing_configured(shared: Service) -> None:
@@ -61,17 +62,21 @@ def listening_sockets(pid: int) -> set[str]:
     return {entry[9] for entry in tables if entry[3] == "0A" and f"socket:[{entry[9]}]" in inodes}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_a_signal_ends_everything_in_order(service: Service, number: signal.Signals) -> None:
-    service.await_ready()
-    folder = service.socket_dir()
-    service.look()
-    service.process.send_signal(number)
-    assert service.process.wait(DEADLINE_S) == 0
-    assert service.all_gone(), "nothing outlives the one who waited for it"
-    assert not folder.exists()
-    assert "killed" not in service.log()
-    assert "Traceback" not in service.log()
+@pytest.mark.parametrize(
+    ("number", "workers"), [(signal.SIGTERM, ()), (signal.SIGINT, NO_WORKER), (signal.SIGHUP, NO_WORKER)]
+)
+def test_a_signal_ends_everything_in_order(tmp_path: Path, number: signal.Signals, workers: tuple[str, ...]) -> None:
+    with started(tmp_path / "state", *workers) as service:
+        if not workers:
+            service.await_ready()
+        folder = service.socket_dir()
+        service.look()
+        service.process.send_signal(number)
+        assert service.process.wait(DEADLINE_S) == 0
+        assert service.all_gone(), "nothing outlives the one who waited for it"
+        assert not folder.exists()
+        assert "killed" not in service.log()
+        assert "Traceback" not in service.log()
 
 
 def test_ctrl_c_reaches_the_supervisor_alone(shared: Service) -> None:
@@ -81,20 +86,16 @@ def test_ctrl_c_reaches_the_supervisor_alone(shared: Service) -> None:
     assert all(os.getpgid(pid) != group for pid in shared.look())
 
 
-def test_a_killed_supervisor_takes_everything_along(service: Service, tmp_path: Path) -> None:
-    service.await_ready()
-    folder = service.socket_dir()
-    service.process.kill()
-    service.process.wait()
-    eventually(service.all_gone, "the end of every process", DEADLINE_S)
-    assert folder.exists(), "nobody was left to remove it"
-    again = start(service.state_dir)
-    try:
-        assert not folder.exists(), "the next one does"
-        again.await_ready()
-    finally:
-        again.end()
-    eventually(again.all_gone, "the end of every process", DEADLINE_S)
+def test_a_killed_supervisor_takes_everything_along(tmp_path: Path) -> None:
+    with started(tmp_path / "state") as service:
+        service.await_ready()
+        folder = service.socket_dir()
+        service.process.kill()
+        service.process.wait()
+        eventually(service.all_gone, "the end of every process", DEADLINE_S)
+        assert folder.exists(), "nobody was left to remove it"
+        with started(service.state_dir, *NO_WORKER):
+            assert not folder.exists(), "the next one does"
 
 
 def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> None:
@@ -119,22 +120,12 @@ def test_a_part_that_dies_is_started_anew(shared: Service, part: str) -> None:
 
 
 def test_state_survives_a_restart(tmp_path: Path) -> None:
-    data = b"no field, but bytes"
-    first = start(tmp_path / "state", "--workers", "0")
-    try:
-        posted = httpx.post(f"{first.address}/fields", content=b"PK\x03\x04" + data)
-        assert posted.status_code == 201, posted.text
+    with started(tmp_path / "state", *NO_WORKER) as first:
+        sha256 = upload(first.address, b"no field, but bytes")
         first.process.terminate()
         assert first.process.wait(DEADLINE_S) == 0
-    finally:
-        first.end()
-    second = start(tmp_path / "state", "--workers", "0")
-    try:
-        held = httpx.get(f"{second.address}{posted.headers['location']}")
-        assert held.json()["state"] == "validating"
-    finally:
-        second.end()
-    eventually(lambda: first.all_gone() and second.all_gone(), "the end of every process", DEADLINE_S)
+    with started(tmp_path / "state", *NO_WORKER) as second:
+        assert httpx.get(f"{second.address}/fields/{sha256}").json()["state"] == "validating"
 
 
 def upload(address: str, content: bytes) -> str:
@@ -145,8 +136,7 @@ def upload(address: str, content: bytes) -> str:
 
 def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
     """Without a worker there is no news: the stop alone ends what is waited for, in order."""
-    service = start(tmp_path / "state", "--workers", "0")
-    try:
+    with started(tmp_path / "state", *NO_WORKER) as service:
         scene, object_ = (upload(service.address, name) for name in (b"scene", b"object"))
         asked = {"scene": scene, "object": object_, "detection": {"min": [0, 0, 0], "max": [1, 1, 1]}}
         job = httpx.post(f"{service.address}/register", json=asked).json()["id"]
@@ -161,11 +151,8 @@ def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
             assert [one.readline() for one in waiting] == [b"HTTP/1.1 200 OK\r\n"] * 3
             assert (told + stream.read()).endswith(b"0\r\n\r\n"), "the stream ends whole"
         assert service.process.wait(DEADLINE_S) == 0
-    finally:
-        service.end()
-    log = service.log()
-    assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
-    eventually(service.all_gone, "the end of every process", DEADLINE_S)
+        log = service.log()
+        assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
 
 
 @contextmanager
@@ -208,19 +195,11 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
 def test_beyond_loopback_only_with_tokens_or_on_request(tmp_path: Path) -> None:
     assert "UNAUTHENTICATED_PUBLIC_BIND" in refused("--host", "0.0.0.0", state_dir=tmp_path / "state")
     for settings in ({"allow_unauthenticated": "true"}, {"api_tokens": '["0123456789abcdef0123456789abcdef"]'}):
-        service = start(tmp_path / "state", "--host", "0.0.0.0", "--workers", "0", **settings)
-        service.end()
-        eventually(service.all_gone, "the end of every process", DEADLINE_S)
+        with started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, **settings):
+            pass
 
 
 def test_without_an_embedded_redis_there_is_one_child_less(tmp_path: Path) -> None:
-    from tests.redis_server import private_redis
-
-    with private_redis() as url:
-        service = start(tmp_path / "state", redis_url=url)
-        try:
-            service.await_ready()
-            assert len(service.look()) == 2
-        finally:
-            service.end()
-    eventually(service.all_gone, "the end of every process", DEADLINE_S)
+    with private_redis() as url, started(tmp_path / "state", *NO_WORKER, redis_url=url) as service:
+        assert [command_of(pid) for pid in service.look() if "regnf_cli.api_process" not in command_of(pid)] == []
+        assert len(service.look()) == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from regnf_state.journal.journal import STORAGE_KEY
 from regnf_state.redis.client import connect
 from tests.faults.house import plain_environment
 from tests.redis_server import private_redis
+from tests.worker.bench import eventually
 
 SERVE = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--workers", "0"]
 WORKER = [sys.executable, "-m", "regnf_worker.main"]
@@ -55,9 +55,8 @@ def test_the_storage_that_the_operator_names_is_adopted(another_s: str, tmp_path
     process = subprocess.Popen(WORKER, env=environment, stderr=subprocess.DEVNULL)
     try:
         with connect(another_s) as redis:
-            while redis.get(STORAGE_KEY) != storage_id.encode():
-                assert process.poll() is None
-                os.sched_yield()
+            eventually(lambda: redis.get(STORAGE_KEY) == storage_id.encode(), "the adoption")
+        assert process.poll() is None
     finally:
         process.kill()
         process.wait()

@@ -83,6 +83,7 @@ def finished(client: httpx.Client, job_id: str) -> dict[str, Any]:
     return eventually(look, f"the end of job {job_id}", 120.0)
 
 
+@pytest.mark.long
 def test_a_registration_between_two_machines(client: httpx.Client, tmp_path: Path) -> None:
     pair = write_small_pair(tmp_path)
     scene, object_ = upload(client, pair.scene), upload(client, pair.object)

@@ -6,12 +6,18 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
+import trimesh
 from playwright.sync_api import Browser, ConsoleMessage, Error, Page, Request, sync_playwright
 
+from regnf_state.settings import Settings
+from tests.ui import room
 from tests.ui.fixture_server import FixtureServer
+from tests.ui.home import home, register, upload
 
 # SwiftShader draws WebGL without a GPU, and nothing else, being slow. The others keep the browser from calling home.
 ARGUMENTS = [
@@ -73,9 +79,10 @@ def server(running_server: FixtureServer) -> FixtureServer:
 
 
 @pytest.fixture
-def context_options() -> dict[str, Any]:
-    """What a test overrides to look through another kind of screen."""
-    return {"viewport": {"width": 1100, "height": 700}, "reduced_motion": "reduce"}
+def context_options(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What a test overrides to look through another kind of screen; a module's VIEWPORT says how large it is."""
+    width, height = getattr(request.module, "VIEWPORT", (1100, 700))
+    return {"viewport": {"width": width, "height": height}, "reduced_motion": "reduce"}
 
 
 Open = Callable[[dict[str, Any]], Page]
@@ -152,3 +159,38 @@ def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Vis
     yield visit
     for event, listener in listeners.items():
         page.remove_listener(event, listener)
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """A room, the chair that stands in it, and a stool that does not."""
+    folder = tmp_path_factory.mktemp("own")
+    stool = folder / "stool.glb"
+    trimesh.creation.box((0.4, 0.3, 0.5)).export(stool)
+    return (*room.write_room_and_chair(folder), stool)
+
+
+@pytest.fixture(scope="package")
+def running_home() -> Iterator[str]:
+    with home(Settings()) as address:
+        yield address
+
+
+@pytest.fixture
+def service(running_home: str, visit: Visit) -> Iterator[str]:
+    """The address of a service that has nothing yet."""
+    yield running_home
+    if visit.page.url.startswith(running_home):
+        visit.page.evaluate("() => { sessionStorage.clear(); localStorage.clear(); }")
+    visit.page.goto("about:blank")  # lets go of the connections
+    for kind, key in (("jobs", "id"), ("library", "name"), ("fields", "sha256")):
+        listed = httpx.get(f"{running_home}/{kind}", headers={"Accept": "application/json"}).json()
+        for one in listed.get(kind) or listed.get("entries") or []:
+            httpx.delete(f"{running_home}/{kind}/{one[key]}").raise_for_status()
+
+
+@pytest.fixture
+def filled(service: str, files: tuple[Path, Path, Path]) -> str:
+    """The address of a service that has a room, a chair, and a job with both."""
+    register(service, upload(service, files[:2]))
+    return service

@@ -21,37 +21,17 @@ def focused(visit: Visit) -> str:
     return str(visit.page.evaluate(script))
 
 
-def test_tab_visits_the_controls_in_reading_order(visit: Visit) -> None:
-    visit.open("done")
+def test_tab_visits_the_controls_in_reading_order_and_focus_can_be_seen(visit: Visit) -> None:
+    page = visit.open("done")
     order = []
     for _ in range(26):
-        visit.page.keyboard.press("Tab")
-        order.append(focused(visit))
-    expected = [
-        "skip",
-        "brand",
-        "copy-id",
-        "canvas",
-        "scene",
-        "color",
-        "up",
-        "size",
-        "frame-object",
-        "play",
-        "iteration",
-    ]
-    places = [order.index(name) for name in expected]
-    assert places == sorted(places), order
-
-
-def test_focus_can_be_seen(visit: Visit) -> None:
-    page = visit.open("done")
-    for _ in range(12):  # the pages' links and what can be done with the job come first
         page.keyboard.press("Tab")
-        if focused(visit) == "canvas":
-            break
-    assert focused(visit) == "canvas"
-    assert page.locator("#canvas").evaluate("node => getComputedStyle(node).outlineStyle") == "solid"
+        order.append(focused(visit))
+        if order[-1] == "canvas":
+            assert page.locator("#canvas").evaluate("node => getComputedStyle(node).outlineStyle") == "solid"
+    wanted = ["skip", "brand", "copy-id", "canvas", "scene", "color", "up", "size", "frame-object", "play", "iteration"]
+    places = [order.index(name) for name in wanted]
+    assert places == sorted(places), order
 
 
 def test_everything_has_a_name(visit: Visit) -> None:
@@ -102,20 +82,15 @@ def phone(context_options: dict[str, Any]) -> None:
 
 
 @pytest.mark.usefixtures("phone")
-@pytest.mark.parametrize("story", ["done", "ambiguous", "searched", "failed", "locked"])
-def test_nothing_overflows_on_a_phone(visit: Visit, story: str) -> None:
-    page = visit.open(story)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 360
-    spilling = page.evaluate(
-        """() => [...document.body.querySelectorAll('*')].filter((node) => node.checkVisibility()
-            && !node.closest('.unseen, .skip') && node.getBoundingClientRect().right > 361)
-            .map((node) => node.outerHTML)"""
-    )
-    assert spilling == []
-
-
-@pytest.mark.usefixtures("phone")
-def test_touch_turns_the_view_on_a_phone(visit: Visit) -> None:
-    page = visit.open("done")
+def test_nothing_overflows_on_a_phone_and_touch_turns_the_view(visit: Visit) -> None:
+    for story in ("ambiguous", "searched", "failed", "locked", "done"):
+        page = visit.open(story)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360, story
+        spilling = page.evaluate(
+            """() => [...document.body.querySelectorAll('*')].filter((node) => node.checkVisibility()
+                && !node.closest('.unseen, .skip') && node.getBoundingClientRect().right > 361)
+                .map((node) => node.outerHTML)"""
+        )
+        assert spilling == [], story
     assert colored(canvas_pixels(page), "blue").mean() > 0.005
     assert page.locator("#canvas").evaluate("node => getComputedStyle(node).touchAction") == "none"

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
-from regnf_state.settings import Settings
-from tests.ui import room
 from tests.ui.conftest import Visit
-from tests.ui.test_home import CHAIR, click_at, give_files, home
+from tests.ui.home import CHAIR, click_at, give_files, open_page
 
 pytestmark = pytest.mark.browser
 THEMES = ("light", "dark")
-
-
-@pytest.fixture(scope="module")
-def service() -> Iterator[str]:
-    with home(Settings()) as address:
-        yield address
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return room.write_room_and_chair(tmp_path_factory.mktemp("own"))
 
 
 def faults_in(page: Page) -> list[str]:
@@ -47,10 +33,9 @@ def in_both_themes(page: Page) -> dict[str, list[str]]:
 NONE: dict[str, list[str]] = {theme: [] for theme in THEMES}
 
 
-def test_home_page_empty_and_at_work(visit: Visit, service: str, files: tuple[Path, Path]) -> None:
+def test_home_page_empty_and_at_work(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
     page = visit.page
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     assert in_both_themes(page) == NONE
     give_files(page, files)
     click_at(page, CHAIR)
@@ -69,7 +54,6 @@ def test_home_page_empty_and_at_work(visit: Visit, service: str, files: tuple[Pa
     page.get_by_role("button", name="Run again").click()
     expect(page.locator("#again-dialog")).to_be_visible()
     assert in_both_themes(page) == NONE
-    page.goto("about:blank")
 
 
 def test_documentation(visit: Visit, service: str) -> None:

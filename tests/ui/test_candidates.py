@@ -15,10 +15,10 @@ def test_each_candidate_has_its_picture_and_its_line(visit: Visit, tmp_path: Pat
     page = visit.open("asked")
     expect(page.locator("#candidates")).to_be_visible()
     figures = page.locator("#candidate-list figure")
-    assert figures.locator("figcaption").all_inner_texts() == ["Scene 1: <i>smooth</i>", "Scene 2: linear"]
+    expect(figures.locator("figcaption")).to_have_text(["Scene 1: <i>smooth</i>", "Scene 2: linear"])
     lines = [json.loads(line) for line in figures.locator("code").all_inner_texts()]
     assert lines == [one["description"] for one in CANDIDATES]
-    assert figures.locator("canvas").count() == 1
+    expect(figures.locator("canvas")).to_have_count(1)
     assert figures.first.locator("canvas").get_attribute("aria-label") is not None
     assert figures.locator("i").count() == 0
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
@@ -32,12 +32,12 @@ def test_each_candidate_has_its_picture_and_its_line(visit: Visit, tmp_path: Pat
 
 def test_other_failures_have_no_candidates(visit: Visit) -> None:
     page = visit.open("failed")
-    assert page.locator("#candidates").is_hidden()
+    expect(page.locator("#candidates")).to_be_hidden()
     assert [url for url in visit.requests if "/candidates/" in url] == []  # the document is read for the field's name
 
 
 def test_a_picture_that_is_gone_leaves_the_line(visit: Visit) -> None:
     visit.page.route("**/candidates/1.png", lambda route: route.fulfill(status=404, json={"reason": "NONE"}))
     page = visit.open("asked")
-    assert page.locator("#candidate-list code").count() == 2
-    assert page.locator("#candidate-list canvas").count() == 0
+    expect(page.locator("#candidate-list code")).to_have_count(2)
+    expect(page.locator("#candidate-list canvas")).to_have_count(0)

@@ -2,45 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 from playwright.sync_api import Page, expect
 
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_state.settings import Settings
 from tests.ui.conftest import Visit
-from tests.ui.test_real_app import RealService, real_service
+from tests.ui.home import home, open_page
 
 pytestmark = pytest.mark.browser
 TOKEN = "open-sesame-open-sesame"
 
 
-@pytest.fixture
-def service(visit: Visit) -> Iterator[RealService]:
-    with real_service(visit.server.stage.data.detection, Settings()) as started:
-        yield started
-        visit.page.goto("about:blank")  # lets go of the connections before the server ends
-
-
-def open_docs(visit: Visit, service: RealService, anchor: str = "") -> Page:
-    visit.page.goto(f"{service.origin}/docs{anchor}")
-    visit.page.wait_for_selector("html[data-page=ready]")
+def open_docs(visit: Visit, service: str, anchor: str = "") -> Page:
+    open_page(visit.page, f"{service}/docs{anchor}")
     return visit.page
 
 
-def test_every_operation_is_listed_and_folded(visit: Visit, service: RealService) -> None:
+def test_every_operation_is_listed_and_folded(visit: Visit, service: str) -> None:
     page = open_docs(visit, service)
     expect(page.locator("nav[aria-label='Addresses'] a[href='#register']")).to_have_text("POST /register")
-    assert page.locator("details.operation[open]").count() == 0
-    assert page.locator("details.operation").count() == page.locator("nav[aria-label='Addresses'] a").count()
+    expect(page.locator("details.operation[open]")).to_have_count(0)
+    expect(page.locator("details.operation")).to_have_count(page.locator("nav[aria-label='Addresses'] a").count())
     page.locator("nav[aria-label='Addresses'] a[href='#register']").click()
     expect(page.locator("#register textarea")).to_be_visible()
     assert visit.complaints == []
-    assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
+    assert [url for url in visit.requests if not url.startswith(service + "/")] == []
 
 
-def test_the_search_leaves_what_matches(visit: Visit, service: RealService) -> None:
+def test_the_search_leaves_what_matches(visit: Visit, service: str) -> None:
     page = open_docs(visit, service)
     page.locator("#search").fill("cancel")
     expect(page.locator("#cancel_job")).to_be_visible()
@@ -51,7 +41,7 @@ def test_the_search_leaves_what_matches(visit: Visit, service: RealService) -> N
     expect(page.locator("#register")).to_be_visible()
 
 
-def test_an_address_is_tried(visit: Visit, service: RealService) -> None:
+def test_an_address_is_tried(visit: Visit, service: str) -> None:
     page = open_docs(visit, service, "#get_job")
     form = page.locator("#get_job form")
     form.get_by_role("button", name="Send GET").click()
@@ -59,14 +49,14 @@ def test_an_address_is_tried(visit: Visit, service: RealService) -> None:
     form.locator("input[name=id]").fill("none")
     form.get_by_role("button", name="Send GET").click()
     expect(form.locator(".answer")).to_contain_text("JOB_NOT_FOUND")
-    page.goto(f"{service.origin}/docs#list_jobs")
+    page.goto(f"{service}/docs#list_jobs")
     page.locator("#list_jobs form select").select_option("accepted")
     page.locator("#list_jobs").get_by_role("button", name="Send GET").click()
     expect(page.locator("#list_jobs .answer")).to_contain_text("200")
     expect(page.locator("#list_jobs .answer")).to_contain_text('"next_page_token": null')
 
 
-def test_a_body_is_the_first_example_of_the_contract(visit: Visit, service: RealService) -> None:
+def test_a_body_is_the_first_example_of_the_contract(visit: Visit, service: str) -> None:
     page = open_docs(visit, service, "#register")
     shortest = next(iter(REGISTER_EXAMPLES.values()))["value"]
     assert shortest["scene"] in page.locator("#register textarea").input_value()
@@ -75,16 +65,16 @@ def test_a_body_is_the_first_example_of_the_contract(visit: Visit, service: Real
     expect(page.locator("#register .answer")).to_contain_text("INVALID_DETECTION")
 
 
-def test_a_reason_is_found_by_its_anchor(visit: Visit, service: RealService) -> None:
+def test_a_reason_is_found_by_its_anchor(visit: Visit, service: str) -> None:
     page = open_docs(visit, service, "#QUEUE_FULL")
     expect(page.locator("#QUEUE_FULL")).to_be_in_viewport()
 
 
 def test_a_token_is_asked_for_and_sent(visit: Visit) -> None:
     settings = Settings(api_tokens=frozenset({f"lab:{TOKEN}"}))
-    with real_service(visit.server.stage.data.detection, settings, owner="lab") as service:
+    with home(settings, "lab") as address:
         page = visit.page
-        page.goto(f"{service.origin}/docs")
+        page.goto(f"{address}/docs")
         page.wait_for_selector("html[data-page=refused]")
         expect(page.locator("#problem")).to_contain_text("access token")
         page.locator("#token").fill(TOKEN)
@@ -97,7 +87,7 @@ def test_a_token_is_asked_for_and_sent(visit: Visit) -> None:
         page.goto("about:blank")
 
 
-def test_it_fits_a_phone(visit: Visit, service: RealService) -> None:
+def test_it_fits_a_phone(visit: Visit, service: str) -> None:
     page = open_docs(visit, service)
     page.set_viewport_size({"width": 360, "height": 700})
     assert page.evaluate("document.documentElement.scrollWidth") <= 360

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from itertools import permutations
 from pathlib import Path
-from typing import Any
 
 import pytest
 from playwright.sync_api import Page, Route, expect
@@ -15,40 +13,11 @@ from regnf_state.settings import Settings
 from tests.ui import room
 from tests.ui.conftest import Visit
 from tests.ui.delays import Held
-from tests.ui.test_home import CHAIR, click_at, give_files, home
+from tests.ui.home import CHAIR, choose_scene, click_at, home, open_page
 
 pytestmark = pytest.mark.browser
+VIEWPORT = (1280, 800)
 LISTS = {"fields": "**/fields?*", "jobs": "**/jobs?*", "demo": "**/demo"}
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return room.write_room_and_chair(tmp_path_factory.mktemp("own"))
-
-
-@pytest.fixture
-def context_options() -> dict[str, Any]:
-    return {"viewport": {"width": 1280, "height": 800}, "reduced_motion": "reduce"}
-
-
-@pytest.fixture
-def service() -> Iterator[str]:
-    with home(Settings()) as address:
-        yield address
-
-
-@pytest.fixture
-def filled(visit: Visit, service: str, files: tuple[Path, Path]) -> str:
-    """The address of a service that has a room, a chair, and a job with both."""
-    page = visit.page
-    page.goto(service)
-    give_files(page, files)
-    click_at(page, CHAIR)
-    page.click("#register")
-    page.wait_for_selector(".run[data-verdict]")
-    page.evaluate("localStorage.clear()")
-    page.goto("about:blank")
-    return service
 
 
 def open_in_order(page: Page, address: str, order: tuple[str, ...]) -> None:
@@ -62,38 +31,30 @@ def open_in_order(page: Page, address: str, order: tuple[str, ...]) -> None:
     page.wait_for_selector("html[data-page=ready]")
 
 
-@pytest.mark.parametrize("order", list(permutations(("fields", "jobs", "demo"))))
-def test_scenes_and_objects_of_the_home_page(visit: Visit, filled: str, order: tuple[str, ...]) -> None:
+def test_the_lists(visit: Visit, filled: str) -> None:
     page = visit.page
-    open_in_order(page, filled, order)
-    assert page.locator("#scene-known option").all_inner_texts() == ["none", "room.ply", "chair.glb"]
-    assert page.locator("#objects .check").all_inner_texts() == ["chair.glb"]
-    assert page.locator("#scenes-as-objects .check").all_text_contents() == ["room.ply"]
-    page.goto("about:blank")
+    for order in permutations(("fields", "jobs", "demo")):
+        open_in_order(page, filled, order)
+        expect(page.locator("#scene-known option")).to_have_text(["none", "room.ply", "chair.glb"])
+        expect(page.locator("#objects .check")).to_have_text(["chair.glb"])
+        expect(page.locator("#scenes-as-objects .check")).to_have_text(["room.ply"])
+    for place, titles in (("fields", ["chair.glb", "room.ply"]), ("jobs", ["chair.glb in room.ply"])):
+        for order in permutations(("fields", "jobs")):
+            open_in_order(page, f"{filled}/{place}", order)
+            expect(page.locator(".tile h2")).to_have_count(len(titles))
+            assert sorted(page.locator(".tile h2").all_inner_texts()) == titles
 
 
-@pytest.mark.parametrize("order", list(permutations(("fields", "jobs"))))
-@pytest.mark.parametrize(
-    ("place", "titles"), [("fields", ["chair.glb", "room.ply"]), ("jobs", ["chair.glb in room.ply"])]
-)
-def test_the_lists(visit: Visit, filled: str, place: str, titles: list[str], order: tuple[str, ...]) -> None:
-    page = visit.page
-    open_in_order(page, f"{filled}/{place}", order)
-    assert sorted(page.locator(".tile h2").all_inner_texts()) == titles
-    page.goto("about:blank")
-
-
-@pytest.mark.parametrize("last", ["scene", "object"])
-def test_the_title_of_a_job(visit: Visit, filled: str, last: str) -> None:
+def test_the_title_of_a_job(visit: Visit, filled: str) -> None:
     page = visit.page
     job = page.request.get(f"{filled}/jobs", headers={"Accept": "application/json"}).json()["jobs"][0]
-    held = Held(page, f"**/fields/{job['inputs'][last]}")
-    page.goto(filled + job["links"]["view"])
-    held.wait()
-    expect(page.locator("#verdict-word")).to_have_text("Registered")
-    held.end()
-    expect(page.locator("#job-title")).to_have_text("chair.glb in room.ply")
-    page.goto("about:blank")
+    for last in ("scene", "object"):
+        held = Held(page, f"**/fields/{job['inputs'][last]}")
+        page.goto(filled + job["links"]["view"])
+        held.wait()
+        expect(page.locator("#verdict-word")).to_have_text("Registered")
+        held.end()
+        expect(page.locator("#job-title")).to_have_text("chair.glb in room.ply")
 
 
 def test_an_older_list_does_not_replace_a_newer_one(visit: Visit, filled: str) -> None:
@@ -112,7 +73,6 @@ def test_an_older_list_does_not_replace_a_newer_one(visit: Visit, filled: str) -
     held.end()
     page.wait_for_load_state("networkidle")
     expect(page.locator(".tile")).to_have_count(0)
-    page.goto("about:blank")
 
 
 def test_the_scene_that_was_chosen_last_is_shown(visit: Visit, filled: str) -> None:
@@ -120,8 +80,7 @@ def test_the_scene_that_was_chosen_last_is_shown(visit: Visit, filled: str) -> N
     fields = page.request.get(f"{filled}/fields").json()["fields"]
     (first,) = [one["sha256"] for one in fields if one["label"] == "room.ply"]
     (last,) = [one["sha256"] for one in fields if one["label"] == "chair.glb"]
-    page.goto(filled)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, filled)
     held = Held(page, f"**/fields/{first}/mesh.glb*")
     page.select_option("#scene-known", first)
     held.wait()
@@ -132,7 +91,6 @@ def test_the_scene_that_was_chosen_last_is_shown(visit: Visit, filled: str) -> N
     expect(page.locator("html")).to_have_attribute("data-scene", last)
     expect(page.locator("#tip")).to_have_text(re.compile(r"^chair\.glb: click"))
     expect(page.locator("#scene-known")).to_have_value(last)
-    page.goto("about:blank")
 
 
 def test_a_file_that_takes_long_does_not_replace_the_scene_that_was_chosen_meanwhile(
@@ -143,25 +101,22 @@ def test_a_file_that_takes_long_does_not_replace_the_scene_that_was_chosen_meanw
     walls = room.room()
     walls.apply_scale(2.0)
     walls.export(other)
-    page.goto(filled)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, filled)
     held: list[Route] = []
     page.route("**/fields", lambda route: held.append(route))
     page.set_input_files("#scene-file", other)
     expect(page.locator("#scene-state")).to_contain_text("Uploading")
-    page.select_option("#scene-known", label="room.ply")
-    page.wait_for_selector("html[data-scene]")
+    choose_scene(page)
     for route in held:
         route.continue_()
     page.unroute("**/fields")
     expect(page.locator("#scene-known option", has_text="hall.ply")).to_have_count(1, timeout=30_000)
     expect(page.locator("#scene-known option:checked")).to_have_text("room.ply")
     expect(page.locator("#scene-state")).to_have_text("room.ply")
-    page.goto("about:blank")
 
 
 def test_an_upload_that_ends_before_the_list_comes_is_chosen(
-    visit: Visit, service: str, files: tuple[Path, Path]
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
 ) -> None:
     page = visit.page
     held = Held(page, LISTS["fields"])
@@ -173,15 +128,12 @@ def test_an_upload_that_ends_before_the_list_comes_is_chosen(
     page.wait_for_selector("html[data-page=ready]")
     expect(page.locator("#objects input:checked")).to_have_count(1)
     expect(page.locator("#missing")).to_have_text(re.compile("^Missing: a scene; a box"))
-    page.goto("about:blank")
 
 
 def test_a_result_of_the_scene_before_is_not_shown(visit: Visit, filled: str) -> None:
     page = visit.page
-    page.goto(filled)
-    page.wait_for_selector("html[data-page=ready]")
-    page.select_option("#scene-known", label="room.ply")
-    page.wait_for_selector("html[data-scene]")
+    open_page(page, filled)
+    choose_scene(page)
     page.locator("#objects input").check()
     click_at(page, CHAIR)
     held = Held(page, "**/jobs/*/result")
@@ -194,7 +146,6 @@ def test_a_result_of_the_scene_before_is_not_shown(visit: Visit, filled: str) ->
     expect(page.locator(".run")).to_have_count(0)
     expect(page.locator("#results")).to_be_hidden()
     expect(page.locator("#register")).to_be_disabled()  # there is no box in the new scene
-    page.goto("about:blank")
 
 
 def test_a_refusal_from_before_the_token_was_entered_does_not_ask_again(visit: Visit) -> None:
@@ -209,13 +160,13 @@ def test_a_refusal_from_before_the_token_was_entered_does_not_ask_again(visit: V
         held.end()
         page.wait_for_selector("html[data-page=ready]", timeout=20_000)
         expect(page.locator("#token-dialog")).to_be_hidden()
-        page.goto("about:blank")
 
 
-def test_what_is_typed_before_the_fields_are_listed_stays(visit: Visit, filled: str, files: tuple[Path, Path]) -> None:
+def test_what_is_typed_before_the_fields_are_listed_stays(
+    visit: Visit, filled: str, files: tuple[Path, Path, Path]
+) -> None:
     page = visit.page
-    page.goto(f"{filled}/library")
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, f"{filled}/library")
     held = Held(page, LISTS["fields"])
     page.click("#add")
     page.fill("#entry-name", "my chair")
@@ -225,7 +176,6 @@ def test_what_is_typed_before_the_fields_are_listed_stays(visit: Visit, filled: 
     expect(page.locator("#entry-field option")).to_have_count(3)
     expect(page.locator("#entry-name")).to_have_value("my chair")
     expect(page.locator("#entry-tags")).to_have_value("seat")
-    page.goto("about:blank")
 
 
 def test_two_clicks_open_one_dialog(visit: Visit, filled: str) -> None:
@@ -238,7 +188,6 @@ def test_two_clicks_open_one_dialog(visit: Visit, filled: str) -> None:
     expect(page.locator("#again-start")).to_be_disabled()
     held.end()
     expect(page.locator("#again-start")).to_be_enabled()
-    page.goto("about:blank")
 
 
 def test_the_way_back_shows_what_was_deleted_meanwhile(visit: Visit, filled: str) -> None:
@@ -251,4 +200,3 @@ def test_the_way_back_shows_what_was_deleted_meanwhile(visit: Visit, filled: str
     page.request.delete(f"{filled}/jobs/{job}")
     page.go_back()
     expect(page.locator(".tile")).to_have_count(0)
-    page.goto("about:blank")

@@ -12,8 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import pytest
-import uvicorn
-from fastapi import FastAPI
 from playwright.sync_api import expect
 
 from regnf_service.server import create_app
@@ -25,6 +23,7 @@ from regnf_state.settings import Settings
 from regnf_state.stores import Stores
 from tests.stores import private_stores
 from tests.ui.conftest import Visit
+from tests.ui.home import StoppingServer
 from tests.ui.pixels import canvas_pixels, colored
 from tests.ui.stories import field_picture
 from tests.ui.synthetic import JOB_ID, Synthetic
@@ -60,23 +59,11 @@ class RealService:
         self.records.update_job(JOB_ID, 1, status="successful")
 
 
-class _Server(uvicorn.Server):
-    """Tells the application first that it stops, as a signal does in a process of its own: threads hear none."""
-
-    def __init__(self, app: FastAPI) -> None:
-        super().__init__(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
-        self._app = app
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        self._app.state.services.stopping.set()
-        await super().shutdown(sockets)
-
-
 @contextmanager
 def real_service(detection: dict[str, object], settings: Settings, owner: str = ANONYMOUS) -> Iterator[RealService]:
     with private_stores() as stores:
         accept(stores, detection, owner)
-        server = _Server(create_app(settings, stores))
+        server = StoppingServer(create_app(settings, stores))
         with socket.create_server(("127.0.0.1", 0)) as listener:
             thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
             thread.start()

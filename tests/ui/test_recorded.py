@@ -18,9 +18,9 @@ from playwright.sync_api import Page, expect
 
 from tests.ui import room
 from tests.ui.conftest import Visit
-from tests.ui.test_home import click_at
+from tests.ui.home import click_at
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.browser, pytest.mark.long, pytest.mark.timeout(900)]
 CHAIR = (0.614, 0.598)
 """Where the chair is seen at first, as shares of the view."""
 PATIENCE_MS = 400_000

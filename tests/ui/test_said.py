@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import fields as fields_of
 from pathlib import Path
 from typing import Any
 
 import pytest
-import trimesh
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Route, expect
 
 from regnf_core.options import RobustOptions
-from regnf_state.settings import Settings
-from tests.ui import room
 from tests.ui.conftest import Visit
+from tests.ui.home import CHAIR, choose_scene, click_at, give_files, open_page, register, upload
 from tests.ui.test_accessibility import NONE, in_both_themes
-from tests.ui.test_home import CHAIR, click_at, give_files, home
 
 pytestmark = pytest.mark.browser
+VIEWPORT = (1280, 800)
+Files = tuple[Path, Path, Path]
 JSON = {"Accept": "application/json"}
 FAULTS = {
     "reason": "INVALID_OPTIONS",
@@ -32,59 +30,13 @@ FAULTS = {
 }
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    folder = tmp_path_factory.mktemp("own")
-    stool = folder / "stool.glb"
-    trimesh.creation.box((0.4, 0.3, 0.5)).export(stool)
-    return (*room.write_room_and_chair(folder), stool)
-
-
-@pytest.fixture
-def context_options() -> dict[str, Any]:
-    return {"viewport": {"width": 1280, "height": 800}, "reduced_motion": "reduce"}
-
-
-@pytest.fixture(scope="module")
-def module_service() -> Iterator[str]:
-    with home(Settings()) as address:
-        yield address
-
-
-@pytest.fixture
-def service(module_service: str, visit: Visit) -> Iterator[str]:
-    """The address of a service that has nothing yet."""
-    yield module_service
-    page = visit.page
-    for kind, key in (("jobs", "id"), ("library", "name"), ("fields", "sha256")):
-        listed = page.request.get(f"{module_service}/{kind}", headers=JSON).json()
-        for one in listed.get(kind) or listed.get("entries") or []:
-            page.request.delete(f"{module_service}/{kind}/{one[key]}")
-    page.goto("about:blank")
-
-
-def found(page: Page, service: str, files: tuple[Path, Path, Path], objects: int = 1) -> None:
-    """Has the page register the chair, or search for it among so many objects."""
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
-    give_files(page, files[:2])
-    if objects == 2:
-        page.set_input_files("#object-file", files[2])
-        expect(page.locator("#objects input:checked")).to_have_count(2)
-    click_at(page, CHAIR)
-    page.click("#register")
-    page.wait_for_selector(".run[data-verdict]")
-
-
 def test_the_card_of_a_search_says_what_was_found_where_and_in_which_box(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
+    visit: Visit, service: str, files: Files
 ) -> None:
     page = visit.page
-    found(page, service, files, 2)
-    (job,) = page.request.get(f"{service}/jobs", headers=JSON).json()["jobs"]
-    named = {
-        one["sha256"]: one["label"] for one in page.request.get(f"{service}/fields", headers=JSON).json()["fields"]
-    }
+    fields = upload(service, files)
+    job = register(service, fields)
+    named = dict(zip(fields, ("room.ply", "chair.glb", "stool.glb"), strict=True))
     page.goto(f"{service}/jobs")
     expect(page.locator(".tile h2")).to_have_text(f"{named[job['object_found']]} in room.ply")
     expect(page.locator(".tile .word")).to_have_text("Registered")
@@ -96,9 +48,13 @@ def test_the_card_of_a_search_says_what_was_found_where_and_in_which_box(
     expect(page.locator("#job-title")).to_have_text(f"{named[job['object_found']]} in room.ply")
 
 
-def test_every_member_of_a_problem_is_shown(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+def test_every_member_of_a_problem_is_shown(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
-    found(page, service, files)
+    register(service, upload(service, files[:2]))
+    open_page(page, service)
+    choose_scene(page)
+    page.locator("#objects input").check()
+    click_at(page, CHAIR)
     page.route("**/register", lambda route: route.fulfill(status=422, json=FAULTS))
     page.click("#register")
     faults = "options.robust: min_scale 2 is larger than max_scale 1. seed: must not be negative."
@@ -112,11 +68,9 @@ def test_every_member_of_a_problem_is_shown(visit: Visit, service: str, files: t
     expect(page.locator("dialog[open] .bad")).to_contain_text("min_scale 2 is larger than max_scale 1")
 
 
-def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
-) -> None:
+def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
-    found(page, service, files, 2)
+    register(service, upload(service, files))
     page.goto(f"{service}/jobs")
     page.get_by_role("button", name="Delete").click()
     expect(page.locator("dialog[open]")).to_contain_text("in room.ply”?")
@@ -136,27 +90,26 @@ def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(
 
 
 def test_a_field_is_called_what_its_file_is_called_now(
-    visit: Visit, service: str, files: tuple[Path, Path, Path], tmp_path: Path
+    visit: Visit, service: str, files: Files, tmp_path: Path
 ) -> None:
     page = visit.page
     upload = {"file": {"name": "x", "mimeType": "application/octet-stream", "buffer": files[1].read_bytes()}}
     page.request.post(f"{service}/fields", multipart={"description": '{"as": "object"}', **upload})
     mine = tmp_path / "my chair.glb"
     mine.write_bytes(files[1].read_bytes())
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     page.set_input_files("#object-file", mine)
     expect(page.locator("#objects")).to_contain_text("my chair.glb")
     page.goto(f"{service}/fields")
     expect(page.locator(".tile h2")).to_have_text("my chair.glb")
 
 
-def test_the_page_of_a_job_leads_on(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+def test_the_page_of_a_job_leads_on(visit: Visit, filled: str) -> None:
     page = visit.page
-    found(page, service, files)
-    page.click(".run a")
+    page.goto(f"{filled}/jobs")
+    page.get_by_role("link", name="Open").click()
     expect(page.locator("#verdict-word")).to_have_text("Registered")
-    assert page.locator("header nav a").all_inner_texts() == ["Register", "Library", "Jobs", "Fields", "API"]
+    expect(page.locator("header nav a")).to_have_text(["Register", "Library", "Jobs", "Fields", "API"])
     page.get_by_role("button", name="Run again").click()
     expect(page.locator("#again-start")).to_be_enabled()
     page.get_by_role("button", name="Close").click()
@@ -166,36 +119,25 @@ def test_the_page_of_a_job_leads_on(visit: Visit, service: str, files: tuple[Pat
     expect(page.locator("#note")).to_contain_text("No jobs yet")
 
 
-def test_rooms_are_no_candidates_unless_a_person_says_so(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
-) -> None:
+def test_rooms_are_no_candidates_unless_a_person_says_so(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
-    for name, role in zip(files, ("scene", "object", "object"), strict=True):
-        upload = {"file": {"name": name.name, "mimeType": "application/octet-stream", "buffer": name.read_bytes()}}
-        description = f'{{"as": "{role}", "label": "{name.name}"}}'
-        field = page.request.post(f"{service}/fields", multipart={"description": description, **upload}).json()
-        assert page.request.get(f"{service}/fields/{field['sha256']}?wait=20").json()["state"] == "ready"
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    upload(service, files)
+    open_page(page, service)
     page.locator("#all-objects").check()
-    assert sorted(page.locator("label:has(input:checked)").all_inner_texts()) == [
-        "All of them: find out which it is",
-        "chair.glb",
-        "stool.glb",
-    ]
+    expect(page.locator("label:has(input:checked)")).to_have_count(3)
+    chosen = ["All of them: find out which it is", "chair.glb", "stool.glb"]
+    assert sorted(page.locator("label:has(input:checked)").all_inner_texts()) == chosen
     page.goto(f"{service}/fields")
     page.get_by_label("What stool.glb is").select_option("scene")
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
-    assert page.locator("#objects .check").all_inner_texts() == ["chair.glb"]
+    open_page(page, service)
+    expect(page.locator("#objects .check")).to_have_text(["chair.glb"])
     groups = page.locator("#scene-known optgroup")
     assert [groups.nth(i).get_attribute("label") for i in range(groups.count())] == ["Scenes", "Objects"]
 
 
-def test_sizes_are_those_of_the_surface(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+def test_sizes_are_those_of_the_surface(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     page.set_input_files("#object-file", files[2])
     expect(page.locator("#objects input:checked")).to_have_count(1)
     page.goto(f"{service}/fields")
@@ -206,12 +148,11 @@ def test_sizes_are_those_of_the_surface(visit: Visit, service: str, files: tuple
 
 
 def test_several_files_become_entries_and_leaving_meanwhile_is_asked_about(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
+    visit: Visit, service: str, files: Files
 ) -> None:
     page = visit.page
     asks = "() => !window.dispatchEvent(new Event('beforeunload', { cancelable: true }))"
-    page.goto(f"{service}/library")
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, f"{service}/library")
     page.click("#add")
     page.set_input_files("#entry-file", list(files[1:]))
     page.fill("#entry-tags", "seat")
@@ -232,11 +173,10 @@ def test_several_files_become_entries_and_leaving_meanwhile_is_asked_about(
     assert not page.evaluate(asks)
 
 
-def test_an_import_that_waits_says_so(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+def test_an_import_that_waits_says_so(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
     waiting = {"sha256": "0" * 64, "state": "validating", "queue_position": 3, "bytes": 1, "description": {}}
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     page.route(re.compile(r"/fields/[0-9a-f]{64}"), lambda route: route.fulfill(json=waiting))
     page.set_input_files("#scene-file", files[0])
     for place in ("#scene-state", "#welcome-state"):
@@ -244,35 +184,11 @@ def test_an_import_that_waits_says_so(visit: Visit, service: str, files: tuple[P
     expect(page.locator("#welcome .steps")).to_be_hidden()
 
 
-def test_a_comparison_opens_at_its_top_in_the_words_of_a_jobs_page(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
-) -> None:
-    page = visit.page
-    found(page, service, files)
-    page.goto(f"{service}/jobs")
-    page.get_by_role("button", name="Run again").click()
-    page.get_by_label("Seed").fill("7")
-    page.click("#again-start")
-    page.wait_for_url("**/view")
-    expect(page.locator("#verdict-word")).to_have_text("Registered")
-    page.set_viewport_size({"width": 600, "height": 320})
-    page.goto(f"{service}/jobs")
-    expect(page.get_by_role("checkbox", name=re.compile("^Compare"))).to_have_count(2)
-    for mark in page.get_by_role("checkbox", name=re.compile("^Compare")).all():
-        mark.check()
-    page.click("#compare")
-    expect(page.locator("#comparison")).to_contain_text("Residual RMS")
-    expect(page.locator("#compare-title")).to_be_focused()
-    expect(page.locator("#compare-title")).to_be_in_viewport()
-    page.set_viewport_size({"width": 1280, "height": 800})
-
-
 def test_the_result_lies_over_the_scene_and_nothing_scrolls_but_the_panel(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
+    visit: Visit, service: str, files: Files
 ) -> None:
     page = visit.page
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     page.locator("#options > summary").click()
     expect(page.locator("#options-form input[placeholder]")).not_to_have_count(0)
     give_files(page, files[:2])
@@ -291,8 +207,7 @@ def test_the_result_lies_over_the_scene_and_nothing_scrolls_but_the_panel(
 
 def test_options_are_those_of_the_contract(visit: Visit, service: str) -> None:
     page = visit.page
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     page.locator("#options > summary").click()
     page.locator("#options-form details summary").click()
     rows = page.locator("#options-form input[placeholder]")
@@ -321,22 +236,24 @@ CROWDED = """() => {
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_buttons_have_gaps_and_no_choice_is_cut(
-    visit: Visit, service: str, files: tuple[Path, Path, Path], width: int
-) -> None:
+def test_buttons_have_gaps_and_no_choice_is_cut(visit: Visit, filled: str, width: int) -> None:
     page = visit.page
-    found(page, service, files)
+    open_page(page, filled)
+    choose_scene(page)
+    page.locator("#objects input").check()
+    click_at(page, CHAIR)
+    page.click("#register")
+    page.wait_for_selector(".run[data-verdict]")
     page.set_viewport_size({"width": width, "height": 800})
     page.locator("#options > summary").click()
     clear = {"touching": [], "cut": []}
     looks = {"home": page.evaluate(CROWDED)}
     for place in ("jobs", "fields", "library", "docs"):
-        page.goto(f"{service}/{place}")
-        page.wait_for_selector("html[data-page=ready]")
+        open_page(page, f"{filled}/{place}")
         looks[place] = page.evaluate(CROWDED)
-        assert page.locator("header nav a").count() == 5
-    page.goto(f"{service}/jobs")
-    page.get_by_role("button", name="Run again").click()
+        expect(page.locator("header nav a")).to_have_count(5)
+    page.goto(f"{filled}/jobs")
+    page.get_by_role("button", name="Run again").first.click()
     expect(page.locator("#again-start")).to_be_enabled()
     looks["again"] = page.evaluate(CROWDED)
     for place, look in looks.items():
@@ -373,12 +290,9 @@ def phone(context_options: dict[str, Any]) -> None:
 
 
 @pytest.mark.usefixtures("phone")
-def test_handles_leave_the_thing_in_sight_on_a_phone(
-    visit: Visit, service: str, files: tuple[Path, Path, Path]
-) -> None:
+def test_handles_leave_the_thing_in_sight_on_a_phone(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
-    page.goto(service)
-    page.wait_for_selector("html[data-page=ready]")
+    open_page(page, service)
     give_files(page, files[:2])
     click_at(page, CHAIR)
     expect(page.locator("#boxes li")).to_have_count(1)

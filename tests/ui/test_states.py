@@ -17,8 +17,8 @@ def test_running_shows_phase_and_progress(visit: Visit) -> None:
     expect(page.locator("#status")).to_have_text("Running")
     expect(page.locator("#message-title")).to_have_text("Optimizing")
     expect(page.locator("#message-text")).to_have_text("62 % done")
-    assert page.locator("#progress").evaluate("bar => bar.value") == pytest.approx(0.62)
-    assert page.locator("#phases [data-state=done]").count() == 3
+    expect(page.locator("#progress")).to_have_js_property("value", 0.62)
+    expect(page.locator("#phases [data-state=done]")).to_have_count(3)
     assert visit.complaints == []
 
 
@@ -72,29 +72,28 @@ def test_cancel_ends_the_job(visit: Visit) -> None:
 
 def test_failure_tells_reason_and_detail_as_text(visit: Visit) -> None:
     page = visit.open("failed")
-    assert page.locator("#status").inner_text() == "Failed"
-    assert page.locator("#message-title").inner_text() == "No surface in the detection"
-    assert "<b>chair</b>" in page.locator("#message-text").inner_text()
-    assert page.locator("#message-text b").count() == 0
-    facts = page.locator("#message-facts").inner_text()
-    assert "NO_SURFACE_IN_DETECTION" in facts
-    assert "req-7f3a" in facts
-    assert page.locator("#message-hint").inner_text() == "Check the box."
-    assert not page.locator("#canvas").is_visible()
+    expect(page.locator("#status")).to_have_text("Failed")
+    expect(page.locator("#message-title")).to_have_text("No surface in the detection")
+    expect(page.locator("#message-text")).to_contain_text("<b>chair</b>")
+    expect(page.locator("#message-text b")).to_have_count(0)
+    expect(page.locator("#message-facts")).to_contain_text("NO_SURFACE_IN_DETECTION")
+    expect(page.locator("#message-facts")).to_contain_text("req-7f3a")
+    expect(page.locator("#message-hint")).to_have_text("Check the box.")
+    expect(page.locator("#canvas")).to_be_hidden()
     assert visit.complaints == []
 
 
 def test_unknown_job_says_so(visit: Visit) -> None:
     page = visit.open("unheard_of")
-    assert page.locator("#message-title").inner_text() == "There is no such job"
-    assert "JOB_NOT_FOUND" in page.locator("#message-facts").inner_text()
+    expect(page.locator("#message-title")).to_have_text("There is no such job")
+    expect(page.locator("#message-facts")).to_contain_text("JOB_NOT_FOUND")
 
 
 def test_versioned_address_works_too(visit: Visit) -> None:
     page = visit.page
     page.goto(f"{visit.server.origin}/v1/jobs/failed/view")
     page.wait_for_selector("html[data-page=ready]")
-    assert page.locator("#status").inner_text() == "Failed"
+    expect(page.locator("#status")).to_have_text("Failed")
     assert f"{visit.server.origin}/v1/jobs/failed" in visit.requests
 
 

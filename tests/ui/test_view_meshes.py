@@ -31,31 +31,24 @@ def test_meshes_are_drawn_where_the_samples_lie(visit: Visit) -> None:
     assert visit.complaints == []
 
 
-@pytest.mark.parametrize(("layer", "least"), [("scene", 0.002), ("context", 0.05), ("before", 0.005), ("after", 0.005)])
-def test_every_mesh_is_a_layer(visit: Visit, layer: str, least: float) -> None:
+def test_every_mesh_is_a_layer(visit: Visit) -> None:
+    """It moves with the iterations, and what is hidden stays hidden as samples."""
     page = visit.open("meshed")
     shown = canvas_pixels(page)
-    hide(visit, layer)
-    assert changed_share(shown, canvas_pixels(page)) > least
-    hide(visit, layer)
-    assert changed_share(shown, canvas_pixels(page)) < 0.001
-
-
-def test_a_hidden_layer_stays_hidden_as_samples(visit: Visit) -> None:
-    page = visit.open("meshed")
+    for layer, least in (("scene", 0.002), ("context", 0.05), ("before", 0.005), ("after", 0.005)):
+        hide(visit, layer)
+        assert changed_share(shown, canvas_pixels(page)) > least, layer
+        hide(visit, layer)
+        assert changed_share(shown, canvas_pixels(page)) < 0.001, layer
+    hide(visit, "before")
+    end = colored(canvas_pixels(page), "blue")
+    page.locator("#iteration").fill("0")
+    assert overlap(end, colored(canvas_pixels(page), "blue")) < 0.5
     hide(visit, "after")
     page.locator("#surfaces").select_option("discs")
     assert colored(canvas_pixels(page), "blue").mean() < 0.001
     hide(visit, "after")
     assert colored(canvas_pixels(page), "blue").mean() > 0.01
-
-
-def test_the_mesh_moves_with_the_iterations(visit: Visit) -> None:
-    page = visit.open("meshed")
-    hide(visit, "before")
-    end = colored(canvas_pixels(page), "blue")
-    page.locator("#iteration").fill("0")
-    assert overlap(end, colored(canvas_pixels(page), "blue")) < 0.5
 
 
 def test_without_meshes_there_is_no_choice(visit: Visit) -> None:

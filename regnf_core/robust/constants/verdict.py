@@ -133,7 +133,7 @@ class CovarianceConstants:
     """Distance of unit normals, about 35 degrees: how far surfaces may be turned from one another and still be off
     alike. The likelihood of the residuals has its maximum at .35 to .6. [random worlds]"""
     residuals_factor: float = 3.8
-    """Of the covariance that the residuals tell. [random worlds, docs/adr/0042-covariance-in-random-worlds.md]"""
+    """Of the covariance that the residuals tell. [random worlds, benchmarks/notes/covariance.md]"""
     offset_factor: float = 2.3
     """Of the offset between the surfaces, as an error of the pose. [random worlds, the same]"""
     min_variance: float = 1e-18

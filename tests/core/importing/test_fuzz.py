@@ -40,7 +40,7 @@ CASES = 4_500
 
 LIMITS = PickleLimits(opcodes=20_000)
 quick = settings(
-    max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
+    max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 
 Edit = tuple[int, int, bytes]
@@ -179,7 +179,7 @@ def fuzzed(seeds: Seeds, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return results
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
     """No other exception, no import, no file left or opened, nothing slow, nothing large."""
@@ -187,7 +187,7 @@ def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
     assert sum(fuzzed["outcomes"].values()) == CASES
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_the_fuzzer_reaches_what_lies_deep(fuzzed: dict[str, Any]) -> None:
     """A fuzzer whose cases all fail at the first check would find nothing."""

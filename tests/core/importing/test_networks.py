@@ -144,7 +144,7 @@ def test_layers_in_arrays(turned: bool, kernel: str, bias: str, tmp_path: Path) 
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5 * np.ptp(expected))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(2))
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_trained_network_is_never_silently_wrong(family: str, number: int, tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_a_trained_network_is_never_silently_wrong(family: str, number: int, tmp
     assert found.value < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_siren_tells_its_factor(tmp_path: Path) -> None:
     case = case_of("siren", 5, steps=250)
     found = judged(case, {}, tmp_path)

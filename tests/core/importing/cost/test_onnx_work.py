@@ -216,26 +216,26 @@ def test_graphs_whose_values_cannot_be_told_are_refused(name: str, tmp_path: Pat
 
 
 LOWEST = np.iinfo(np.int64).min
-TRAPS: dict[str, tuple[str, Initializers]] = {
-    "known": ("a = Div low minus", {"low": ints(LOWEST), "minus": ints(-1)}),
-    "of a real number": (
-        "i = Cast low to:7; a = Div i minus",
-        {"low": np.array([-1e30], np.float32), "minus": ints(-1)},
-    ),
-    "at every point": (
-        "i = Cast r to:7; z = Sub i i; k = Add z low; a = Div k minus",
-        {"low": ints(LOWEST), "minus": ints(-1)},
-    ),
-    "the rest": ("a = Mod low minus", {"low": ints(LOWEST), "minus": ints(-1)}),
-    "the other rest": ("a = Mod low minus fmod:1", {"low": ints(LOWEST), "minus": ints(-1)}),
+TRAPS = {
+    "known": "a{0} = Div low minus",
+    "of a real number": "i{0} = Cast far to:7; a{0} = Div i{0} minus",
+    "at every point": "i{0} = Cast r to:7; z{0} = Sub i{0} i{0}; k{0} = Add z{0} low; a{0} = Div k{0} minus",
+    "the rest": "a{0} = Mod low minus",
+    "the other rest": "a{0} = Mod low minus fmod:1",
 }
+"""What divides the lowest whole number by minus one; each result is then multiplied by nothing and added."""
 
 
-@pytest.mark.parametrize("name", TRAPS)
-def test_the_lowest_whole_number_by_minus_one_does_not_end_the_process(name: str, tmp_path: Path) -> None:
-    text, initializers = TRAPS[name]
-    zero = "; b = Mul a none; c = Cast b to:1; y = Add s c"
-    path = saved(tmp_path, model(SPHERE + text + zero, HALF | initializers | {"none": ints(0)}).SerializeToString())
+def test_the_lowest_whole_number_by_minus_one_does_not_end_the_process(tmp_path: Path) -> None:
+    text, last = SPHERE, "s"
+    for number, trap in enumerate(TRAPS.values()):
+        total = "y" if number == len(TRAPS) - 1 else f"t{number}"
+        text += f"{trap}; b{{0}} = Mul a{{0}} none; c{{0}} = Cast b{{0}} to:1; {total} = Add {last} c{{0}}; ".format(
+            number
+        )
+        last = total
+    values = {"low": ints(LOWEST), "minus": ints(-1), "none": ints(0), "far": np.array([-1e30], np.float32)}
+    path = saved(tmp_path, model(text.removesuffix("; "), HALF | values).SerializeToString())
     assert import_field(path, tmp_path / "out").family == "onnx"
 
 

@@ -18,6 +18,7 @@ from regnf_core.in_memory import FieldWarning
 from regnf_core.loading import open_field, safe_field
 from regnf_core.schema.safe_format import add_to_source, read_description, write_safe_field
 from tests.core.importing.gate.test_candidates import reading
+from tests.core.importing.in_process import convert
 
 
 def ball(folder: Path, factor: float = 3.0, name: str = "ball.npz") -> Path:
@@ -34,15 +35,14 @@ def test_a_field_file_keeps_the_warnings_of_its_import(tmp_path: Path) -> None:
     assert safe_field(find_source(kept)).notes.warnings == report.warnings
     with pytest.warns(FieldWarning, match="GRADIENT_NOT_UNIT"):
         open_field(kept)
-    again = import_field(kept, tmp_path / "again")
-    assert again.warnings == report.warnings
+    assert tuple(convert(kept, tmp_path / "again")["warnings"]) == report.warnings
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         open_field(_imported(tmp_path))
 
 
 def _imported(folder: Path) -> Path:
-    import_field(ball(folder, 1.0, "true.npz"), folder / "true")
+    convert(ball(folder, 1.0, "true.npz"), folder / "true")
     return folder / "true" / FIELD_NAME
 
 

@@ -1,0 +1,120 @@
+"""The home page's service: the real application with a pretended worker, filled by mouse or by requests."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import trimesh
+import uvicorn
+from fastapi import FastAPI
+from playwright.sync_api import Page, expect
+
+from regnf_service.server import create_app
+from regnf_state.ownership import ANONYMOUS
+from regnf_state.settings import Settings
+from tests.contract.live import eventually
+from tests.stores import private_stores
+from tests.ui import room
+from tests.ui.pretend_worker import PretendWorker
+
+NETWORK = "Failed to load resource"
+"""Begins what the browser says of an answer that is no success; the page shows what it makes of it."""
+CHAIR = (0.417, 0.484)
+"""Where the chair is seen at first, as shares of the view."""
+BOX = {"center": [*room.CHAIR_AT, 0.5], "size": [0.8, 0.8, 1.1]}
+
+
+class StoppingServer(uvicorn.Server):
+    """Tells the application first that it stops, as a signal does in a process of its own: threads hear none."""
+
+    def __init__(self, app: FastAPI) -> None:
+        super().__init__(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        self._app = app
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._app.state.services.stopping.set()
+        await super().shutdown(sockets)
+
+
+def true_pose() -> np.ndarray:
+    """T_scene_object of the chair's file in the room."""
+    stands = trimesh.transformations.rotation_matrix(room.CHAIR_TURN, (0, 0, 1))
+    stands[:3, 3] = (*room.CHAIR_AT, 0.002)
+    own = np.diag([1 / room.CHAIR_SCALE] * 3 + [1.0])
+    own[:3, 3] = -np.array([3.0, 1.0, 0.0]) / room.CHAIR_SCALE
+    return stands @ own
+
+
+@contextmanager
+def home(settings: Settings, caller: str = ANONYMOUS) -> Iterator[str]:
+    """The address of the application with a worker that ends everything at once."""
+    with private_stores() as stores:
+        server = StoppingServer(create_app(settings, stores))
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+            thread.start()
+            try:
+                with PretendWorker(stores.records, stores.blobs, caller, true_pose().tolist()):
+                    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+            finally:
+                server.should_exit = True
+                thread.join()
+
+
+def upload(address: str, files: Sequence[Path]) -> list[str]:
+    """Send a scene and objects, as the page does; their digests, once each can be shown."""
+    found = []
+    for file, role in zip(files, ("scene", "object", "object"), strict=False):
+        description = json.dumps({"as": role, "label": file.name})
+        parts = {"description": (None, description), "file": (file.name, file.read_bytes())}
+        found.append(httpx.post(f"{address}/fields", files=parts, timeout=30).json()["sha256"])
+    for sha256 in found:
+        eventually(lambda at=f"{address}/fields/{sha256}": httpx.get(at).json().get("views") == "ready", "the views")
+    return found
+
+
+def register(address: str, fields: Sequence[str], **more: Any) -> dict[str, Any]:
+    """Have the chair registered, or searched for among several objects: the job once it has ended."""
+    scene, *objects = fields
+    asked = {"object": objects[0]} if len(objects) == 1 else {"candidates": objects}
+    answer = httpx.post(f"{address}/register", json={"scene": scene, "detection": BOX, **asked, **more}, timeout=30)
+    assert answer.status_code == 202, answer.text
+
+    def ended() -> dict[str, Any] | None:
+        job: dict[str, Any] = httpx.get(f"{address}/jobs/{answer.json()['id']}").json()
+        return job if job["status"] == "successful" else None
+
+    return eventually(ended, "the end of a job")
+
+
+def give_files(page: Page, files: Sequence[Path]) -> None:
+    page.set_input_files("#scene-file", files[0])
+    page.set_input_files("#object-file", files[1])
+    page.wait_for_selector("html[data-scene]")
+    expect(page.locator("#objects input:checked")).to_have_count(1)
+
+
+def choose_scene(page: Page, label: str = "room.ply") -> None:
+    """Take one of the service's fields as the scene."""
+    page.select_option("#scene-known", label=label)
+    page.wait_for_selector("html[data-scene]")
+
+
+def click_at(page: Page, place: tuple[float, float]) -> None:
+    box = page.locator("#canvas").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"])
+
+
+def open_page(page: Page, address: str) -> None:
+    """Open a page of the service and wait until it is filled."""
+    page.goto(address)
+    page.wait_for_selector("html[data-page=ready]")
