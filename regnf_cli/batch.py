@@ -292,7 +292,7 @@ def _at_service(
 ) -> Iterator[tuple[FilePair, dict[str, Any]]]:
     from regnf_client import Client
 
-    with Client(server, token, worker_timeout_s=worker_timeout or None) as client:
+    with Client(server, token, worker_timeout_s=worker_timeout) as client:
         for one in client.batch(_request(pair) for pair in pairs):
             yield pairs[one.index], _told(one)
 

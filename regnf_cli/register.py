@@ -33,7 +33,7 @@ from regnf_cli.options import (
     read_transform,
     source_of,
 )
-from regnf_cli.report import err, exit_code, phase_progress, show
+from regnf_cli.report import err, exit_code, reporting, show
 from regnf_cli.search import Files, check_box_by_header, open_scene, tell_files
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
@@ -100,11 +100,11 @@ def register(
     if server is None:
         document = _register_here(place, thing, box, request, Files(output, recording))
     else:
-        from regnf_cli.remote import RemoteService
-        from regnf_cli.remote_exchange import Delivery, register_remotely
+        from regnf_cli.remote import register_remotely
+        from regnf_client import Client
 
-        service = RemoteService(server, token, worker_timeout)
-        document = register_remotely(service, place, thing, request, Delivery(output, cancel_on_interrupt))
+        client = Client(server, token, worker_timeout_s=worker_timeout)
+        document = register_remotely(client, place, thing, request, output=output, cancel=cancel_on_interrupt)
     show(document, as_json)
     tell_files(output, recording)
     raise typer.Exit(exit_code(document))
@@ -145,8 +145,7 @@ def _register_here(
     start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
     truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
     files.check()
-    with phase_progress() as bar:
-        task = bar.add_task("loading", total=1.0)
+    with reporting("loading") as report:
         import_smallest_first((scene, object_))
         opened, obj = open_scene(scene, detection), load_field(object_)
         result = run(
@@ -155,11 +154,11 @@ def _register_here(
             box,
             options,
             request["seed"],
-            lambda phase, share: bar.update(task, description=phase, completed=share),
+            report,
             WarmStart(T_object_scene=start),
             clouds=files.wanted,
         )
-        bar.update(task, description="exporting", completed=1.0)
+        report("exporting", 1.0)
     said: dict[str, Any] = {
         "truth": truth,
         "object_name": str(object_.named),

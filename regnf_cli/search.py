@@ -36,7 +36,7 @@ from regnf_cli.options import (
     read_options,
     source_of,
 )
-from regnf_cli.report import err, exit_code, phase_progress, show
+from regnf_cli.report import err, exit_code, reporting, show
 from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.errors import (
     Candidate,
@@ -216,14 +216,12 @@ def search(
         require("engine")
         document = _search_here(place, objects, box, request, output)
     else:
-        from regnf_cli.remote import RemoteService
-        from regnf_cli.remote_exchange import Delivery, search_its_library, search_remotely
+        from regnf_cli.remote import register_remotely
+        from regnf_client import Client
 
-        service, delivery = RemoteService(server, token, worker_timeout), Delivery(output, cancel_on_interrupt)
-        if library:
-            document = search_remotely(service, place, objects, request, delivery)
-        else:
-            document = search_its_library(service, place, tag, request, delivery)
+        client = Client(server, token, worker_timeout_s=worker_timeout)
+        searched = objects if library else None
+        document = register_remotely(client, place, searched, request, tag, output, cancel_on_interrupt)
     show(document, as_json, top)
     tell_files(output)
     raise typer.Exit(exit_code(document))
@@ -277,21 +275,20 @@ def _search_here(
     options = RegistrationOptions.from_dict(request["options"])
     box = OrientedBox.from_detection(detection)
     Files(output).check()
-    with phase_progress() as bar:
-        task = bar.add_task("library", total=1.0)
+    with reporting("library") as report:
         import_smallest_first((scene, *objects))
         opened = open_scene(scene, detection)
-        library, unusable = _modeled(objects, options.robust, lambda share: bar.update(task, completed=share))
+        library, unusable = _modeled(objects, options.robust, partial(report, "library"))
         found = search_library(
             opened.field,
             box,
             library,
             options,
             request["seed"],
-            lambda phase, share: bar.update(task, description=phase, completed=share),
+            report,
             clouds=output is not None,
         )
-        bar.update(task, description="exporting", completed=1.0)
+        report("exporting", 1.0)
     winner = next(one for one in objects if str(one.named) == found.ranking[0].name)
     said: dict[str, Any] = {
         "object_name": found.ranking[0].name,
