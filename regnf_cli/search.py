@@ -12,30 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.options import (
-    CONFIG,
-    DESCRIPTION,
-    JSON_FILE,
-    AsJson,
-    CancelOnInterrupt,
-    DetectionFile,
-    DetectionIndex,
-    NoConfigs,
-    Output,
-    Scene,
-    SceneConfig,
-    SceneDescription,
-    Seed,
-    Server,
-    Token,
-    WorkerTimeout,
-    choice_of,
-    library_path,
-    read_detection,
-    read_options,
-    source_of,
-)
 from regnf_cli.report import err, exit_code, reporting, show
 from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.errors import (
@@ -82,7 +60,7 @@ def objects_of(
         yield FieldSource(Path(one.notes.name), library.file(one))
     files = [path for path in paths if path not in [library.folder for library in libraries]]
     for path in library_files(files) if files else ():
-        yield source_of(path, description, settings, "object")
+        yield cli.source_of(path, description, settings, "object")
 
 
 # The files that a registration leaves: those of its folder, and its recording.
@@ -167,37 +145,37 @@ Library = Annotated[
     list[Path] | None,
     typer.Argument(
         help="Libraries, folders of fields, or fields: the objects. Without any, your library.",
-        parser=library_path,
+        parser=cli.library_path,
         metavar="[LIBRARY]...",
     ),
 ]
 Tag = Annotated[str | None, typer.Option(help="Of libraries, only the entries with this tag.")]
 Top = Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")]
-Options = Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **JSON_FILE)]
-ObjectConfig = Annotated[Path | None, typer.Option(help="The same of every object.", **CONFIG)]
-ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of every object.", **DESCRIPTION)]
+Options = Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **cli.JSON_FILE)]
+ObjectConfig = Annotated[Path | None, typer.Option(help="The same of every object.", **cli.CONFIG)]
+ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of every object.", **cli.DESCRIPTION)]
 
 
 def search(
-    scene: Scene,
-    detection: DetectionFile,
+    scene: cli.Scene,
+    detection: cli.DetectionFile,
     library: Library = None,
     tag: Tag = None,
-    detection_index: DetectionIndex = None,
+    detection_index: cli.DetectionIndex = None,
     top: Top = 5,
     options: Options = None,
-    scene_config: SceneConfig = None,
+    scene_config: cli.SceneConfig = None,
     object_config: ObjectConfig = None,
-    no_config: NoConfigs = False,
-    scene_description: SceneDescription = None,
+    no_config: cli.NoConfigs = False,
+    scene_description: cli.SceneDescription = None,
     object_description: ObjectDescription = None,
-    seed: Seed = 0,
-    output: Output = None,
-    server: Server = None,
-    worker_timeout: WorkerTimeout = 60,
-    cancel_on_interrupt: CancelOnInterrupt = False,
-    token: Token = None,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    output: cli.Output = None,
+    server: cli.Server = None,
+    worker_timeout: cli.WorkerTimeout = 60,
+    cancel_on_interrupt: cli.CancelOnInterrupt = False,
+    token: cli.Token = None,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Find which object of a library stands in the box, and where.
 
@@ -206,11 +184,11 @@ def search(
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
     """
-    box = read_detection(detection, detection_index)
+    box = cli.read_detection(detection, detection_index)
     request = _request(box, options, seed)
-    place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
+    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
     check_box_by_header(place.file, box)
-    settings = choice_of(object_config, no_config)
+    settings = cli.choice_of(object_config, no_config)
     objects = [] if server and not library else list(objects_of(library, tag, object_description, settings))
     if server is None:
         require("engine")
@@ -229,7 +207,7 @@ def search(
 
 def _request(box: Detection, options: Path | None, seed: int) -> dict[str, Any]:
     """What a service is asked, too."""
-    request: dict[str, Any] = {"detection": box.canonical(), "options": read_options(options, None), "seed": seed}
+    request: dict[str, Any] = {"detection": box.canonical(), "options": cli.read_options(options, None), "seed": seed}
     if RegistrationOptions.from_dict(request["options"]).preset != "robust":
         message = f"{options}: only the preset robust searches a library"
         hint = "Leave the preset out of the options."

@@ -18,6 +18,7 @@ HELP = "--help` shows"
 CASES = [
     Case("unknown command", "USAGE", 2, "regster", "No such command", "register", ["regster"]),
     Case("unknown option", "USAGE", 2, "--detectin", "No such option", "--detection", ["register", "--detectin", "x"]),
+    Case("option by its old name", "USAGE", 2, "--truth", "No such option", "Did you mean --ground-truth", [*REGISTER, "--truth", "box.json"]),
     Case("no detection", "USAGE", 2, "--detection", "Missing option", "regnf register " + HELP, REGISTER[:3]),
     Case("no object", "USAGE", 2, "(?i)object", "Missing argument", "regnf register " + HELP, [*REGISTER[:2], *REGISTER[3:]]),
     Case("negative seed", "USAGE", 2, "--seed", "greater than or equal to 0", "regnf register " + HELP, [*REGISTER, "--seed=-1"]),
@@ -29,7 +30,7 @@ CASES = [
     Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON is expected", [*REGISTER[:4], "chair.safetensors"]),
     Case("output a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json"]),
     Case("output below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json/out"]),
-    Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--truth", "box.json"]),
+    Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--ground-truth", "box.json"]),
     Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected safe fields", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
     Case("library missing", "FILE_NOT_FOUND", 2, "nowhere", "no such file", "Check the path", ["search", "room.safetensors", "nowhere", *REGISTER[3:]]),
     Case("library of a run's folder above", "FILE_TRUNCATED", 2, "step-000030000.ckpt", "cut short", "Copy or download", ["search", "room.safetensors", "run", *REGISTER[3:]]),
