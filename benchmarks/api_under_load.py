@@ -25,8 +25,9 @@ import httpx
 import numpy as np
 
 from benchmarks.api_process import api_process
+from benchmarks.service_load.small_fields import submit
 from regnf_cli.demo import running_service
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 from tests.core.importing.checkpoints import write_full_size_checkpoint
 
 DATA = Path(__file__).resolve().parents[1] / "examples" / "data"
@@ -81,26 +82,26 @@ def measure(folder: Path) -> str:
     write_full_size_checkpoint(checkpoint)
     size = checkpoint.stat().st_size
     idle, job_only, uploading, importing = Polls(), Polls(), Polls(), Polls()
-    with running_service(folder / "state") as address, RemoteService(address) as service:
+    with running_service(folder / "state") as address, Client(address) as service:
         pid = api_process(address)
         request = {
-            "scene": service.upload_field(DATA / "mix-room.safetensors"),
-            "object": service.upload_field(DATA / "armchair.safetensors"),
+            "scene": service.upload(DATA / "mix-room.safetensors").sha256,
+            "object": service.upload(DATA / "armchair.safetensors").sha256,
             "detection": json.loads((DATA / "detection.json").read_text()),
         }
-        first = service.submit({**request, "seed": 1})["id"]
+        first = submit(service, {**request, "seed": 1})
         with polling(address, first, pid, job_only):
-            service.follow(first)
+            service.wait(first)
         with polling(address, first, pid, idle):
             time.sleep(5)
-        second = service.submit({**request, "seed": 2})["id"]
+        second = submit(service, {**request, "seed": 2})
         begun = time.perf_counter()
         with polling(address, second, pid, uploading):
-            sha256 = service.send(checkpoint)
+            service.upload(checkpoint, wait=False)
         upload_s = time.perf_counter() - begun
         with polling(address, second, pid, importing):
-            service.follow(second)
-            service.wait_until_ready(sha256)
+            service.wait(second)
+            service.upload(checkpoint)
         import_s = time.perf_counter() - begun - upload_s
         mapped = "libtorch" in Path(f"/proc/{pid}/maps").read_text()
     peak = max(polls.peak_memory for polls in (idle, job_only, uploading, importing))

@@ -29,8 +29,8 @@ from typing import Any
 import httpx
 import numpy as np
 
-from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, write_small_pair
-from regnf_cli.remote import RemoteService
+from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, submit, write_small_pair
+from regnf_client import Client
 from regnf_service.http.query import encode_token
 from tests.contract.live import Live, eventually, live_service
 from tests.processes import children_of
@@ -64,15 +64,15 @@ class Outcome:
 def prepare(live: Live, folder: Path, spare_fields: int) -> dict[str, Any]:
     """Fields in every state, jobs of every end; what the hooks are told of them."""
     pair = write_small_pair(folder)
-    with RemoteService(live.address) as service:
+    with Client(live.address) as service:
         request = pair.upload(service)
-        ended = service.submit(request)["id"]
-        failed = service.submit({**request, "detection": EMPTY_BOX})["id"]
+        ended = submit(service, request)
+        failed = submit(service, {**request, "detection": EMPTY_BOX})
         for job in (ended, failed):
-            service.follow(job)
-        artifacts = [entry["name"] for entry in service.result(ended)["artifacts"]]
+            service.wait(job)
+        artifacts = [one.name for one in service.result(ended).artifacts]
         for name in artifacts:  # those that follow the result, before their process is stopped with the others
-            service.fetch_artifact(ended, name, folder / "artifact")
+            service.download(ended, name, folder / "artifact")
     with live.client() as client:
         kept = [request["scene"], request["object"]]
         rejected = client.post("/fields", content=_broken(pair)).json()["sha256"]

@@ -218,16 +218,14 @@ PairsFile = Annotated[
 Results = Annotated[
     Path | None, typer.Option(help="Results, a JSON line each. By default beside the pairs: PAIRS.results.jsonl.")
 ]
-Processes = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Processes, of one thread each. By default one a core.")
-]
+Processes = Annotated[int | None, typer.Option(min=1, help="Processes, of one thread each. By default one a core.")]
 _REASONS_SHOWN, _LINES_SHOWN = 8, 5
 
 
 def batch(
     pairs: PairsFile,
     output: Results = None,
-    jobs: Processes = None,
+    processes: Processes = None,
     server: Server = None,
     worker_timeout: WorkerTimeout = 60,
     token: Token = None,
@@ -251,7 +249,7 @@ def batch(
         if pair.error is not None:
             results.add(pair, failure(pair.error))
     if server is None:
-        ended = register_here(sound, min(jobs or os.cpu_count() or 1, max(1, len(sound))))
+        ended = register_here(sound, min(processes or os.cpu_count() or 1, max(1, len(sound))))
     else:
         ended = _at_service(sound, server, token, worker_timeout)
     if sound:
@@ -292,7 +290,7 @@ def _at_service(
 ) -> Iterator[tuple[FilePair, dict[str, Any]]]:
     from regnf_client import Client
 
-    with Client(server, token, worker_timeout_s=worker_timeout or None) as client:
+    with Client(server, token, worker_timeout_s=worker_timeout) as client:
         for one in client.batch(_request(pair) for pair in pairs):
             yield pairs[one.index], _told(one)
 

@@ -13,11 +13,12 @@ import typer
 from regnf_cli.report import EXIT_BAD_INPUT, err, fail
 from regnf_core import __version__
 
-COMMANDS = (
-    "demo", "register", "search", "batch", "serve", "worker", "inspect", "convert", "fit", "fuse", "render", "edit",
-    "doctor", "render-dataset", "manual",
-)  # fmt: skip
-"""In the order of the help. Each is a function in a module, both of its name, with underscores."""
+COMMANDS = {
+    "demo": "demo", "register": "register", "search": "search", "batch": "batch", "serve": "serve", "worker": "serve",
+    "inspect": "inspect", "convert": "convert", "fit": "fit", "fuse": "fit", "render": "render", "edit": "render",
+    "doctor": "doctor", "render-dataset": "render_dataset", "manual": "manual",
+}  # fmt: skip
+"""In the order of the help, each with its module. Its function has its name, with underscores."""
 GROUPS = ("library",)
 """Each is the ``app`` of the module of its name, with sub-commands of its own."""
 
@@ -34,12 +35,11 @@ def app_of(names: Iterable[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
     )
     app.callback(invoke_without_command=True)(root)
     for name in names:
-        function = name.replace("-", "_")
-        module = import_module(f"regnf_cli.{function}")
+        module = import_module(f"regnf_cli.{COMMANDS.get(name, name)}")
         if name in GROUPS:
             app.add_typer(module.app, name=name)
         else:
-            app.command(name)(getattr(module, function))
+            app.command(name)(getattr(module, name.replace("-", "_")))
     return app
 
 
@@ -53,6 +53,9 @@ def root(
 
 # Arguments that a command cannot use: what is wrong, and where the right ones are listed.
 
+_RENAMED = {"--truth": "--ground-truth", "--jobs": "--processes", "--up": "--up-axis"}
+"""Options of earlier versions, and what they are called now."""
+_UNKNOWN = re.compile(r"No such option: (--[\w-]+)")
 _CHOICES = re.compile(r"'([^']*)' is not one of (.*?)\.?$")
 
 
@@ -72,6 +75,8 @@ def usage_fault(error: Any) -> int:
 
 
 def _meant(message: str) -> str | None:
+    if (unknown := _UNKNOWN.search(message)) and unknown[1] in _RENAMED:
+        return _RENAMED[unknown[1]]
     found = _CHOICES.search(message)
     if found is None:
         return None

@@ -19,14 +19,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from regnf_cli.guard import require
-from regnf_cli.remote import RemoteService
-from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, phase_progress, show_pose
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, reporting, show_pose
 from regnf_cli.serve import demo_folder
+from regnf_client import Client, Result
 
 # A private service for scripts and notebooks: `regnf serve` on a free port, stopped at the end.
 
@@ -102,10 +102,10 @@ def demo(
         try:
             with running_service(folder) as address:
                 out.print(f"service      {address}  (log: {folder / 'serve.log'})")
-                job, result = _register(address)
+                result = _register(address)
                 good = _show(result)
                 if waits:  # else the service ends now, and its page with it
-                    out.print(f"page         [bold]{address}/jobs/{job['id']}/view[/]", soft_wrap=True)
+                    out.print(f"page         [bold]{address}/jobs/{result.job}/view[/]", soft_wrap=True)
                 out.print(f"total        {time.monotonic() - started:.1f} s")
                 if waits:
                     _wait_for_enter()
@@ -130,31 +130,20 @@ def _state_folder(chosen: Path | None) -> Iterator[Path]:
     yield chosen
 
 
-def _register(address: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Upload, register, follow; returns the job and its result."""
+def _register(address: str) -> Result:
     data = demo_folder()
-    with RemoteService(address) as service, phase_progress() as bar:
-        task = bar.add_task("uploading", total=1.0)
-
-        def report(phase: str, share: float) -> None:
-            bar.update(task, description=phase, completed=share)
-
-        truth = json.loads((data / "truth.json").read_text(encoding="utf-8"))
-        job = service.submit(
-            {
-                "scene": service.upload_field(data / "mix-room.safetensors", report),
-                "object": service.upload_field(data / "armchair.safetensors", report),
-                "detection": json.loads((data / "detection.json").read_text(encoding="utf-8")),
-                "ground_truth": {"T_object_scene": truth["T_object_scene"]["matrix"]},
-                "seed": 0,
-            }
-        )
-        service.follow(job["id"], report)
-        return job, service.result(job["id"])
+    truth = json.loads((data / "truth.json").read_text(encoding="utf-8"))["T_object_scene"]["matrix"]
+    box = json.loads((data / "detection.json").read_text(encoding="utf-8"))
+    room, chair = data / "mix-room.safetensors", data / "armchair.safetensors"
+    with Client(address) as client, reporting("uploading") as report:
+        job = client.submit(room, chair, box, more={"ground_truth": {"T_object_scene": truth}}, progress=report)
+        client.wait(job, report)
+        return client.result(job)
 
 
-def _show(result: dict[str, Any]) -> bool:
+def _show(found: Result) -> bool:
     """Print the transform and its errors; whether they are within the demo's bounds."""
+    result = found.document
     out.print(f"verdict      {result['verdict']} ({result['verdict_reason']})")
     out.print(f"             {result['verdict_detail']}")
     show_pose(result)

@@ -53,16 +53,14 @@ def check_all() -> Iterator[Finding]:
     except MissingExtraError as error:
         yield Finding("service", "warning", str(error), "Needed to serve, not to register here or to use a service.")
         return
-    from regnf_cli.checks.machine import check_machine
-    from regnf_cli.checks.stores import check_stores
+    from regnf_cli.checks.service import check_service
 
     try:
         settings = read_settings()
     except InvalidInputError as error:
         yield Finding("settings", "error", str(error), error.hint)
         return
-    yield from check_stores(settings)
-    yield from check_machine(settings)
+    yield from check_service(settings)
 
 
 def _show(findings: list[Finding]) -> None:

@@ -1,16 +1,18 @@
-"""``regnf fit``: a neural field from a mesh or from posed images."""
+"""``regnf fit``: a neural field from a mesh or from posed images; ``regnf fuse``: a map from posed depth images."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from regnf_cli.convert import Axes, CameraAxes
 from regnf_cli.guard import require
@@ -134,94 +136,62 @@ def fit(
     check_field_to_write(output, label)
     if extent is not None and not 0.0 < extent < math.inf:
         raise InvalidOptionsError("the extent must be positive")
+    from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.fit import FitFiles, reconstruct
+    from regnf_fit.mesh import fit_field, mesh_target
+    from regnf_fit.options import FitOptions, ReconstructionOptions
+
     given = {"iterations": iterations, "hidden_width": hidden_width}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    rest = {"seed": seed, "label": label}
-    if not source.is_dir():
-        if (snapshots, sdfstudio, pictures, start, refine_poses, device, axes) != _OF_IMAGES_UNSAID:
-            named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device and --camera-axes"
-            raise InvalidOptionsError(f"{named} are for images")
-        _fit_mesh(source, output, settings, table_log2, extent, rest)
+    rest: dict[str, Any] = {"seed": seed, "label": label}
+    if source.is_dir():
+        if extent is not None:
+            raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
+        wanted = ReconstructionOptions(**settings, table_log2=table_log2, start=start.value, refine_poses=refine_poses)
+        checkpoint = output.with_suffix(".checkpoint")
+        files = FitFiles(output, checkpoint, shares(snapshots), pictures=pictures, sdfstudio=sdfstudio)
+        rest |= {"device": device.value, "source": {"dataset": source.resolve().name}}
+        with _fitting() as (say, report):
+            say("reading the images")
+            images = load_dataset(source, opengl=axes == Axes.OPENGL)
+            say("laying out the rays")
+            fitted = reconstruct(images, files, wanted, progress=report, **rest)
+        print_report(asdict(fitted))
         return
-    if extent is not None:
-        raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
-
-    settings |= {"table_log2": table_log2, "start": start.value, "refine_poses": refine_poses}
-    files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures, "opengl": axes == Axes.OPENGL}
-    fit_images(source, output, settings, files, rest | {"device": device.value})
-
-
-def _fit_mesh(
-    mesh: Path,
-    output: Path,
-    settings: dict[str, Any],
-    table_log2: int | None,
-    extent: float | None,
-    rest: dict[str, Any],
-) -> None:
-    from regnf_fit.mesh import fit_field, mesh_target
-    from regnf_fit.options import FitOptions
-
+    if (snapshots, sdfstudio, pictures, start, refine_poses, device, axes) != _OF_IMAGES_UNSAID:
+        named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device and --camera-axes"
+        raise InvalidOptionsError(f"{named} are for images")
     options = FitOptions(**settings)
     if table_log2 is not None:
         options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
-    target = mesh_target(mesh, extent)
+    target = mesh_target(source, extent)
     for done in target.source.get("mesh_faces", ()):
-        err.print(f"{mesh.name}: {done}", markup=False, soft_wrap=True)
-    _fit_with_bar(fit_field, target.field, output, options, rest | {"source": target.source})
-
-
-def _fit_with_bar(fit_field: Any, target: Any, output: Path, options: Any, rest: dict[str, Any]) -> None:
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
-    with Progress(*columns, console=err) as bar:
-        task = bar.add_task("fitting", total=options.iterations, state="sampling exact distances")
-
-        def report(iteration: int, loss: float, seconds_left: float) -> None:
-            bar.update(task, completed=iteration, state=f"loss {loss:.5f}, {seconds_left:.0f} s left")
-
-        figures = fit_field(target, output, options, progress=report, **rest)
+        err.print(f"{source.name}: {done}", markup=False, soft_wrap=True)
+    with _fitting() as (say, report):
+        say("sampling exact distances")
+        figures = fit_field(target.field, output, options, progress=report, source=target.source, **rest)
     print_report(asdict(figures))
 
 
-# ``regnf fit`` of a folder of posed images.
-
-
-def fit_images(
-    dataset: Path, output: Path, settings: dict[str, Any], extra: dict[str, Any], rest: dict[str, Any]
-) -> None:
-    """Fit to the images in ``dataset``.
-
-    settings: of ReconstructionOptions · extra: ``snapshots``, percents between commas, and ``sdfstudio``, a path, or
-    None each; ``pictures``, whether to draw; ``opengl``, the cameras' axes · rest: what ``reconstruct`` takes beside.
-    """
-    from regnf_data.sdfstudio import load_dataset
-    from regnf_fit.images.fit import FitFiles, reconstruct
-    from regnf_fit.options import ReconstructionOptions
-
-    options = ReconstructionOptions(**settings)
-    files = FitFiles(
-        output,
-        output.with_suffix(".checkpoint"),
-        shares(extra["snapshots"]),
-        pictures=extra["pictures"],
-        sdfstudio=extra["sdfstudio"],
-    )
+@contextmanager
+def _fitting() -> Iterator[tuple[Callable[[str], None], Callable[[int, float, float], None]]]:
+    """A bar: what says a state, and what takes a fit's progress, which is the share of the seconds since then."""
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
     with Progress(*columns, console=err) as bar:
-        task = bar.add_task("fitting", total=1.0, state="reading the images")
-        images = load_dataset(dataset, opengl=extra["opengl"])
+        task = bar.add_task("fitting", total=1.0, state="")
+        started = time.monotonic()
+
+        def say(state: str) -> None:
+            nonlocal started
+            started = time.monotonic()
+            bar.update(task, state=state)
 
         def report(iteration: int, loss: float, seconds_left: float) -> None:
             elapsed = time.monotonic() - started
             state = f"iteration {iteration}, loss {loss:.5f}, {seconds_left:.0f} s left"
             bar.update(task, completed=elapsed / max(elapsed + seconds_left, 1e-9), state=state)
 
-        bar.update(task, state="laying out the rays")
-        started = time.monotonic()
-        figures = reconstruct(
-            images, files, options, progress=report, source={"dataset": dataset.resolve().name}, **rest
-        )
-    print_report(asdict(figures))
+        yield say, report
 
 
 def shares(percents: str | None) -> tuple[float, ...]:
@@ -235,3 +205,56 @@ def shares(percents: str | None) -> tuple[float, ...]:
     if not all(0.0 < value < 1.0 for value in values):
         raise InvalidOptionsError("snapshots lie between 0 and 100 percent")
     return values
+
+
+# ``regnf fuse``.
+
+Images = Annotated[
+    Path, typer.Argument(help="A folder of posed RGB-D images with meta_data.json.", exists=True, file_okay=False)
+]
+Voxel = Annotated[
+    float | None,
+    typer.Option(help="From node to node, the dataset's units; without it as wide as a pixel is at its surface."),
+]
+Truncation = Annotated[
+    float | None,
+    typer.Option(
+        min=1.0, max=1000.0, help="Voxels; without it 4, or 6 standard deviations of the depths from image to image."
+    ),
+]
+
+
+def fuse(
+    images: Images,
+    output: SafeField,
+    voxel: Voxel = None,
+    truncation: Truncation = None,
+    label: Label = None,
+    axes: CameraAxes = None,
+) -> None:
+    """Fuse posed depth images to a map, with what they have seen of it: seconds, where a fit takes minutes.
+
+    Example: **regnf fuse room-images room.safetensors**
+    """
+    require("engine")
+    check_field_to_write(output, label)
+    if voxel is not None and not 1e-9 <= voxel <= 1e6:
+        raise InvalidOptionsError("the voxel's edge must lie between 1e-9 and 1e6")
+    from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.fusion import FusionOptions, fuse_images
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    with Progress(*columns, console=err) as bar:
+        task = bar.add_task("reading the images", total=None)
+        given = load_dataset(images, opengl=axes == Axes.OPENGL)
+        bar.update(task, description="fusing", total=len(given))
+        report = fuse_images(
+            given,
+            output,
+            FusionOptions(voxel, truncation),
+            progress=lambda done: bar.update(task, completed=done),
+            label=label,
+            source={"dataset": images.resolve().name},
+        )
+        bar.update(task, completed=len(given))
+    print_report(asdict(report))

@@ -1,42 +1,24 @@
 """Starts a command that ends when the process that asked for it ends, however that one ends.
 
-    python -m regnf_cli.guard PARENT_PID LIFELINE_FD COMMAND [ARGUMENT ...]
+    python -m regnf_cli.guard PARENT_PID COMMAND [ARGUMENT ...]
 
-On Linux the kernel is told to kill the command with its parent, and the command takes this process' place. Elsewhere
-this process stays: it reads a pipe of which the parent holds the other end, and kills the command once the pipe closes.
+The kernel is told to kill this process with its parent, and the command takes its place.
 """
 
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
 import sys
-import threading
 from importlib.util import find_spec
 
 from regnf_core.errors import MissingExtraError
 from regnf_core.processes import die_with_parent
 
 
-def main(arguments: list[str], kernel_kills: bool = sys.platform.startswith("linux")) -> int:
-    """Run the command; its exit status where this process outlives it."""
-    parent_pid, lifeline, command = int(arguments[0]), int(arguments[1]), arguments[2:]
-    if kernel_kills:
-        die_with_parent(parent_pid)
-        os.close(lifeline)
-        os.execv(command[0], command)  # noqa: S606 - no shell is wanted
-    process = subprocess.Popen(command)
-    threading.Thread(target=_kill_when_closed, args=(lifeline, process), daemon=True).start()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda received, _: process.send_signal(received))
-    return process.wait()
-
-
-def _kill_when_closed(lifeline: int, process: subprocess.Popen[bytes]) -> None:
-    while os.read(lifeline, 64):
-        pass
-    process.kill()
+def main(arguments: list[str]) -> None:
+    """Become the command."""
+    die_with_parent(int(arguments[0]))
+    os.execv(arguments[1], arguments[1:])  # noqa: S606 - no shell is wanted
 
 
 # Optional parts of the installation: a command names the one that it lacks.
@@ -69,4 +51,4 @@ def require(*extras: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(sys.argv[1:])

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -45,26 +45,8 @@ class Shown:
         return values | {"field": self.field, "state": self.state, "place": self.place}
 
 
-class Shelf(Protocol):
-    """A library. Everything may raise RegnfError."""
-
-    def entries(self, tag: str | None = None, part: str | None = None) -> list[Shown]: ...
-
-    def get(self, name: str) -> Shown: ...
-
-    def add(self, source: FieldSource, notes: EntryNotes) -> Shown: ...
-
-    def change(self, name: str, notes: EntryNotes) -> Shown: ...
-
-    def remove(self, name: str) -> None: ...
-
-    def file(self, entry: Shown, folder: Path) -> Path:
-        """The entry's safe field: where it lies, or written into ``folder``."""
-        ...
-
-
 class FolderShelf:
-    """A library in a folder."""
+    """A library in a folder. Everything may raise RegnfError."""
 
     def __init__(self, folder: Path | None) -> None:
         self.library = LibraryFolder.usual() if folder is None else LibraryFolder(folder)
@@ -86,6 +68,7 @@ class FolderShelf:
         self.library.remove(name)
 
     def file(self, entry: Shown, folder: Path) -> Path:  # noqa: ARG002 -- it lies there already
+        """The entry's safe field: where it lies; of a service, written into ``folder``."""
         return Path(entry.place)
 
     def _shown(self, entry: FolderEntry) -> Shown:
@@ -93,7 +76,7 @@ class FolderShelf:
 
 
 class ServiceShelf:
-    """A caller's library at a service."""
+    """A caller's library at a service, with the same methods."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -122,6 +105,9 @@ class ServiceShelf:
         notes = EntryNotes(entry.name, tuple(entry.tags), entry.unit, entry.note, entry.symmetry if said else None)
         place = f"{self._client.address}/fields/{entry.field}"
         return Shown(notes, entry.field, entry.symmetry, place, None if said else entry.symmetry, entry.state)
+
+
+Shelf = FolderShelf | ServiceShelf
 
 
 @contextmanager

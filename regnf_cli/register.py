@@ -7,33 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.options import (
-    CONFIG,
-    DESCRIPTION,
-    FIELD,
-    JSON_FILE,
-    AsJson,
-    CancelOnInterrupt,
-    DetectionFile,
-    DetectionIndex,
-    NoConfigs,
-    Output,
-    Recording,
-    Scene,
-    SceneConfig,
-    SceneDescription,
-    Seed,
-    Server,
-    Token,
-    WorkerTimeout,
-    choice_of,
-    read_detection,
-    read_options,
-    read_transform,
-    source_of,
-)
-from regnf_cli.report import err, exit_code, phase_progress, show
+from regnf_cli.report import err, exit_code, reporting, show
 from regnf_cli.search import Files, check_box_by_header, open_scene, tell_files
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
@@ -41,43 +17,45 @@ from regnf_core.field_source import FieldSource
 from regnf_core.options import Preset, RegistrationOptions
 
 LibraryObject = Annotated[
-    Path, typer.Argument(help="The library object's field, in the same forms.", **FIELD | {"metavar": "OBJECT"})
+    Path, typer.Argument(help="The library object's field, in the same forms.", **cli.FIELD | {"metavar": "OBJECT"})
 ]
-ObjectConfig = Annotated[Path | None, typer.Option(help="The same of the object.", **CONFIG)]
-ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of the object.", **DESCRIPTION)]
+ObjectConfig = Annotated[Path | None, typer.Option(help="The same of the object.", **cli.CONFIG)]
+ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of the object.", **cli.DESCRIPTION)]
 PresetChoice = Annotated[
     Preset | None, typer.Option(help="robust (the default) needs no initial guess; paper is the published method.")
 ]
-Options = Annotated[Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **JSON_FILE)]
+Options = Annotated[Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **cli.JSON_FILE)]
 InitialTransform = Annotated[
     Path | None,
-    typer.Option(help="JSON: a T_object_scene to try first, as a 4x4 or in a result document.", **JSON_FILE),
+    typer.Option(help="JSON: a T_object_scene to try first, as a 4x4 or in a result document.", **cli.JSON_FILE),
 ]
-Truth = Annotated[Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **JSON_FILE)]
+GroundTruth = Annotated[
+    Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **cli.JSON_FILE)
+]
 
 
 def register(
-    scene: Scene,
+    scene: cli.Scene,
     object_: LibraryObject,
-    detection: DetectionFile,
-    detection_index: DetectionIndex = None,
+    detection: cli.DetectionFile,
+    detection_index: cli.DetectionIndex = None,
     preset: PresetChoice = None,
     options: Options = None,
-    scene_config: SceneConfig = None,
+    scene_config: cli.SceneConfig = None,
     object_config: ObjectConfig = None,
-    no_config: NoConfigs = False,
-    scene_description: SceneDescription = None,
+    no_config: cli.NoConfigs = False,
+    scene_description: cli.SceneDescription = None,
     object_description: ObjectDescription = None,
     initial_transform: InitialTransform = None,
-    truth: Truth = None,
-    seed: Seed = 0,
-    output: Output = None,
-    recording: Recording = None,
-    server: Server = None,
-    worker_timeout: WorkerTimeout = 60,
-    cancel_on_interrupt: CancelOnInterrupt = False,
-    token: Token = None,
-    as_json: AsJson = False,
+    ground_truth: GroundTruth = None,
+    seed: cli.Seed = 0,
+    output: cli.Output = None,
+    recording: cli.Recording = None,
+    server: cli.Server = None,
+    worker_timeout: cli.WorkerTimeout = 60,
+    cancel_on_interrupt: cli.CancelOnInterrupt = False,
+    token: cli.Token = None,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Find where a known object stands in a scanned scene: rotation, position and scale.
 
@@ -85,26 +63,26 @@ def register(
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.
     """
-    box = read_detection(detection, detection_index)
-    request = _request(box, read_options(options, preset), seed, initial_transform, truth)
+    box = cli.read_detection(detection, detection_index)
+    request = _request(box, cli.read_options(options, preset), seed, initial_transform, ground_truth)
     if server is None:
         require("engine", *(["rerun"] if recording else []))
     elif recording is not None:
         hint = "Leave --server out, or look at the page of the job."
         raise InvalidOptionsError("--recording is for registrations that are done here", hint=hint)
-    place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
-    thing = source_of(object_, object_description, choice_of(object_config, no_config), "object")
+    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
+    thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
     if place.file.samefile(thing.file):
         err.print(f"warning: scene and object are the same file, {scene}", markup=False, soft_wrap=True)
     check_box_by_header(place.file, box, thing.file)
     if server is None:
         document = _register_here(place, thing, box, request, Files(output, recording))
     else:
-        from regnf_cli.remote import RemoteService
-        from regnf_cli.remote_exchange import Delivery, register_remotely
+        from regnf_cli.remote import register_remotely
+        from regnf_client import Client
 
-        service = RemoteService(server, token, worker_timeout)
-        document = register_remotely(service, place, thing, request, Delivery(output, cancel_on_interrupt))
+        client = Client(server, token, worker_timeout_s=worker_timeout)
+        document = register_remotely(client, place, thing, request, output=output, cancel=cancel_on_interrupt)
     show(document, as_json)
     tell_files(output, recording)
     raise typer.Exit(exit_code(document))
@@ -118,8 +96,8 @@ def _request(
         "detection": box.canonical(),
         "options": options,
         "seed": seed,
-        "initial_transform": read_transform(initial_transform, "initial transform") if initial_transform else None,
-        "ground_truth": {"T_object_scene": read_transform(truth, "ground truth")} if truth else None,
+        "initial_transform": cli.read_transform(initial_transform, "initial transform") if initial_transform else None,
+        "ground_truth": {"T_object_scene": cli.read_transform(truth, "ground truth")} if truth else None,
     }
     if request["initial_transform"] and RegistrationOptions.from_dict(options).preset != "robust":
         raise InvalidInputError(
@@ -145,8 +123,7 @@ def _register_here(
     start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
     truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
     files.check()
-    with phase_progress() as bar:
-        task = bar.add_task("loading", total=1.0)
+    with reporting("loading") as report:
         import_smallest_first((scene, object_))
         opened, obj = open_scene(scene, detection), load_field(object_)
         result = run(
@@ -155,11 +132,11 @@ def _register_here(
             box,
             options,
             request["seed"],
-            lambda phase, share: bar.update(task, description=phase, completed=share),
+            report,
             WarmStart(T_object_scene=start),
             clouds=files.wanted,
         )
-        bar.update(task, description="exporting", completed=1.0)
+        report("exporting", 1.0)
     said: dict[str, Any] = {
         "truth": truth,
         "object_name": str(object_.named),

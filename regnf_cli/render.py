@@ -1,36 +1,83 @@
-"""``regnf render``: pictures of a field."""
+"""``regnf render`` and ``regnf edit``: pictures of a field; of a scene with objects put into it or taken out of it."""
 
 from __future__ import annotations
 
+import os
+from enum import StrEnum
 from pathlib import Path
+from typing import Annotated, Any
 
+import typer
+
+import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.options import Config, Description, Field, NoConfig, choice_of, source_of
-from regnf_cli.rendering_options import (
-    Antialias,
-    Around,
-    CameraFile,
-    CutAway,
-    Distance,
-    Elevation,
-    Every,
-    Folder,
-    Frames,
-    Jobs,
-    ModeChoice,
-    Outputs,
-    Request,
-    Size,
-    Up,
-    poses_of,
-    render_here,
-    request_of,
-    size_of,
-)
+from regnf_cli.report import out, phase_progress
+from regnf_core.errors import InvalidOptionsError, filled_folder, require_writable
+from regnf_core.field_source import FieldSource, find_source
+from regnf_core.rendering.request import MOST_FRAMES, RenderRequest
+
+
+class Mode(StrEnum):
+    """How rays see a field."""
+
+    SURFACE = "surface"
+    VOLUME = "volume"
+
+
+Folder = Annotated[Path, typer.Option(help="The folder for the pictures.", **cli.OUTPUT)]
+Request = Annotated[
+    Path | None,
+    typer.Option(help="JSON: the whole request (docs/editing.md); other options take precedence.", **cli.JSON_FILE),
+]
+Size = Annotated[str | None, typer.Option(help="Of every picture; 480x360 by default.", metavar="WIDTHxHEIGHT")]
+ModeChoice = Annotated[
+    Mode | None,
+    typer.Option(
+        help="surface: the zero level (the default). volume: as NeuS renders; takes three to four times as long."
+    ),
+]
+Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 8 by default.")]
+Elevation = Annotated[float | None, typer.Option(help="Of the orbit above the horizon, degrees; 25 by default.")]
+Distance = Annotated[float | None, typer.Option(help="Of the orbit's cameras, scene units; by default all is in view.")]
+Around = Annotated[
+    Path | None,
+    typer.Option(help="JSON: a box to orbit round; by default the first edit's, or the scene.", **cli.JSON_FILE),
+]
+UpAxis = Annotated[str | None, typer.Option(help="The scene's vertical: x, y, z, -x, -y or -z; z by default.")]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Take these cameras in place of an orbit: transforms.json, meta_data.json or their folder.",
+        parser=cli.existing,
+        metavar="PATH",
+    ),
+]
+Every = Annotated[int, typer.Option(min=1, help="With --cameras: take one of so many.")]
+Outputs = Annotated[
+    str | None,
+    typer.Option(
+        help="Which files: color, depth, normal, animation, strip, mesh, field. color,depth,normal,strip by default.",
+        metavar="LIST",
+    ),
+]
+Antialias = Annotated[int | None, typer.Option(min=1, max=4, help="Rays along each side of a pixel.")]
+Processes = Annotated[int | None, typer.Option(min=1, help="Processes that share the frames. By default one a core.")]
+CutAway = Annotated[
+    bool, typer.Option("--cut-away", help="Cameras may stand in matter: what is before them is cut away.")
+]
+EditsFile = Annotated[
+    Path,
+    typer.Option(
+        help="JSON: a list of edits (docs/editing.md). Objects are named by their files, from this file's folder on; a "
+        "T_object_scene is a 4x4, or the name of a result.json that has one.",
+        **cli.JSON_FILE,
+    ),
+]
+_FILES = ("object", "replacement")
 
 
 def render(
-    field: Field,
+    field: cli.Field,
     output: Folder = Path("pictures"),
     request: Request = None,
     size: Size = None,
@@ -39,33 +86,156 @@ def render(
     elevation: Elevation = None,
     distance: Distance = None,
     around: Around = None,
-    up: Up = None,
+    up_axis: UpAxis = None,
     cameras: CameraFile = None,
     every: Every = 1,
     outputs: Outputs = None,
     antialias: Antialias = None,
     cut_away: CutAway = False,
-    jobs: Jobs = None,
-    description: Description = None,
-    config: Config = None,
-    no_config: NoConfig = False,
+    processes: Processes = None,
+    description: cli.Description = None,
+    config: cli.Config = None,
+    no_config: cli.NoConfig = False,
 ) -> None:
     """Render a field: colors, depths and normals from an orbit or from the cameras of a file.
 
     Example: **regnf render room.safetensors --around box.json --frames 8 --output pictures/**
     """
     require("engine")
-    said = {
-        "size": size,
-        "mode": None if mode is None else mode.value,
-        "frames": frames,
-        "elevation_deg": elevation,
-        "distance": distance,
-        "up": up,
-        "outputs": outputs,
-        "antialias": antialias,
-        "cut_away": cut_away,
-    }
-    poses = None if cameras is None else poses_of(cameras, every, size_of(size))
-    wanted = request_of(request, said, around=around, poses=poses)
-    render_here(source_of(field, description, choice_of(config, no_config)), wanted, output, jobs)
+    poses = None if cameras is None else poses_of(cameras, every, None if size is None else size_of(size))
+    wanted = request_of(
+        request, around=around, poses=poses, size=size, mode=mode, frames=frames, elevation_deg=elevation,
+        distance=distance, up=up_axis, outputs=outputs, antialias=antialias, cut_away=cut_away,
+    )  # fmt: skip
+    render_here(cli.source_of(field, description, cli.choice_of(config, no_config)), wanted, output, processes)
+
+
+def edit(
+    scene: cli.Scene,
+    edits: EditsFile,
+    output: Folder = Path("edited"),
+    request: Request = None,
+    size: Size = None,
+    mode: ModeChoice = None,
+    frames: Frames = None,
+    elevation: Elevation = None,
+    around: Around = None,
+    up_axis: UpAxis = None,
+    outputs: Outputs = None,
+    antialias: Antialias = None,
+    cut_away: CutAway = False,
+    processes: Processes = None,
+    scene_config: cli.SceneConfig = None,
+    scene_description: cli.SceneDescription = None,
+    no_config: cli.NoConfigs = False,
+) -> None:
+    """Substitute, replace, remove and insert objects in a scene: pictures before and after, a mesh, a new field.
+
+    Example: **regnf edit room.safetensors --edits edits.json --outputs color,strip,mesh,field --output edited/**
+    """
+    require("engine")
+    wanted = request_of(
+        request, _edits(edits), around, size=size, mode=mode, frames=frames, elevation_deg=elevation, up=up_axis,
+        outputs=outputs, antialias=antialias, cut_away=cut_away,
+    )  # fmt: skip
+    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
+    render_here(place, wanted, output, processes)
+
+
+def request_of(
+    file: Path | None,
+    edits: list[Any] | None = None,
+    around: Path | None = None,
+    poses: list[dict[str, Any]] | None = None,
+    **said: Any,
+) -> RenderRequest:
+    """The request: what ``file`` says, and in its place what options say (None: nothing).
+
+    said: by the options' names. Raises InvalidInputError naming the member.
+    """
+    said = {name: value for name, value in said.items() if value is not None and value is not False}
+    values = cli.read_object(file, "request") if file is not None else {}
+    values |= {name: value for name, value in {"edits": edits, "poses": poses}.items() if value is not None}
+    orbit: dict[str, Any] = {name: said[name] for name in ("frames", "elevation_deg", "distance", "up") if name in said}
+    if around is not None:
+        orbit["detection"] = cli.read_detection(around).canonical()
+    options: dict[str, Any] = {name: said[name] for name in ("mode", "antialias", "up", "cut_away") if name in said}
+    for name, part in {"orbit": orbit, "options": options}.items():
+        if part:
+            values[name] = {**(values.get(name) or {}), **part}
+    if "size" in said:
+        values["size"] = size_of(said["size"])
+    if "outputs" in said:
+        values["outputs"] = [word.strip() for word in said["outputs"].split(",")]
+    return RenderRequest.from_dict(values)
+
+
+def poses_of(path: Path, every: int, size: tuple[int, int] | None) -> list[dict[str, Any]]:
+    """The cameras of a file as a request says them."""
+    from regnf_core.rendering.camera import cameras_of_file
+
+    found = []
+    for camera in cameras_of_file(path, size=size, every=every):
+        rows = [[*axes, place] for axes, place in zip(camera.axes.tolist(), camera.position.tolist(), strict=True)]
+        found.append(
+            {
+                "T_scene_camera": [*rows, [0.0, 0.0, 0.0, 1.0]],
+                "intrinsics": [*camera.focal, *camera.middle],
+                "size": [camera.width, camera.height],
+            }
+        )
+    return found
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height. Raises InvalidOptionsError."""
+    words = text.lower().split("x")
+    if len(words) != 2 or not all(word.isdecimal() and len(word) < 8 and int(word) > 0 for word in words):
+        raise InvalidOptionsError(f"--size {text[:40]}: expected WIDTHxHEIGHT in pixels, like 640x480")
+    return int(words[0]), int(words[1])
+
+
+# A rendering done in this process, with a bar: what ``regnf render`` and ``regnf edit`` share.
+
+
+def render_here(scene: FieldSource, request: RenderRequest, output: Path, processes: int | None) -> None:
+    """Write the request's files into ``output``, each whole or not at all. An object's name is its file.
+
+    processes: None: one a core.
+    """
+    from regnf_core.fields.observation import SdfField
+    from regnf_core.loading import load_field
+    from regnf_core.rendering.job import run_render
+
+    require_writable(output)
+
+    def open_object(name: str) -> SdfField:
+        return load_field(find_source(Path(name))).field
+
+    with phase_progress() as bar, filled_folder(output) as folder:
+        task = bar.add_task("loading", total=1.0)
+        field = load_field(scene).field
+        bar.update(task, description="rendering")
+
+        def tell(share: float) -> None:
+            bar.update(task, completed=share)
+
+        report = run_render(field, request, open_object, folder, tell, processes=processes or os.cpu_count() or 1)
+    for artifact in report.artifacts:
+        out.print(str(output / artifact.name), markup=False, soft_wrap=True)
+
+
+def _edits(file: Path) -> list[Any]:
+    """The list in ``file``, with the names of files in it taken from its folder on, and transforms read."""
+    return [_edit(value, file.parent) if isinstance(value, dict) else value for value in cli.read_list(file, "edits")]
+
+
+def _edit(value: dict[str, Any], folder: Path) -> dict[str, Any]:
+    found = dict(value)
+    for name in _FILES:
+        if isinstance(found.get(name), str):
+            found[name] = str(folder / found[name])
+    transform = found.get("T_object_scene")
+    if isinstance(transform, str):
+        found["T_object_scene"] = cli.read_transform(folder / transform, "transform")
+    return found

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -40,6 +41,14 @@ def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None
 def _with_commands(text: str) -> str:
     """Pages of the manual by the command that prints them: an installed regnf has no folder docs."""
     return _PAGE.sub(r"`regnf manual \1`", text)
+
+
+@contextmanager
+def reporting(phase: str) -> Iterator[Callable[[str, float], None]]:
+    """A bar of phases and their shares, which begins with ``phase``."""
+    with phase_progress() as bar:
+        task = bar.add_task(phase, total=1.0)
+        yield lambda phase, share: bar.update(task, description=phase, completed=share)
 
 
 def phase_progress() -> Progress:

@@ -12,31 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.options import (
-    CONFIG,
-    DESCRIPTION,
-    JSON_FILE,
-    AsJson,
-    CancelOnInterrupt,
-    DetectionFile,
-    DetectionIndex,
-    NoConfigs,
-    Output,
-    Scene,
-    SceneConfig,
-    SceneDescription,
-    Seed,
-    Server,
-    Token,
-    WorkerTimeout,
-    choice_of,
-    library_path,
-    read_detection,
-    read_options,
-    source_of,
-)
-from regnf_cli.report import err, exit_code, phase_progress, show
+from regnf_cli.report import err, exit_code, reporting, show
 from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.errors import (
     Candidate,
@@ -82,7 +60,7 @@ def objects_of(
         yield FieldSource(Path(one.notes.name), library.file(one))
     files = [path for path in paths if path not in [library.folder for library in libraries]]
     for path in library_files(files) if files else ():
-        yield source_of(path, description, settings, "object")
+        yield cli.source_of(path, description, settings, "object")
 
 
 # The files that a registration leaves: those of its folder, and its recording.
@@ -167,37 +145,37 @@ Library = Annotated[
     list[Path] | None,
     typer.Argument(
         help="Libraries, folders of fields, or fields: the objects. Without any, your library.",
-        parser=library_path,
+        parser=cli.library_path,
         metavar="[LIBRARY]...",
     ),
 ]
 Tag = Annotated[str | None, typer.Option(help="Of libraries, only the entries with this tag.")]
 Top = Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")]
-Options = Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **JSON_FILE)]
-ObjectConfig = Annotated[Path | None, typer.Option(help="The same of every object.", **CONFIG)]
-ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of every object.", **DESCRIPTION)]
+Options = Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **cli.JSON_FILE)]
+ObjectConfig = Annotated[Path | None, typer.Option(help="The same of every object.", **cli.CONFIG)]
+ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of every object.", **cli.DESCRIPTION)]
 
 
 def search(
-    scene: Scene,
-    detection: DetectionFile,
+    scene: cli.Scene,
+    detection: cli.DetectionFile,
     library: Library = None,
     tag: Tag = None,
-    detection_index: DetectionIndex = None,
+    detection_index: cli.DetectionIndex = None,
     top: Top = 5,
     options: Options = None,
-    scene_config: SceneConfig = None,
+    scene_config: cli.SceneConfig = None,
     object_config: ObjectConfig = None,
-    no_config: NoConfigs = False,
-    scene_description: SceneDescription = None,
+    no_config: cli.NoConfigs = False,
+    scene_description: cli.SceneDescription = None,
     object_description: ObjectDescription = None,
-    seed: Seed = 0,
-    output: Output = None,
-    server: Server = None,
-    worker_timeout: WorkerTimeout = 60,
-    cancel_on_interrupt: CancelOnInterrupt = False,
-    token: Token = None,
-    as_json: AsJson = False,
+    seed: cli.Seed = 0,
+    output: cli.Output = None,
+    server: cli.Server = None,
+    worker_timeout: cli.WorkerTimeout = 60,
+    cancel_on_interrupt: cli.CancelOnInterrupt = False,
+    token: cli.Token = None,
+    as_json: cli.AsJson = False,
 ) -> None:
     """Find which object of a library stands in the box, and where.
 
@@ -206,24 +184,22 @@ def search(
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
     """
-    box = read_detection(detection, detection_index)
+    box = cli.read_detection(detection, detection_index)
     request = _request(box, options, seed)
-    place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
+    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
     check_box_by_header(place.file, box)
-    settings = choice_of(object_config, no_config)
+    settings = cli.choice_of(object_config, no_config)
     objects = [] if server and not library else list(objects_of(library, tag, object_description, settings))
     if server is None:
         require("engine")
         document = _search_here(place, objects, box, request, output)
     else:
-        from regnf_cli.remote import RemoteService
-        from regnf_cli.remote_exchange import Delivery, search_its_library, search_remotely
+        from regnf_cli.remote import register_remotely
+        from regnf_client import Client
 
-        service, delivery = RemoteService(server, token, worker_timeout), Delivery(output, cancel_on_interrupt)
-        if library:
-            document = search_remotely(service, place, objects, request, delivery)
-        else:
-            document = search_its_library(service, place, tag, request, delivery)
+        client = Client(server, token, worker_timeout_s=worker_timeout)
+        searched = objects if library else None
+        document = register_remotely(client, place, searched, request, tag, output, cancel_on_interrupt)
     show(document, as_json, top)
     tell_files(output)
     raise typer.Exit(exit_code(document))
@@ -231,7 +207,7 @@ def search(
 
 def _request(box: Detection, options: Path | None, seed: int) -> dict[str, Any]:
     """What a service is asked, too."""
-    request: dict[str, Any] = {"detection": box.canonical(), "options": read_options(options, None), "seed": seed}
+    request: dict[str, Any] = {"detection": box.canonical(), "options": cli.read_options(options, None), "seed": seed}
     if RegistrationOptions.from_dict(request["options"]).preset != "robust":
         message = f"{options}: only the preset robust searches a library"
         hint = "Leave the preset out of the options."
@@ -277,21 +253,20 @@ def _search_here(
     options = RegistrationOptions.from_dict(request["options"])
     box = OrientedBox.from_detection(detection)
     Files(output).check()
-    with phase_progress() as bar:
-        task = bar.add_task("library", total=1.0)
+    with reporting("library") as report:
         import_smallest_first((scene, *objects))
         opened = open_scene(scene, detection)
-        library, unusable = _modeled(objects, options.robust, lambda share: bar.update(task, completed=share))
+        library, unusable = _modeled(objects, options.robust, partial(report, "library"))
         found = search_library(
             opened.field,
             box,
             library,
             options,
             request["seed"],
-            lambda phase, share: bar.update(task, description=phase, completed=share),
+            report,
             clouds=output is not None,
         )
-        bar.update(task, description="exporting", completed=1.0)
+        report("exporting", 1.0)
     winner = next(one for one in objects if str(one.named) == found.ranking[0].name)
     said: dict[str, Any] = {
         "object_name": found.ranking[0].name,

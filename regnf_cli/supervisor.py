@@ -41,8 +41,8 @@ _STEADY_AFTER_S = 30.0
 class Child:
     """A command, which ends with this process and is restarted after growing pauses whenever it ends.
 
-    Start it from the main thread: the kernel ties its life to the thread that started it. ``lifeline`` is the reading
-    end of a pipe that nobody writes to; ``passed`` are descriptors that the command inherits.
+    Start it from the main thread: the kernel ties its life to the thread that started it. ``passed``: descriptors that
+    the command inherits.
     """
 
     def __init__(
@@ -50,13 +50,12 @@ class Child:
         name: str,
         command: Sequence[str],
         environment: Mapping[str, str],
-        lifeline: int,
         passed: Sequence[int] = (),
     ) -> None:
         self.name = name
-        self._command = [sys.executable, "-m", "regnf_cli.guard", str(os.getpid()), str(lifeline), *command]
+        self._command = [sys.executable, "-m", "regnf_cli.guard", str(os.getpid()), *command]
         self._environment = dict(environment)
-        self._passed = (lifeline, *passed)
+        self._passed = tuple(passed)
         self._process: subprocess.Popen[bytes] | None = None
         self._started = 0.0
         self._pause_s = _FIRST_PAUSE_S
@@ -279,13 +278,10 @@ class Supervisor:
             lock = stack.enter_context(StateLock(self._settings.state_dir))
             listener = stack.enter_context(open_socket(self._settings))
             lock.note(address=address_of(listener))
-            lifeline, held = os.pipe()
-            stack.callback(os.close, held)
-            stack.callback(os.close, lifeline)
             stack.callback(self._stop_children)
-            url = self._settings.redis_url or self._start_redis(lock, lifeline)
+            url = self._settings.redis_url or self._start_redis(lock)
             check_storage(self._settings.model_copy(update={"redis_url": url}))
-            self._start_rest(url, listener, lifeline)
+            self._start_rest(url, listener)
             if self._until(lambda: _api_answers(address_of(listener)), self._api, "the API"):
                 ready(address_of(listener))
             while not self._stop.wait(_LOOK_EVERY_S):
@@ -301,16 +297,16 @@ class Supervisor:
         if self._api is not None:
             yield self._api
 
-    def _start_redis(self, lock: StateLock, lifeline: int) -> str:
+    def _start_redis(self, lock: StateLock) -> str:
         path = lock.make_socket_dir() / "redis.sock"
         command = server_command(path, self._settings.state_dir / "redis")
-        self._redis = Child("redis", command, _without_secrets(os.environ), lifeline)
+        self._redis = Child("redis", command, _without_secrets(os.environ))
         self._redis.start()
         url = f"unix://{path}"
         self._until(lambda: answers(url), self._redis, "Redis")
         return url
 
-    def _start_rest(self, redis_url: str, listener: socket.socket, lifeline: int) -> None:
+    def _start_rest(self, redis_url: str, listener: socket.socket) -> None:
         environment = os.environ | {
             "REGNF_REDIS_URL": redis_url,
             "REGNF_STATE_DIR": str(self._settings.state_dir),
@@ -322,10 +318,10 @@ class Supervisor:
             environment["REGNF_DEMO_DIR"] = str(self._settings.demo_dir)
         descriptor = listener.fileno()
         api = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
-        self._api = Child("api", api, environment, lifeline, passed=[descriptor])
+        self._api = Child("api", api, environment, passed=[descriptor])
         worker = [sys.executable, "-m", "regnf_worker.main"]
         self._workers = [
-            Child(f"worker {number}", worker, _without_secrets(environment), lifeline)
+            Child(f"worker {number}", worker, _without_secrets(environment))
             for number in range(1, self._settings.workers + 1)
         ]
         for child in (self._api, *self._workers):

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, TypeVar
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import httpx
 
-import regnf_client.fields as fields
-import regnf_client.jobs as artifacts
-import regnf_client.jobs as jobs
-import regnf_client.library as library
-import regnf_client.registrations as registrations
 from regnf_client.answers import refusal, unreachable
 from regnf_client.batches import BatchReader, PairLike, PairResult
-from regnf_client.fields import ADDRESS, WORKER_TIMEOUT_S, Connection, FieldLike, Report, Sendable
-from regnf_client.jobs import JobLike, delete_field, id_of, list_fields, list_jobs
-from regnf_client.models import BatchOutcome, Entry, Event, EventReader, Field, Job, Rendering, Result
-from regnf_client.registrations import Batch, Request
+from regnf_client.calls import Calls, JobLike, LibraryCalls, id_of, signed
+from regnf_client.fields import ADDRESS, WORKER_TIMEOUT_S, Connection, Report
+from regnf_client.models import Event, EventReader
 from regnf_client.steps import Call, Download, Flow, Patience, Pause, Step
-from regnf_core.detections.parsing import BoxLike
-from regnf_core.field_source import Role, SettingsChoice
-from regnf_core.library_entries import EntryNotes
-from regnf_core.options import OptionsLike
 
-# Performs the steps of a flow without blocking the event loop.
-
+_P = ParamSpec("_P")
 _T = TypeVar("_T")
+_Calls = TypeVar("_Calls")
 
 
 class AsyncDriver:
@@ -76,55 +65,38 @@ class AsyncDriver:
             return answer
 
 
-# The library of the awaited client: ``client.library``.
+class _Awaited(Generic[_Calls]):
+    """What performs flows of calls."""
 
-
-class AsyncLibrary:
-    """Objects by name. An ``Entry`` may be given wherever a field may."""
-
-    def __init__(self, connection: Connection, driver: AsyncDriver) -> None:
-        self._connection = connection
+    def __init__(self, calls: _Calls, driver: AsyncDriver) -> None:
+        self._calls = calls
         self._driver = driver
 
-    async def add(
-        self,
-        name: str,
-        field: FieldLike,
-        tags: Sequence[str] = (),
-        unit: str | None = None,
-        note: str | None = None,
-        symmetry: dict[str, Any] | None = None,
-        progress: Report | None = None,
-    ) -> Entry:
-        """Make a field an entry; a file is uploaded. symmetry: order, axis, continuous; None: the detected one.
 
-        Raises ServiceError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY), InvalidInputError (LIBRARY_ENTRY_INVALID).
-        """
-        notes = EntryNotes.checked(name, tags, unit, note, symmetry)
-        return await self._driver.run(library.add(self._connection.asking(progress), field, notes))
+def awaited(
+    method: Callable[Concatenate[_Calls, _P], Flow[_T]],
+) -> Callable[Concatenate[_Awaited[_Calls], _P], Coroutine[Any, Any, _T]]:
+    """A method of a client: the flow, performed. It has the flow's parameters and docstring."""
 
-    async def entries(self, tag: str | None = None, name: str | None = None) -> list[Entry]:
-        """Those with the tag, and with ``name`` in their names; the one added last first."""
-        return await self._driver.run(library.entries(self._connection.asking(), tag, name))
+    @signed(method)
+    async def performed(self: _Awaited[_Calls], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        return await self._driver.run(method(self._calls, *args, **kwargs))
 
-    async def get(self, name: str) -> Entry:
-        """Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
-        return await self._driver.run(library.get(self._connection.asking(), name))
-
-    async def change(self, name: str, /, **changes: Any) -> Entry:
-        """Change name, tags, unit, note or symmetry; None takes one back. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
-        return await self._driver.run(library.change(self._connection.asking(), name, changes))
-
-    async def remove(self, name: str) -> None:
-        """Take an entry out; its field stays. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
-        await self._driver.run(library.remove(self._connection.asking(), name))
-
-    async def download(self, name: str, target: str | Path) -> Path:
-        """Write an entry's field, in the safe format."""
-        return await self._driver.run(library.download(self._connection.asking(), name, Path(target)))
+    return performed
 
 
-class AsyncClient:
+class AsyncLibrary(_Awaited[LibraryCalls]):
+    """Objects by name. An ``Entry`` may be given wherever a field may."""
+
+    add = awaited(LibraryCalls.add)
+    entries = awaited(LibraryCalls.entries)
+    get = awaited(LibraryCalls.get)
+    change = awaited(LibraryCalls.change)
+    remove = awaited(LibraryCalls.remove)
+    download = awaited(LibraryCalls.download)
+
+
+class AsyncClient(_Awaited[Calls]):
     """A regnf service. Files are read and hashed in threads.
 
     Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects. A
@@ -147,7 +119,7 @@ class AsyncClient:
         to wait while the service has no worker; None: for ever. transport: of httpx, for proxies and tests."""
         self._connection = Connection(address, token, retries, worker_timeout_s)
         self._http = httpx.AsyncClient(transport=transport, **self._connection.http_options())
-        self._driver = AsyncDriver(self._http)
+        super().__init__(Calls(self._connection), AsyncDriver(self._http))
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -167,82 +139,26 @@ class AsyncClient:
     @property
     def library(self) -> AsyncLibrary:
         """Objects by name, with tags."""
-        return AsyncLibrary(self._connection, self._driver)
+        return AsyncLibrary(LibraryCalls(self._connection), self._driver)
 
-    async def upload(
-        self,
-        field: Sendable,
-        description: Mapping[str, Any] | None = None,
-        settings: SettingsChoice = None,
-        role: Role | None = None,
-        progress: Report | None = None,
-        timeout_s: float | None = None,
-    ) -> Field:
-        """The field at the service, once its import has ended. ``description`` says what no file says, ``settings``
-        names the trainer's settings (None: those beside the file, False: none), as in ``regnf.open_field``."""
-        source = fields.source_of(field, description, settings, role)
-        return await self._driver.run(fields.upload(self._connection.asking(progress, timeout_s), source))
-
-    async def field(self, field: FieldLike) -> Field:
-        """A field as it is now. Raises ServiceError (FIELD_NOT_FOUND)."""
-        return await self._driver.run(fields.find(self._connection.asking(), field))
-
-    async def fields(self, label: str | None = None) -> list[Field]:
-        """All fields, newest first."""
-        return await self._driver.run(list_fields(self._connection.asking(), label))
-
-    async def delete_field(self, field: FieldLike) -> None:
-        """Forget a field. Raises ServiceError (FIELD_IN_USE)."""
-        await self._driver.run(delete_field(self._connection.asking(), field))
-
-    async def register(
-        self,
-        scene: FieldLike,
-        obj: FieldLike,
-        detection: BoxLike,
-        options: OptionsLike = None,
-        seed: int = 0,
-        start: Any = None,
-        progress: Report | None = None,
-        timeout_s: float | None = None,
-    ) -> Result:
-        """Find where an object stands in a scene. start: a T_object_scene (4, 4) to look at first."""
-        request = Request(detection, options, seed, start)
-        return await self._driver.run(
-            registrations.register(self._connection.asking(progress, timeout_s), scene, obj, request)
-        )
-
-    async def submit(
-        self,
-        scene: FieldLike,
-        obj: FieldLike,
-        detection: BoxLike,
-        options: OptionsLike = None,
-        seed: int = 0,
-        start: Any = None,
-        more: Mapping[str, Any] | None = None,
-        progress: Report | None = None,
-    ) -> Job:
-        """The same without waiting. more: members of the request that have no parameter here, such as ``webhook``."""
-        request = Request(detection, options, seed, start, more or {})
-        return await self._driver.run(
-            registrations.submit_registration(self._connection.asking(progress), scene, obj, request)
-        )
-
-    async def search(
-        self,
-        scene: FieldLike,
-        objects: Sequence[FieldLike],
-        detection: BoxLike,
-        options: OptionsLike = None,
-        seed: int = 0,
-        progress: Report | None = None,
-        timeout_s: float | None = None,
-    ) -> Result:
-        """Which of the objects it is, and where; the result's ``candidates`` rank them all."""
-        request = Request(detection, options, seed)
-        asking = self._connection.asking(progress, timeout_s)
-        return await self._driver.run(registrations.search(asking, scene, objects, request))
+    upload = awaited(Calls.upload)
+    field = awaited(Calls.field)
+    fields = awaited(Calls.fields)
+    delete_field = awaited(Calls.delete_field)
+    register = awaited(Calls.register)
+    submit = awaited(Calls.submit)
+    search = awaited(Calls.search)
+    register_batch = awaited(Calls.register_batch)
+    render = awaited(Calls.render)
+    job = awaited(Calls.job)
+    jobs = awaited(Calls.jobs)
+    wait = awaited(Calls.wait)
+    cancel = awaited(Calls.cancel)
+    result = awaited(Calls.result)
+    rendering = awaited(Calls.rendering)
+    artifact = awaited(Calls.artifact)
+    download = awaited(Calls.download)
+    save = awaited(Calls.save)
 
     async def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
@@ -258,46 +174,6 @@ class AsyncClient:
                 for one in found:
                     yield one
                 found = await self._driver.run(reader.read())
-
-    async def register_batch(
-        self,
-        scene: FieldLike,
-        detections: Sequence[BoxLike],
-        objects: Sequence[FieldLike],
-        pairs: Sequence[tuple[int, int]] | None = None,
-        options: OptionsLike = None,
-        seed: int = 0,
-        progress: Report | None = None,
-        timeout_s: float | None = None,
-    ) -> list[BatchOutcome]:
-        """Several registrations in one scene; pairs: numbers of detection and object, None: each with each."""
-        asking = self._connection.asking(progress, timeout_s)
-        wanted = Batch(detections, objects, pairs, options, seed)
-        return await self._driver.run(registrations.batch(asking, scene, wanted))
-
-    async def render(
-        self,
-        scene: FieldLike,
-        edits: Sequence[Mapping[str, Any]] = (),
-        request: Mapping[str, Any] | None = None,
-        progress: Report | None = None,
-        timeout_s: float | None = None,
-    ) -> Rendering:
-        """Pictures, a mesh and a field of a scene with its edits. request: members of ``POST /render``."""
-        asking = self._connection.asking(progress, timeout_s)
-        return await self._driver.run(registrations.render(asking, scene, edits, request or {}))
-
-    async def job(self, job: JobLike) -> Job:
-        """A job as it is now. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
-        return await self._driver.run(jobs.find(self._connection.asking(), job))
-
-    async def jobs(self, status: str | None = None) -> list[Job]:
-        """All jobs, newest first."""
-        return await self._driver.run(list_jobs(self._connection.asking(), status))
-
-    async def wait(self, job: JobLike, progress: Report | None = None, timeout_s: float | None = None) -> Job:
-        """The job once it has finished. Raises WaitTimeoutError, NoWorkerError."""
-        return await self._driver.run(jobs.wait(self._connection.asking(progress, timeout_s), job))
 
     async def watch(self, job: JobLike) -> AsyncIterator[Event]:
         """A job's events as they come, until it has finished; a broken stream goes on where it stopped."""
@@ -319,27 +195,3 @@ class AsyncClient:
                 if wait_s is None:
                     raise unreachable(error) from error
                 await asyncio.sleep(wait_s)
-
-    async def cancel(self, job: JobLike) -> Job:
-        """Stop a job; no error if it was stopped before. Raises ServiceError (JOB_FINISHED)."""
-        return await self._driver.run(jobs.cancel(self._connection.asking(), job))
-
-    async def result(self, job: JobLike) -> Result:
-        """What a registration found. Raises ServiceError: JOB_NOT_READY, or the job's own reason where it failed."""
-        return await self._driver.run(jobs.result(self._connection.asking(), job))
-
-    async def rendering(self, job: JobLike) -> Rendering:
-        """What a rendering made. Raises ServiceError as ``result`` does."""
-        return await self._driver.run(jobs.rendering(self._connection.asking(), job))
-
-    async def artifact(self, job: JobLike, name: str) -> bytes:
-        """The bytes of one file of a result. Raises ServiceError (ARTIFACT_NOT_FOUND)."""
-        return await self._driver.run(artifacts.artifact(self._connection.asking(), job, name))
-
-    async def download(self, job: JobLike, name: str, target: str | Path) -> Path:
-        """Write one file of a result."""
-        return await self._driver.run(artifacts.download(self._connection.asking(), job, name, Path(target)))
-
-    async def save(self, found: Result | Rendering, folder: str | Path, progress: Report | None = None) -> list[Path]:
-        """Write all files of a result into a folder."""
-        return await self._driver.run(artifacts.save(self._connection.asking(progress), found, Path(folder)))

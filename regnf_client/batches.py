@@ -13,9 +13,9 @@ from httpx import Response
 from pydantic import BeforeValidator, Field
 
 from regnf_client.answers import checked, refusal, service_error
+from regnf_client.calls import request_body
 from regnf_client.fields import Asking, Deadline, FieldLike, known_sha256, upload
 from regnf_client.models import Alternative, Array, Document, Matrix, Verdict
-from regnf_client.registrations import Request
 from regnf_client.steps import Flow, Pause, call, look
 from regnf_core.detections.parsing import BoxLike
 from regnf_core.errors import InvalidInputError, RegnfError
@@ -185,7 +185,7 @@ class BatchReader:
         return PairResult.model_validate({**told, "index": self._indexes[told["number"] - 1]})
 
     def _line(self, pair: Pair) -> Flow[dict[str, Any]]:
-        body = Request(pair.detection, pair.options, pair.seed, more=pair.more).body()
+        body = request_body(pair.detection, pair.options, pair.seed, more=pair.more)
         scene = yield from self._upload(pair.scene, "scene")
         named: dict[str, Any] = {"scene": scene} | ({} if pair.key is None else {"key": pair.key})
         if isinstance(pair.object, list):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
 import re
 import time
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from regnf_core.errors import Said
 from regnf_core.field_source import FieldSource, Role, SettingsChoice, assumed_role, find_source
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.in_memory import HasGeometry, HasPoints, HasVertices
+from regnf_core.library_folder import digest_of
 
 Sendable = str | Path | FieldSource | HasVertices | HasPoints | HasGeometry
 FieldLike = Sendable | Field | Entry
@@ -140,16 +141,39 @@ def smallest_first(given: Mapping[Role, FieldLike]) -> list[tuple[Role, FieldLik
     return [(role, field) for _, role, field in sorted(sized, key=lambda one: one[0])]
 
 
-def upload(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Field]:
+def upload(asking: Asking, field: FieldLike, role: Role | None = None, wait: bool = True) -> Flow[Field]:
     """The field at the service, once its import has ended; its bytes are sent only if the service lacks them.
 
-    Raises ServiceError: of a refused field the gate's reason, FIELD_DESCRIPTION_DIFFERS for bytes that are held as
-    another function; both name the file.
+    wait: False leaves the import running. Raises ServiceError: of a refused field the gate's reason,
+    FIELD_DESCRIPTION_DIFFERS for bytes that are held as another function; both name the file.
     """
-    source = None if known_sha256(field) is not None else source_of(_path(field), role=role)
+    (found,) = yield from upload_all(asking, [field], role, wait)
+    return found
+
+
+def upload_all(
+    asking: Asking, given: Sequence[FieldLike], role: Role | None = None, wait: bool = True
+) -> Flow[list[Field]]:
+    """The same of several: all are sent before the first import is waited for."""
+    sources = [None if known_sha256(one) is not None else source_of(_path(one), role=role) for one in given]
+    sent = []
+    for one, source in zip(given, sources, strict=True):
+        with _naming(source):
+            sent.append((yield from send(asking, one if source is None else source)))
+    if not wait:
+        return sent
+    found = []
+    for one, source in zip(sent, sources, strict=True):
+        with _naming(source):
+            found.append((yield from ready(asking, one)))
+    return found
+
+
+@contextmanager
+def _naming(source: FieldSource | None) -> Iterator[None]:
+    """Refusals of a field name its file."""
     try:
-        found = yield from send(asking, field if source is None else source)
-        return (yield from ready(asking, found))
+        yield
     except ServiceError as error:
         if source is None or error.unavailable or error.reason in _NOT_OF_A_FILE:
             raise
@@ -158,12 +182,12 @@ def upload(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[F
         raise named from error
 
 
-def send(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Field]:
-    """The same, while its import may still run."""
+def send(asking: Asking, field: FieldLike) -> Flow[Field]:
+    """The field at the service, while its import may still run."""
     if known_sha256(field) is not None:
         return (yield from find(asking, field))
-    source = source_of(_path(field), role=role)
-    sha256 = yield from work(partial(_sha256, source.file))
+    source = source_of(_path(field))
+    sha256 = yield from work(partial(digest_of, source.file))
     answer = yield from call(asking.patience, "GET", f"/fields/{sha256}")
     if answer.status_code != 404:
         known = parsed(Field, checked(answer))
@@ -186,7 +210,7 @@ def find(asking: Asking, field: FieldLike) -> Flow[Field]:
     """A field as the service has it now. Raises ServiceError (FIELD_NOT_FOUND)."""
     sha256 = known_sha256(field)
     if sha256 is None:
-        sha256 = yield from work(partial(_sha256, source_of(_path(field)).file))
+        sha256 = yield from work(partial(digest_of, source_of(_path(field)).file))
     return parsed(Field, checked((yield from call(asking.patience, "GET", f"/fields/{sha256}"))))
 
 
@@ -273,11 +297,6 @@ def _read(path: Path, offset: int, size: int) -> bytes:
         return file.read(size)
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _require_same(held: Field, source: FieldSource) -> None:
     """Raises ServiceError FIELD_DESCRIPTION_DIFFERS unless the service has the field as the user wants it.
 
@@ -286,7 +305,7 @@ def _require_same(held: Field, source: FieldSource) -> None:
     with source.packed_settings() as settings:
         if not source.said and settings is None:
             return
-        digest = None if settings is None else _sha256(settings)
+        digest = None if settings is None else digest_of(settings)
     said = UploadDescription.from_dict(dict(source.said)).non_default()
     wanted = {name: value for name, value in said.items() if name != "label"}
     found = {name: value for name, value in held.description.items() if name in wanted or name != "as"}

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+from pydantic import Field as MemberField
 
 from regnf_core.errors import RegnfError
 
@@ -91,6 +92,8 @@ class Job(Document):
     error: dict[str, Any] | None = None
     warnings: dict[str, list[str]] = {}
     links: dict[str, str] = {}
+    sources: dict[str, str] = {}
+    """The objects as the caller named them, by the SHA-256s of their fields; of a job that this client submitted."""
 
     @property
     def finished(self) -> bool:
@@ -175,6 +178,8 @@ class Result(Document):
     seed: int = 0
     options: dict[str, Any] = {}
     artifacts: list[Artifact] = []
+    document: dict[str, Any] = MemberField(default={}, exclude=True)
+    """The same as the service sends it, plain (JSON) values."""
 
     @property
     def scale(self) -> float:

@@ -15,8 +15,8 @@ from benchmarks.attacks.connection import Reply, exchange
 from benchmarks.attacks.outcome import Outcome
 from benchmarks.attacks.raw_requests import Known, RawRequest, draw
 from benchmarks.service_load.house import House, running_house
-from benchmarks.service_load.small_fields import write_small_pair
-from regnf_cli.remote import RemoteService
+from benchmarks.service_load.small_fields import submit, write_small_pair
+from regnf_client import Client
 
 _HONEST, _GREEDY = "honest-token-of-the-tests", "greedy-token-of-the-tests"
 _PATIENCE_S = 5.0
@@ -55,11 +55,11 @@ def attack_http(folder: Path, inputs: int, seed: int, tokens: bool) -> Outcome:
 def _prepare(house: House, folder: Path, tokens: bool) -> tuple[Known, dict[str, object]]:
     """The honest caller's fields and finished job."""
     pair = write_small_pair(folder)
-    with RemoteService(house.address, token=_HONEST if tokens else None) as service:
+    with Client(house.address, token=_HONEST if tokens else None) as service:
         request = pair.upload(service)
-        job = service.submit(request)["id"]
-        service.follow(job)
-        result = service.result(job)
+        job = submit(service, request)
+        service.wait(job)
+        result = service.result(job).document
     fields = (request["scene"], request["object"])
     return Known(job, fields, _GREEDY if tokens else "", request, urlsplit(house.address).netloc), result
 
@@ -91,8 +91,8 @@ def _look(outcome: Outcome, house: House, number: int) -> None:
 
 def _compare(outcome: Outcome, house: House, before: dict[str, object], known: Known) -> None:
     """The honest caller's things are as they were, and the other caller's list does not have them."""
-    with RemoteService(house.address, token=_HONEST) as service:
-        if service.result(known.job) != before:
+    with Client(house.address, token=_HONEST) as service:
+        if service.result(known.job).document != before:
             outcome.fault("the honest caller's result has changed")
     headers = {"Authorization": f"Bearer {_GREEDY}"}
     for path in ("/jobs", "/fields"):

@@ -15,8 +15,8 @@ from redis.exceptions import RedisError
 
 from benchmarks.attacks.outcome import Outcome
 from benchmarks.service_load.house import House, running_house
-from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from regnf_cli.remote import RemoteService
+from benchmarks.service_load.small_fields import SmallPair, submit, write_small_pair
+from regnf_client import Client
 from regnf_state.redis.client import connect
 
 _BATCH = 5
@@ -34,10 +34,10 @@ def attack_stored_state(folder: Path, inputs: int, seed: int) -> Outcome:
     settings: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 5.0, "rate_limit_per_s": 0}
     with running_house(folder, workers=1, **settings) as house, connect(house.redis.url) as redis:
         pair = write_small_pair(folder)
-        with RemoteService(house.address) as service:
+        with Client(house.address) as service:
             request = pair.upload(service)
-            job = service.submit(request)["id"]
-            service.follow(job)
+            job = submit(service, request)
+            service.wait(job)
         sound = _held(redis)
         for first in range(0, inputs, _BATCH):
             httpx.post(f"{house.address}/register", json=request | {"seed": first + 1}, timeout=30)
@@ -231,9 +231,9 @@ def _look(outcome: Outcome, house: House, job: str, number: int) -> None:
 def _works(outcome: Outcome, house: House, pair: SmallPair) -> None:
     """With an empty Redis and the storage as it is, an upload and a registration come to their end."""
     try:
-        with RemoteService(house.address) as service:
-            job = service.submit({**pair.upload(service), "seed": 999_999})["id"]
-            service.follow(job)
-            outcome.ends[f"a registration afterwards: {service.result(job)['verdict']}"] += 1
+        with Client(house.address) as service:
+            job = submit(service, {**pair.upload(service), "seed": 999_999})
+            service.wait(job)
+            outcome.ends[f"a registration afterwards: {service.result(job).verdict}"] += 1
     except Exception as error:  # noqa: BLE001 -- whatever it is, it is a fault of the service
         outcome.fault(f"a registration afterwards: {error!r}"[:500])

@@ -26,7 +26,7 @@ import httpx
 from benchmarks.service_load.house import House, standing_house
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import write_small_pair
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 from regnf_state.redis.client import connect
 from tests.processes import processor_seconds
 
@@ -99,7 +99,7 @@ def measure(folder: Path, pairs: int, workers: int, kill_every_s: float, picture
     with standing_house(folder, threads=1, lost_after_s=15, **settings) as house:
         house.patience_s = _PATIENCE_S
         house.start(workers)
-        with RemoteService(house.address) as remote:
+        with Client(house.address) as remote:
             request = {**pair.upload(remote), "options": _OPTIONS, "pictures": pictures}
         with httpx.Client(base_url=house.address, timeout=60) as client:
             client.post("/register", json={**request, "seed": 2**31}, headers={"Prefer": "wait=30"})  # makes the model

@@ -11,8 +11,8 @@ from typing import Any
 
 import httpx
 
-from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair
-from regnf_cli.remote import RemoteService
+import regnf_client
+from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, submit
 
 ENDS = ("successful", "failed", "dismissed")
 _MAX_WAIT_S = 180.0
@@ -38,13 +38,13 @@ class Expected:
     @classmethod
     def of(cls, address: str, pair: SmallPair, questions: int) -> Expected:
         """Ask so many questions, which differ in their seeds. The first job makes the object's model for all others."""
-        with RemoteService(address) as service:
+        with regnf_client.Client(address) as service:
             request = {**pair.upload(service), "options": _OPTIONS}
             results = []
             for seed in range(questions):
-                job = service.submit({**request, "seed": seed})["id"]
-                service.follow(job)
-                results.append(comparable(service.result(job)))
+                job = submit(service, {**request, "seed": seed})
+                service.wait(job)
+                results.append(comparable(service.result(job).document))
         return cls(request, results)
 
     def question(self, number: int) -> tuple[str, dict[str, Any]]:

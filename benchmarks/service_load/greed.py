@@ -40,7 +40,7 @@ import numpy as np
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 
 _TOKENS = {"greedy": "greedy-caller-of-the-benchmark", "honest": "honest-caller-of-the-benchmark"}
 _OPTIONS = {"up_axis": "z"}
@@ -186,7 +186,7 @@ def measure(folder: Path, kind: str, rounds: int) -> tuple[list[float], list[flo
 
 
 def _uploaded(house: House, pair: SmallPair, caller: str) -> dict[str, Any]:
-    with RemoteService(house.address, _TOKENS[caller]) as service:
+    with Client(house.address, _TOKENS[caller]) as service:
         return {**pair.upload(service), "options": _OPTIONS}
 
 

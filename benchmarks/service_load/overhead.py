@@ -30,7 +30,7 @@ from benchmarks.api_process import api_process
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
 from regnf_cli.demo import running_service
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 from tests.processes import descendants_of, processor_seconds
 
 _OPTIONS = {"up_axis": "z"}
@@ -94,7 +94,7 @@ def start(
     stack: ExitStack, name: str, folder: Path, pair: SmallPair, checkout: Path | None = None, **settings: object
 ) -> Service:
     address = stack.enter_context(running_service(folder, checkout, threads=1, device="cpu", **settings))
-    with RemoteService(address, worker_timeout_s=_WORKER_S) as remote:
+    with Client(address, worker_timeout_s=_WORKER_S) as remote:
         request = {**pair.upload(remote), "options": _OPTIONS}
     client = stack.enter_context(httpx.Client(base_url=address, timeout=300))
     for sha256 in (request["scene"], request["object"]):  # their drawing would count as a job's

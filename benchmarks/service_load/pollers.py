@@ -29,8 +29,8 @@ import numpy as np
 from benchmarks.service_load.connection import Connection
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
-from benchmarks.service_load.small_fields import write_small_pair
-from regnf_cli.remote import RemoteService
+from benchmarks.service_load.small_fields import submit, write_small_pair
+from regnf_client import Client
 from tests.core.importing.checkpoints import write_full_size_checkpoint
 
 _POLLERS = 100
@@ -84,9 +84,9 @@ def measure(folder: Path, seconds: float) -> tuple[Seen, tuple[float, float], in
     write_full_size_checkpoint(checkpoint)
     pair = write_small_pair(folder)
     with running_house(folder, 1, threads=1) as house:
-        with RemoteService(house.address) as remote:
+        with Client(house.address) as remote:
             request = {**pair.upload(remote), "options": _OPTIONS}
-            jobs = [remote.submit({**request, "seed": seed})["id"] for seed in range(_POLLERS)]
+            jobs = [submit(remote, {**request, "seed": seed}) for seed in range(_POLLERS)]
         until = time.monotonic() + seconds
         moment = str(until - seconds + _CALM_S)
         command = [sys.executable, "-m", "benchmarks.service_load.send", house.address, str(checkpoint), moment]

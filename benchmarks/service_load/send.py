@@ -9,15 +9,15 @@ import sys
 import time
 from pathlib import Path
 
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 
 
 def main() -> None:
     address, path, moment = sys.argv[1:]
     time.sleep(max(0.0, float(moment) - time.monotonic()))
     begun = time.monotonic()
-    with RemoteService(address) as service:
-        service.send(Path(path))
+    with Client(address) as service:
+        service.upload(Path(path), wait=False)
     sys.stdout.write(f"{begun} {time.monotonic()}\n")
 
 

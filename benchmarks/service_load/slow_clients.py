@@ -27,8 +27,8 @@ import numpy as np
 from benchmarks.service_load.connection import Connection
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
-from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from regnf_cli.remote import RemoteService
+from benchmarks.service_load.small_fields import SmallPair, submit, write_small_pair
+from regnf_client import Client
 
 _POLLERS = 200
 _EVERY_S = 2.0
@@ -82,11 +82,11 @@ def be_honest(house: House, pair: SmallPair, begin: float, seen: Seen) -> None:
     time.sleep(max(0.0, begin - time.monotonic()))
     begun = time.monotonic()
     try:
-        with RemoteService(house.address, _HONEST) as remote:
+        with Client(house.address, _HONEST) as remote:
             request = {**pair.upload(remote), "options": _OPTIONS, "seed": 4711}
-            job_id = remote.submit(request)["id"]
-            remote.follow(job_id, lambda phase, share: None)
-            verdict = remote.result(job_id)["verdict"]
+            job_id = submit(remote, request)
+            remote.wait(job_id)
+            verdict = remote.result(job_id).verdict
         seen.honest = f"{verdict} after {time.monotonic() - begun:.1f} s"
     except Exception as error:  # noqa: BLE001 -- whatever it was, it is the result
         seen.honest = f"failed after {time.monotonic() - begun:.1f} s: {type(error).__name__}: {error}"
@@ -105,9 +105,9 @@ def measure(folder: Path, slow: int, seconds: float) -> tuple[Seen, float]:
     """What was seen, and when the slow connections began."""
     with running_house(folder, 1, _HONEST, threads=1, api_tokens=_TOKENS, rate_limit_per_s=0) as house:
         seen, port = Seen(), house.listener.getsockname()[1]
-        with RemoteService(house.address, _HONEST) as remote:
+        with Client(house.address, _HONEST) as remote:
             request = {**write_small_pair(folder).upload(remote), "options": _OPTIONS}
-            path = f"/jobs/{remote.submit(request)['id']}"
+            path = f"/jobs/{submit(remote, request)}"
         begin = time.monotonic() + _CALM_S
         until = begin + seconds
         honest = threading.Thread(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room
 
 _NODES = 64
@@ -26,10 +26,17 @@ class SmallPair:
     detection: dict[str, Any]
     T_object_scene: list[list[float]]
 
-    def upload(self, service: RemoteService) -> dict[str, Any]:
+    def upload(self, service: Client) -> dict[str, Any]:
         """Send both and wait for their import; the request that registers them."""
-        sent = {"scene": service.upload_field(self.scene), "object": service.upload_field(self.object)}
+        sent = {"scene": service.upload(self.scene).sha256, "object": service.upload(self.object).sha256}
         return {**sent, "detection": self.detection}
+
+
+def submit(service: Client, request: dict[str, Any]) -> str:
+    """Ask for what ``SmallPair.upload`` made, changed perhaps; the job's id."""
+    more = dict(request)
+    scene, obj, detection = (more.pop(name) for name in ("scene", "object", "detection"))
+    return service.submit(scene, obj, detection, more=more).id
 
 
 def write_small_pair(folder: Path, factor: float = 1.0) -> SmallPair:

@@ -23,7 +23,7 @@ import httpx
 from benchmarks.service_load.house import running_house
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import write_small_pair
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 
 _OPTIONS = {"up_axis": "z"}
 _WORKERS = (1, 2)
@@ -48,7 +48,7 @@ def measure(folder: Path, jobs: int, rounds: int, preload: bool) -> tuple[dict[i
     pair, seeds = write_small_pair(folder), itertools.count()
     rates: dict[int, list[float]] = {count: [] for count in _WORKERS}
     loads = [load()]
-    with running_house(folder, 1, threads=1, preload=preload) as house, RemoteService(house.address) as remote:
+    with running_house(folder, 1, threads=1, preload=preload) as house, Client(house.address) as remote:
         request = {**pair.upload(remote), "options": _OPTIONS}
         with httpx.Client(base_url=house.address, timeout=60) as client:
             batch(client, request, seeds, 2)  # the object's model, and files in the page cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import platform
 import re
@@ -53,19 +52,18 @@ def check_libraries() -> Iterator[Finding]:
     """Python, regnf and what it needs, by extra."""
     yield Finding("python", "ok", f"{platform.python_version()}, regnf {__version__}")
     yield from (_extra(extra) for extra in MODULES)
-    yield from (_load(module) for module in _LOADED if _is_installed(module))
+    yield from (_load(module) for module in _LOADED if find_spec(module) is not None)
 
 
 def _extra(extra: str) -> Finding:
     mend = f"pip install 'regnf[{extra}]'"
     wrong = [text for name, wanted in _requirements(extra) if (text := _fault(name, wanted)) is not None]
-    if wrong:
-        missing_all = all(text.endswith("not installed") for text in wrong)
-        if missing_all and extra in _OPTIONAL:
-            return Finding(extra, "ok", f"not installed, and needed by no other part: {mend}")
-        state: Finding = Finding(extra, "warning" if missing_all else "error", "; ".join(wrong), mend)
-        return state
-    return Finding(extra, "ok", "installed")
+    if not wrong:
+        return Finding(extra, "ok", "installed")
+    missing_all = all(text.endswith("not installed") for text in wrong)
+    if missing_all and extra in _OPTIONAL:
+        return Finding(extra, "ok", f"not installed, and needed by no other part: {mend}")
+    return Finding(extra, "warning" if missing_all else "error", "; ".join(wrong), mend)
 
 
 def _requirements(extra: str) -> list[tuple[str, str]]:
@@ -110,12 +108,6 @@ def _holds(version: tuple[int, ...], sign: str, bound: tuple[int, ...]) -> bool:
     return {
         ">=": have >= want, "<": have < want, "<=": have <= want, ">": have > want, "==": have == want,
     }[sign]  # fmt: skip
-
-
-def _is_installed(module: str) -> bool:
-    from importlib.util import find_spec
-
-    return find_spec(module) is not None
 
 
 def _load(module: str) -> Finding:
@@ -166,7 +158,7 @@ _BUILD = "With a C compiler (apt-get install gcc libc6-dev) it is built when reg
 
 def check_native() -> Iterator[Finding]:
     """One finding where the engine is installed. To be without compiled code is no fault."""
-    if importlib.util.find_spec("torch") is None:
+    if find_spec("torch") is None:
         return
     from regnf_core.fields.native.library import NOT_BUILT, SWITCH, load
 

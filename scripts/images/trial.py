@@ -28,7 +28,7 @@ import numpy as np
 
 from regnf_cli.demo import MAX_CENTER_SHARE, MAX_ROTATION_RAD, MAX_SCALE_SHARE
 from regnf_cli.embedded_redis import answers, server_binary
-from regnf_cli.remote import RemoteService
+from regnf_client import Client
 from regnf_core.errors import RegnfError
 from scripts.images.commands import ComposeCommand, documented_commands
 from scripts.images.compose import Service, render
@@ -174,18 +174,12 @@ def use(plan: Plan) -> None:
     _expect(f"{address}/readyz", known, 200)
     _expect(f"{address}/healthz", {}, 200)
     print(f"   asks for {'a' if token else 'no'} token")
-    with RemoteService(address, token) as service:
+    with Client(address, token) as service:
         began = time.monotonic()
-        request = {
-            "scene": service.upload_field(DATA / "mix-room.safetensors"),
-            "object": service.upload_field(DATA / "armchair.safetensors"),
-            "detection": json.loads((DATA / "detection.json").read_text(encoding="utf-8")),
-            "seed": 0,
-        }
+        room, chair = (service.upload(DATA / f"{name}.safetensors") for name in ("mix-room", "armchair"))
         uploaded = time.monotonic()
-        job = service.submit(request)
-        service.follow(job["id"])
-        result = service.result(job["id"])
+        box = json.loads((DATA / "detection.json").read_text(encoding="utf-8"))
+        result = service.register(room, chair, box).document
         print(f"   fields ready after {uploaded - began:.1f} s, registered in {time.monotonic() - uploaded:.1f} s")
     check(result)
 

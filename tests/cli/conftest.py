@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -34,7 +35,8 @@ Serve = Callable[[Answers], str]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """``run(*arguments)``: the command `regnf` with these arguments."""
+    """``run(*arguments)``: the command `regnf` with these arguments. It asks a service again without a pause."""
+    monkeypatch.setattr("regnf_client.client.SyncDriver.sleep", lambda *_: None)
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # set by the command otherwise, for all tests that follow
 
     def call(*arguments: object) -> Outcome:
@@ -51,6 +53,50 @@ def demo() -> list[object]:
     """The arguments of a registration with the demo's fields."""
     fields = [DATA / "mix-room.safetensors", DATA / "armchair.safetensors"]
     return ["register", *fields, "--detection", DATA / "detection.json"]
+
+
+UNIT = {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "scale": 1.0}
+JOB = {"id": "j", "kind": "registration", "status": "successful"}
+RESULT = {
+    "verdict": "registered",
+    "verdict_reason": "BECAUSE",
+    "T_scene_object": UNIT,
+    "T_object_scene": UNIT,
+    "metrics": {"residual_rms": 0.5},
+    "artifacts": [{"name": "result.json", "url": "/jobs/j/artifacts/result.json"}],
+}
+
+
+def field(path: str, **said: object) -> str:
+    """The document of the field at a path, without a name."""
+    return json.dumps({"sha256": path.removeprefix("/fields/"), "state": "ready", "bytes": 1, **said})
+
+
+def service(job: Mapping[str, object] = JOB, **result: object) -> Answers:
+    """A service that has every field and whose one job is done, with such a result."""
+
+    def answers(method: str, path: str) -> Answer:
+        if path.startswith("/fields/"):
+            return 200, field(path)
+        if path in ("/register", "/jobs/j", "/jobs/j/cancel"):
+            return 200, json.dumps(job)
+        return 200, json.dumps(RESULT | result) if path == "/jobs/j/result" else "content"
+
+    return answers
+
+
+def without_worker(stuck: str, checks: object = None) -> Answers:
+    """A service whose fields (``stuck`` = fields) or jobs never end, for want of a worker or as ``checks`` say."""
+    unready = {"reason": "NOT_READY", "checks": {"records": True, "worker": False} if checks is None else checks}
+
+    def answers(method: str, path: str) -> Answer:
+        if path == "/readyz":
+            return 503, json.dumps(unready)
+        if stuck == "fields" and path.startswith("/fields/"):
+            return 200, field(path, state="validating")
+        return service(JOB | {"status": "accepted"} if stuck == "jobs" else JOB)(method, path)
+
+    return answers
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ def test_a_search_refuses_what_is_of_one_object(
 ) -> None:
     """As a service does; nothing that is given is passed over."""
     path = write(folder, [pair(object=None, candidates=["armchair.safetensors"], **{member: value})])
-    assert run("batch", str(path), "--jobs", "1").code == 1
+    assert run("batch", str(path), "--processes", "1").code == 1
     assert [one["error"]["reason"] for one in results(path)] == [reason]
 
 
@@ -96,7 +96,7 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
         pair(key="search", object=None, candidates=["dining-chair.safetensors", "armchair.safetensors"]),
     ]
     path = write(folder, lines)
-    outcome = run("batch", path, "--jobs", 1)
+    outcome = run("batch", path, "--processes", 1)
     assert outcome.code == 1, outcome.stderr
     found = {one["line"]: one for one in results(path)}
     reasons = {line: one["error"]["reason"] for line, one in found.items() if one["status"] == "failed"}
@@ -122,15 +122,15 @@ def test_a_second_run_does_what_is_left(run: Run, folder: Path, monkeypatch: pyt
 
     monkeypatch.setattr(batch_here, "register_pair", pretend)
     path = write(folder, [pair(seed=1), pair(seed=2, key="bad")])
-    assert run("batch", path, "--jobs", 1).code == 1
+    assert run("batch", path, "--processes", 1).code == 1
     write(folder, [pair(seed=1), pair(seed=2, key="bad"), pair(seed=3)])
     with path.with_suffix(".results.jsonl").open("a") as file:
         file.write('{"id": "torn')
-    assert run("batch", path, "--jobs", 1).code == 1
+    assert run("batch", path, "--processes", 1).code == 1
     assert done == [1, 2, 2, 3]
     assert len(results(path)) == 4
     write(folder, [pair(seed=3), pair(seed=1)])
-    assert run("batch", path, "--jobs", 1).code == 0
+    assert run("batch", path, "--processes", 1).code == 0
     assert done == [1, 2, 2, 3], "both were done, wherever they stand now"
 
 

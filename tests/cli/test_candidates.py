@@ -12,7 +12,7 @@ from PIL import Image
 
 from regnf_core.errors import Candidate, FieldFormatError
 from regnf_core.importing.gate import gate
-from tests.cli.conftest import DATA, Run, Serve
+from tests.cli.conftest import DATA, Run, Serve, field
 from tests.core.importing.gate.test_candidates import octahedron
 
 ASKED = (Candidate("it's smooth", {"hash": {"interpolation": "smoothstep"}}, b"png"), Candidate("b", {"sign": -1}))
@@ -96,11 +96,11 @@ def test_a_service_asks_as_well(run: Run, serve: Serve, tmp_path: Path) -> None:
 
     seen: list[str] = []
 
-    def answer(method: str, _: str) -> tuple[int, str]:
+    def answer(method: str, path: str) -> tuple[int, str]:
         seen.append(method)
         if seen == ["GET"]:
             return 404, json.dumps({"reason": "FIELD_NOT_FOUND"})
-        return 200, json.dumps({"state": "rejected", "error": error})
+        return 200, field(path, state="rejected", error=error)
 
     fields = (tmp_path / "a.ckpt", DATA / "armchair.safetensors")
     said = ("--scene-description", '{"label": "room"}')

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from regnf_cli import doctor
-from regnf_cli.checks import libraries, machine, stores
+from regnf_cli.checks import libraries, service
 from regnf_cli.checks.libraries import Finding
 from regnf_core.fields.native import library
 from regnf_state.settings import Settings
@@ -77,17 +77,17 @@ def test_a_port_that_is_taken() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         taken.close()
-        assert machine._port("127.0.0.1", port).state == "ok"
+        assert service._port("127.0.0.1", port).state == "ok"
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))  # nobody listens, so nothing answers either
-        found = machine._port("127.0.0.1", bound.getsockname()[1])
+        found = service._port("127.0.0.1", bound.getsockname()[1])
     assert found.state == "error"
     assert "--port" in str(found.hint)
 
 
 def test_a_storage_that_cannot_be_one(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    found = list(stores.check_stores(Settings(state_dir=tmp_path / "file" / "state")))[-1]
+    found = list(service.check_service(Settings(state_dir=tmp_path / "file" / "state")))[1]
     assert (found.subject, found.state) == ("storage", "error")
     assert "REGNF_STATE_DIR" in str(found.hint)
 
@@ -96,8 +96,8 @@ def test_too_little_of_something(tmp_path: Path) -> None:
     meminfo = tmp_path / "meminfo"
     for kib, state in ((500_000, "error"), (2_000_000, "warning"), (9_000_000, "ok")):
         meminfo.write_text(f"MemTotal: 1 kB\nMemAvailable: {kib} kB\n")
-        assert machine._memory(meminfo).state == state
-    assert [machine._files(limit).state for limit in (20, 256, 65536)] == ["error", "warning", "ok"]
+        assert service._memory(meminfo).state == state
+    assert [service._files(limit).state for limit in (20, 256, 65536)] == ["error", "warning", "ok"]
 
 
 def test_versions_are_compared_by_their_numbers() -> None:

@@ -98,7 +98,7 @@ def test_an_interrupted_batch_ends_its_processes_silently(tmp_path: Path) -> Non
     pair = {"scene": ROOM, "object": CHAIR, "detection": BOX}
     (tmp_path / "pairs.jsonl").write_text("".join(json.dumps(pair | {"seed": seed}) + "\n" for seed in range(40)))
     results = tmp_path / "pairs.results.jsonl"
-    command = [sys.executable, "-m", "regnf_cli.main", "batch", "pairs.jsonl", "--jobs", "2"]
+    command = [sys.executable, "-m", "regnf_cli.main", "batch", "pairs.jsonl", "--processes", "2"]
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -34,7 +34,7 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     (tmp_path / "box.json").write_text(json.dumps({"center": box.center.tolist(), "size": box.size.tolist()}))
     (tmp_path / "truth.json").write_text(json.dumps({"T_object_scene": truth.matrix().tolist()}))
     files = [tmp_path / name for name in ("room.safetensors", "chair.safetensors")]
-    return ["register", *files, "--detection", tmp_path / "box.json", "--truth", tmp_path / "truth.json"]
+    return ["register", *files, "--detection", tmp_path / "box.json", "--ground-truth", tmp_path / "truth.json"]
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_the_published_method_starts_from_nothing_given(run: Run, exact: list[ob
         "7",
     ],
 )
-@pytest.mark.parametrize("option", ["--initial-transform", "--truth"])
+@pytest.mark.parametrize("option", ["--initial-transform", "--ground-truth"])
 def test_a_file_without_a_transform_is_refused(
     option: str, text: str, run: Run, exact: list[object], tmp_path: Path
 ) -> None:
@@ -188,7 +188,7 @@ def test_options_that_are_refused(run: Run, demo: list[object], tmp_path: Path) 
     assert outcome.stderr.count("\n") == 2  # the message and the hint, however narrow the terminal
 
 
-@pytest.mark.parametrize("option", ["--options", "--truth", "--detection"])
+@pytest.mark.parametrize("option", ["--options", "--ground-truth", "--detection"])
 def test_folders_and_absent_files_are_refused(option: str, run: Run, demo: list[object], tmp_path: Path) -> None:
     assert run(*demo, option, tmp_path).code == 2
     assert run(*demo, option, tmp_path / "absent.json").code == 2

@@ -10,36 +10,12 @@ import pytest
 
 from regnf_client.answers import NoWorkerError
 from regnf_client.steps import WorkerWatch
-from tests.cli.conftest import Answer, Answers, Run, Serve
-
-
-def service(verdict: str, artifact: str = "result.json") -> Answers:
-    """A service that has every field and whose one job is done."""
-    transform = {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "scale": 1.0}
-    result = {
-        "verdict": verdict,
-        "verdict_reason": "BECAUSE",
-        "T_scene_object": transform,
-        "T_object_scene": transform,
-        "metrics": {"residual_rms": 0.5},
-        "artifacts": [{"name": artifact}],
-    }
-
-    def answers(method: str, path: str) -> Answer:
-        if path.startswith("/fields/"):
-            return 200, json.dumps({"state": "ready"})
-        if path == "/register":
-            return 202, json.dumps({"id": "j"})
-        if path == "/jobs/j":
-            return 200, json.dumps({"id": "j", "status": "successful"})
-        return 200, json.dumps(result) if path == "/jobs/j/result" else "content"
-
-    return answers
+from tests.cli.conftest import JOB, Answer, Run, Serve, service, without_worker
 
 
 @pytest.mark.parametrize(("verdict", "code"), [("registered", 0), ("ambiguous", 4), ("rejected", 1)])
 def test_the_verdict_decides(verdict: str, code: int, run: Run, demo: list[object], serve: Serve) -> None:
-    outcome = run(*demo, "--server", serve(service(verdict)))
+    outcome = run(*demo, "--server", serve(service(verdict=verdict)))
     assert outcome.code == code, outcome.stderr
     assert outcome.stdout.startswith(f"verdict      {verdict}  (BECAUSE)")
 
@@ -50,28 +26,11 @@ def test_fields_that_the_service_has_without_a_name_get_one(run: Run, demo: list
     def answers(method: str, path: str) -> Answer:
         if path.startswith("/fields/"):
             asked.append(method)
-        return service("registered")(method, path)
+        return service()(method, path)
 
     outcome = run(*demo, "--server", serve(answers))
     assert outcome.code == 0, outcome.stderr
     assert asked.count("PATCH") == 2
-
-
-def without_worker(stuck: str, checks: object = None) -> Answers:
-    """A service whose fields (``stuck`` = fields) or jobs never end, for want of a worker or as ``checks`` say."""
-    ready = service("registered")
-    unready = {"reason": "NOT_READY", "checks": {"records": True, "worker": False} if checks is None else checks}
-
-    def answers(method: str, path: str) -> Answer:
-        if path == "/readyz":
-            return 503, json.dumps(unready)
-        if stuck == "fields" and path.startswith("/fields/"):
-            return 200, json.dumps({"state": "validating"})
-        if stuck == "jobs" and path == "/jobs/j":
-            return 200, json.dumps({"id": "j", "status": "accepted"})
-        return ready(method, path)
-
-    return answers
 
 
 @pytest.mark.parametrize("stuck", ["fields", "jobs"])
@@ -91,7 +50,7 @@ def test_a_worker_is_missing_only_where_the_service_says_so(
 
     def answers(method: str, path: str) -> Answer:
         looks.append(path)
-        return stuck(method, path) if looks.count("/jobs/j") < 4 else service("registered")(method, path)
+        return stuck(method, path) if looks.count("/jobs/j") < 4 else service()(method, path)
 
     outcome = run(*demo, "--server", serve(answers), "--worker-timeout", 0)
     assert outcome.code == 0, outcome.stderr
@@ -126,7 +85,8 @@ def test_the_watch_counts_only_an_absence_without_a_break() -> None:
 
 def test_artifacts_stay_in_the_folder(run: Run, demo: list[object], serve: Serve, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    outcome = run(*demo, "--output", folder, "--server", serve(service("registered", "../outside.txt")))
+    address = serve(service(artifacts=[{"name": "../outside.txt", "url": "/"}]))
+    outcome = run(*demo, "--output", folder, "--server", address)
     assert outcome.code == 0, outcome.stderr
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["outside.txt"]
     assert (folder / "outside.txt").read_text() == "content"
@@ -156,11 +116,11 @@ def test_a_refusal_is_bad_input_with_the_services_reason(run: Run, demo: list[ob
 
 def test_a_failed_job_tells_its_own_reason(run: Run, demo: list[object], serve: Serve) -> None:
     own = {"reason": "NO_SURFACE_IN_DETECTION", "status": 422, "detail": "12 surface points were found"}
-    whole = service("registered")
+    whole = service()
 
     def answers(method: str, path: str) -> Answer:
         if path == "/jobs/j":
-            return 200, json.dumps({"id": "j", "status": "failed", "error": own})
+            return 200, json.dumps(JOB | {"status": "failed", "error": own})
         if path == "/jobs/j/result":
             return 409, json.dumps({"reason": "JOB_FAILED", "detail": "The job failed.", "error": own})
         return whole(method, path)

@@ -78,7 +78,7 @@ def test_cameras_of_a_file(fields: Path, tmp_path: Path) -> None:
         ("INVALID_OPTIONS", ("--size", "wide")),
         ("RENDER_TOO_LARGE", ("--size", "100000x10000")),
         ("INVALID_OPTIONS", ("--outputs", "film")),
-        ("CAMERA_INVALID", ("--up", "w")),
+        ("CAMERA_INVALID", ("--up-axis", "w")),
     ],
 )
 def test_bad_options_have_reasons(fields: Path, tmp_path: Path, reason: str, said: tuple[str, ...]) -> None:

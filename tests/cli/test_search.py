@@ -17,7 +17,7 @@ from regnf_core.field_files import library_files
 from regnf_core.field_source import find_source
 from regnf_core.object_models import object_model
 from regnf_core.options import RobustOptions
-from tests.cli.conftest import DATA, Answer, Run, Serve
+from tests.cli.conftest import DATA, Answer, Answers, Run, Serve, field, service
 
 CHAIRS = [DATA / "dining-chair.safetensors", DATA / "armchair.safetensors"]
 DEMO: list[object] = ["search", DATA / "mix-room.safetensors", *CHAIRS, "--detection", DATA / "detection.json"]
@@ -125,31 +125,22 @@ def test_a_ranking_is_printed_as_far_as_asked(capfd: pytest.CaptureFixture[str])
     ]
 
 
-def searching(state_of: dict[str, str]) -> Any:
+def searching(state_of: dict[str, str]) -> Answers:
     """A service whose search puts the armchair first; fields are in these states, by name."""
     shas = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in CHAIRS}
     ranking = [
         candidate(shas["armchair"], "refined", 0.02, "ambiguous"),
         candidate(shas["dining-chair"], "coarse", 0.4),
     ]
-    result = {
-        "verdict": "ambiguous",
-        "verdict_reason": "SEVERAL_POSES_AGREE",
-        "T_object_scene": {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "scale": 1.0},
-        "object": shas["armchair"],
-        "candidates": ranking,
-        "metrics": {},
-        "artifacts": [],
-    }
+    found = service(verdict="ambiguous", object=shas["armchair"], candidates=ranking, artifacts=[])
 
     def answers(method: str, path: str) -> Answer:
-        if path.startswith("/fields/"):
-            name = next((name for name, sha in shas.items() if sha in path), "")
-            problem = {"reason": "TENSOR_NOT_FINITE", "detail": "not finite"}
-            return 200, json.dumps({"state": state_of.get(name, "ready"), "error": problem})
-        if path == "/register":
-            return 202, json.dumps({"id": "j"})
-        return 200, json.dumps(result if path == "/jobs/j/result" else {"id": "j", "status": "successful"})
+        if path == "/fields":  # what was rejected is sent again
+            return 201, field(shas["armchair"], state="validating")
+        name = next((name for name, sha in shas.items() if sha in path), "")
+        if name in state_of:
+            return 200, field(path, state=state_of[name], error={"reason": "TENSOR_NOT_FINITE", "detail": "not finite"})
+        return found(method, path)
 
     return answers
 
@@ -166,3 +157,16 @@ def test_a_field_that_the_server_rejects_is_named(run: Run, serve: Serve) -> Non
     outcome = run(*DEMO, "--server", serve(searching({"armchair": "rejected"})))
     assert outcome.code == 2
     assert f"TENSOR_NOT_FINITE {CHAIRS[1]}: not finite" in outcome.stderr
+
+
+def test_a_library_at_the_server_is_searched_by_its_tags(run: Run, serve: Serve) -> None:
+    entries = {"entries": [{"name": "seat", "field": "ab" * 32, "state": "ready"}], "next_page_token": None}
+    ranking = [candidate("ab" * 32, "refined", 0.02, "registered")]
+    found = service(object="ab" * 32, candidates=ranking)
+    arguments = [*DEMO[:2], *DEMO[4:], "--tag", "seat"]
+    answers = [json.dumps(entries), json.dumps(entries | {"entries": []})]
+    address = serve(lambda method, path: (200, answers.pop(0)) if path == "/library" else found(method, path))
+    outcome = run(*arguments, "--server", address, "--json")
+    assert json.loads(outcome.stdout)["object"] == "seat", outcome.stderr
+    outcome = run(*arguments, "--server", address)
+    assert "LIBRARY_EMPTY the library has no entries with the tag 'seat'" in outcome.stderr

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from regnf_cli.batch_file import read_pairs
-from regnf_cli.edit import _edits
 from regnf_cli.options import description, read_detection, read_options, read_transform
+from regnf_cli.render import _edits
 from regnf_core.errors import FieldFormatError, InvalidInputError
 from regnf_core.importing.observing.reading import read_matrices, read_tum
 from regnf_core.importing.run.opened import SettingsFile
@@ -191,7 +191,7 @@ def test_failed_rows_are_shown(run: Run, tmp_path: Path) -> None:
     rows = ["room.ply,chair.ply,box.json"] * 9 + ["room.ply,chair.ply,nothing.json", "room.ply,chair.ply,box.json,5"]
     path = tmp_path / "pairs.csv"
     path.write_text("\n".join(["scene,object,detection", *rows]))
-    outcome = run("batch", path, "--jobs", 1)
+    outcome = run("batch", path, "--processes", 1)
     assert outcome.code == 1
     assert "11 failed" in outcome.stdout
     told = " ".join(outcome.stderr.split())

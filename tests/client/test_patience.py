@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -116,3 +117,27 @@ def test_a_long_job_costs_few_requests(told: bool, slept: list[float]) -> None:
     assert [request.url.query for request in asked] == [b"wait=20"] * 3
     assert [request.headers.get("if-none-match") for request in asked[1:]] == (['"1"', '"2"'] if told else [None, None])
     assert len(said) == (3 if told else 0)
+
+
+def test_an_upload_is_sent_again_as_a_whole(slept: list[float], tmp_path: Path) -> None:
+    path = tmp_path / "field.bin"
+    path.write_bytes(b"PK\x03\x04" + bytes(range(256)) * 5_000)
+    bodies: list[bytes] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.method == "GET":
+            return refusal(404, "FIELD_NOT_FOUND", None)
+        bodies.append(request.content)
+        ready = {"sha256": "ab" * 32, "state": "ready", "bytes": 1_280_000}
+        return refusal() if len(bodies) < 3 else httpx.Response(201, json=ready)
+
+    assert pretended(answer).upload(path).state == "ready"
+    assert len(bodies) == 3
+    assert all(path.read_bytes() in body for body in bodies)
+
+
+def test_a_download_that_is_refused_is_asked_for_again(slept: list[float], tmp_path: Path) -> None:
+    answers = [refusal(reason="RATE_LIMITED"), httpx.Response(200, content=b"bytes")]
+    path = pretended(lambda _: answers.pop(0)).download("j", "a.ply", tmp_path / "a.ply")
+    assert path.read_bytes() == b"bytes"
+    assert len(slept) == 1

@@ -163,7 +163,7 @@ def test_a_refused_field_is_told_with_its_reason(world: World, transport: AppTra
 
 
 def test_lists_have_every_page(world: World, transport: AppTransport, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("regnf_client.jobs._PAGE", 2)
+    monkeypatch.setattr("regnf_client.calls._PAGE", 2)
     names = [world.ready_field(f"field {number}") for number in range(5)]
     assert [one.sha256 for one in client(transport).fields()] == names[::-1]
     client(transport).delete_field(names[0])

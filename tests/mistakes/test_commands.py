@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import Answers, Run, Serve
-from tests.cli.test_remote import service, without_worker
+from tests.cli.conftest import Answers, Run, Serve, field, service, without_worker
 from tests.mistakes.case import Case, parametrized
 
 REGISTER = ["register", "room.safetensors", "chair.safetensors", "--detection", "box.json"]
@@ -19,6 +18,7 @@ HELP = "--help` shows"
 CASES = [
     Case("unknown command", "USAGE", 2, "regster", "No such command", "register", ["regster"]),
     Case("unknown option", "USAGE", 2, "--detectin", "No such option", "--detection", ["register", "--detectin", "x"]),
+    Case("option by its old name", "USAGE", 2, "--truth", "No such option", "Did you mean --ground-truth", [*REGISTER, "--truth", "box.json"]),
     Case("no detection", "USAGE", 2, "--detection", "Missing option", "regnf register " + HELP, REGISTER[:3]),
     Case("no object", "USAGE", 2, "(?i)object", "Missing argument", "regnf register " + HELP, [*REGISTER[:2], *REGISTER[3:]]),
     Case("negative seed", "USAGE", 2, "--seed", "greater than or equal to 0", "regnf register " + HELP, [*REGISTER, "--seed=-1"]),
@@ -30,7 +30,7 @@ CASES = [
     Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON is expected", [*REGISTER[:4], "chair.safetensors"]),
     Case("output a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json"]),
     Case("output below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json/out"]),
-    Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--truth", "box.json"]),
+    Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--ground-truth", "box.json"]),
     Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected safe fields", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
     Case("library missing", "FILE_NOT_FOUND", 2, "nowhere", "no such file", "Check the path", ["search", "room.safetensors", "nowhere", *REGISTER[3:]]),
     Case("library of a run's folder above", "FILE_TRUNCATED", 2, "step-000030000.ckpt", "cut short", "Copy or download", ["search", "room.safetensors", "run", *REGISTER[3:]]),
@@ -129,7 +129,7 @@ SERVERS = [
     Case("no token", "UNAUTHENTICATED", 2, "UNAUTHENTICATED", "token", "REGNF_API_TOKEN", refusing(401, {"reason": "UNAUTHENTICATED", "detail": "Send a token."})),
     Case("no worker", "NO_WORKER", 3, "no live worker", "for 0 s", "regnf worker", without_worker("jobs")),
     Case("queue full", "QUEUE_FULL", 3, "QUEUE_FULL", "as many", "again later", refusing(503, {"reason": "QUEUE_FULL", "detail": "as many jobs as it takes"})),
-    Case("a field that was rejected", "FIELD_SHAPES", 2, "chair.safetensors: wrong shapes", "wrong shapes", "another", lambda method, path: (200, json.dumps({"state": "rejected" if method == "GET" and "wait" not in path else "ready", "error": {"reason": "FIELD_SHAPES", "detail": "wrong shapes", "hint": "Try another."}}))),
+    Case("a field that was rejected", "FIELD_SHAPES", 2, "chair.safetensors: wrong shapes", "wrong shapes", "another", lambda method, path: (200, field(path, state="rejected", error={"reason": "FIELD_SHAPES", "detail": "wrong shapes", "hint": "Try another."}))),
 ]  # fmt: skip
 
 
@@ -146,11 +146,11 @@ def interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("regnf_cli.remote.RemoteService.follow", interrupt)
+    monkeypatch.setattr("regnf_client.Client.wait", interrupt)
 
 
 def test_job_and_page_are_told_at_the_start(run: Run, folder: Path, serve: Serve) -> None:
-    address = serve(service("registered"))
+    address = serve(service())
     outcome = run(*REGISTER, "--server", f"{address}/", "--json")
     assert outcome.code == 0, outcome.stderr
     assert f"page         {address}/jobs/j/view" in outcome.stderr
@@ -163,7 +163,7 @@ def test_an_interrupted_job_goes_on(run: Run, folder: Path, serve: Serve) -> Non
 
     def answers(method: str, path: str) -> tuple[int, str]:
         calls.append(path)
-        return service("registered")(method, path)
+        return service()(method, path)
 
     address = serve(answers)
     outcome = run(*REGISTER, "--server", address)
@@ -180,11 +180,11 @@ def test_an_interrupted_job_is_cancelled_on_request(run: Run, folder: Path, serv
 
     def answers(method: str, path: str) -> tuple[int, str]:
         calls.append((method, path))
-        return (202, "{}") if path.endswith("/cancel") else service("registered")(method, path)
+        return service()(method, path)
 
     outcome = run(*REGISTER, "--server", serve(answers), "--cancel-on-interrupt")
     assert outcome.code == 130
-    assert "cancelled the job j" in outcome.stderr
+    assert "canceled the job j" in outcome.stderr
     assert calls[-1] == ("POST", "/jobs/j/cancel")
 
 

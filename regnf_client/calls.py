@@ -1,0 +1,479 @@
+"""What a service can be asked, each as a flow of steps: ``Client`` performs them, ``AsyncClient`` awaits them."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial, update_wrapper
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+from uuid import uuid4
+
+import regnf_client.fields as fields
+from regnf_client.answers import ServiceError, checked, parsed, refusal
+from regnf_client.fields import Asking, Connection, FieldLike, Report, Sendable, known_sha256, smallest_first, source_of
+from regnf_client.models import BatchOutcome, Entry, Field, Job, Rendering, Result
+from regnf_client.steps import Download, Flow, again, call, look, work
+from regnf_core.detections.parsing import BoxLike, detection_of
+from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.field_source import Role, SettingsChoice
+from regnf_core.library_entries import EntryNotes, checked_name
+from regnf_core.library_folder import digest_of
+from regnf_core.options import OptionsLike, options_of
+from regnf_core.pairs import pairs_of
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+_Document = TypeVar("_Document", Job, Entry)
+JobLike = str | Job | Result | Rendering
+"""A job, its id, or what came of it."""
+_PAGE = 200
+_PART = ".part"
+_AT_ONCE = 16
+"""Jobs of a batch that wait or run, so that a quota of active jobs holds them."""
+
+
+def signed(flow: Callable[..., Flow[Any]]) -> Callable[[_Function], _Function]:
+    """Give a function the name, the docstring and the signature of a flow, with what the flow returns."""
+
+    def sign(function: _Function) -> _Function:
+        signature = inspect.signature(flow)
+        returned = str(signature.return_annotation).removeprefix("Flow[").removesuffix("]")
+        update_wrapper(function, flow)
+        function.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
+        return function
+
+    return sign
+
+
+class Calls:
+    """Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects.
+
+    Errors: see :mod:`regnf_client.answers`.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def upload(
+        self,
+        field: Sendable,
+        description: Mapping[str, Any] | None = None,
+        settings: SettingsChoice = None,
+        role: Role | None = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+        wait: bool = True,
+    ) -> Flow[Field]:
+        """The field at the service, once its import has ended, or while it may still run (``wait``). ``description``
+        says what no file says, ``settings`` names the trainer's settings (None: those beside the file, False: none), as
+        in ``regnf.open_field``."""
+        source = source_of(field, description, settings, role)
+        return fields.upload(self._connection.asking(progress, timeout_s), source, wait=wait)
+
+    def field(self, field: FieldLike) -> Flow[Field]:
+        """A field as it is now. Raises ServiceError (FIELD_NOT_FOUND)."""
+        return fields.find(self._connection.asking(), field)
+
+    def fields(self, label: str | None = None) -> Flow[list[Field]]:
+        """All fields, newest first."""
+        found = yield from _pages(self._connection.asking(), "fields", {"label": label})
+        return [parsed(Field, one) for one in found]
+
+    def delete_field(self, field: FieldLike) -> Flow[None]:
+        """Forget a field. Raises ServiceError (FIELD_IN_USE)."""
+        asking = self._connection.asking()
+        known = yield from fields.find(asking, field)
+        yield from _done(asking, "DELETE", f"/fields/{known.sha256}")
+
+    def register(
+        self,
+        scene: FieldLike,
+        obj: FieldLike,
+        detection: BoxLike,
+        options: OptionsLike = None,
+        seed: int = 0,
+        initial_transform: Any = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Flow[Result]:
+        """Find where an object stands in a scene. initial_transform: a T_object_scene (4, 4) to look at first."""
+        asking = self._connection.asking(progress, timeout_s)
+        job = yield from _submit(asking, scene, obj, request_body(detection, options, seed, initial_transform))
+        yield from _wait(asking, job)
+        return (yield from _result(asking, job))
+
+    def submit(
+        self,
+        scene: FieldLike,
+        obj: FieldLike | list[FieldLike],
+        detection: BoxLike,
+        options: OptionsLike = None,
+        seed: int = 0,
+        initial_transform: Any = None,
+        more: Mapping[str, Any] | None = None,
+        progress: Report | None = None,
+    ) -> Flow[Job]:
+        """The same without waiting; a search where ``obj`` is a list. more: members of the request that have no
+        parameter here, such as ``webhook``."""
+        body = request_body(detection, options, seed, initial_transform, more or {})
+        return _submit(self._connection.asking(progress), scene, obj, body)
+
+    def search(
+        self,
+        scene: FieldLike,
+        objects: Sequence[FieldLike],
+        detection: BoxLike,
+        options: OptionsLike = None,
+        seed: int = 0,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Flow[Result]:
+        """Which of the objects it is, and where; the result's ``candidates`` rank them all."""
+        asking = self._connection.asking(progress, timeout_s)
+        job = yield from _submit(asking, scene, _several(objects), request_body(detection, options, seed))
+        yield from _wait(asking, job)
+        return (yield from _result(asking, job))
+
+    def register_batch(
+        self,
+        scene: FieldLike,
+        detections: Sequence[BoxLike],
+        objects: Sequence[FieldLike],
+        pairs: Sequence[tuple[int, int]] | None = None,
+        options: OptionsLike = None,
+        seed: int = 0,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Flow[list[BatchOutcome]]:
+        """Several registrations in one scene; pairs: numbers of detection and object, None: each with each.
+
+        A pair that fails does not stop the others.
+        """
+        asking = self._connection.asking(progress, timeout_s)
+        bodies = [request_body(box, options, seed) for box in detections]
+        several = _several(objects)
+        wanted = pairs_of(pairs, len(bodies), len(several))
+        place = yield from fields.upload(asking, scene, "scene")
+        things: dict[int, str | RegnfError] = {}
+        for number in sorted({o for _, o in wanted}):
+            try:
+                things[number] = (yield from fields.upload(asking, several[number], "object")).sha256
+            except RegnfError as error:
+                things[number] = error
+        jobs: list[Job | RegnfError] = []
+        outcomes: list[BatchOutcome] = []
+        for d, o in wanted:
+            thing = things[o]
+            try:
+                if isinstance(thing, RegnfError):
+                    raise thing
+                body = {"scene": place.sha256, "object": thing, **bodies[d]}
+                jobs.append((yield from _post(asking, "/register", body)))
+            except RegnfError as error:
+                jobs.append(error)
+            if len(jobs) - len(outcomes) >= _AT_ONCE:
+                outcomes.append((yield from _outcome(asking, wanted[len(outcomes)], jobs[len(outcomes)])))
+        while len(outcomes) < len(jobs):
+            outcomes.append((yield from _outcome(asking, wanted[len(outcomes)], jobs[len(outcomes)])))
+            asking.tell("registering", len(outcomes) / len(jobs))
+        return outcomes
+
+    def render(
+        self,
+        scene: FieldLike,
+        edits: Sequence[Mapping[str, Any]] = (),
+        request: Mapping[str, Any] | None = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Flow[Rendering]:
+        """Pictures, a mesh and a field of a scene with its edits. request: members of ``POST /render``.
+
+        Objects of edits may be paths, jobs may be results.
+        """
+        asking = self._connection.asking(progress, timeout_s)
+        place = yield from fields.upload(asking, scene, "scene")
+        sent = []
+        for edit in edits:
+            known = plain(edit)
+            for name in ("object", "replacement"):
+                if name in edit:
+                    known[name] = (yield from fields.upload(asking, edit[name], "object")).sha256
+            if "job" in edit:
+                known["job"] = id_of(edit["job"])
+            sent.append(known)
+        job = yield from _post(asking, "/render", {"scene": place.sha256, "edits": sent, **plain(request or {})})
+        yield from _wait(asking, job)
+        return (yield from self.rendering(job))
+
+    def job(self, job: JobLike) -> Flow[Job]:
+        """A job as it is now. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
+        return _one(self._connection.asking(), Job, "GET", f"/jobs/{id_of(job)}")
+
+    def jobs(self, status: str | None = None) -> Flow[list[Job]]:
+        """All jobs, newest first."""
+        found = yield from _pages(self._connection.asking(), "jobs", {"status": status})
+        return [parsed(Job, one) for one in found]
+
+    def wait(self, job: JobLike, progress: Report | None = None, timeout_s: float | None = None) -> Flow[Job]:
+        """The job once it has finished. Raises WaitTimeoutError, NoWorkerError."""
+        return _wait(self._connection.asking(progress, timeout_s), job)
+
+    def cancel(self, job: JobLike) -> Flow[Job]:
+        """Stop a job; no error if it was stopped before. Raises ServiceError (JOB_FINISHED)."""
+        return _one(self._connection.asking(), Job, "POST", f"/jobs/{id_of(job)}/cancel")
+
+    def result(self, job: JobLike) -> Flow[Result]:
+        """What a registration found. Raises ServiceError: JOB_NOT_READY, or the job's own reason where it failed."""
+        return _result(self._connection.asking(), job)
+
+    def rendering(self, job: JobLike) -> Flow[Rendering]:
+        """What a rendering made. Raises ServiceError as ``result`` does."""
+        document = yield from _document(self._connection.asking(), job)
+        return parsed(Rendering, {**document, "job": id_of(job)})
+
+    def artifact(self, job: JobLike, name: str) -> Flow[bytes]:
+        """The bytes of one file of a result. Raises ServiceError (ARTIFACT_NOT_FOUND)."""
+        answer = yield from call(self._connection.asking().patience, "GET", _artifact_address(job, name))
+        if not answer.is_success:
+            raise refusal(answer)
+        return answer.content
+
+    def download(self, job: JobLike, name: str, target: str | Path) -> Flow[Path]:
+        """Write one file of a result to ``target``, which is there only once it is whole."""
+        return _download(self._connection.asking(), _artifact_address(job, name), Path(target))
+
+    def save(self, found: Result | Rendering, folder: str | Path, progress: Report | None = None) -> Flow[list[Path]]:
+        """Write all files of a result into a folder. Raises ServiceError (DIGEST_MISMATCH)."""
+        asking = self._connection.asking(progress)
+        paths = []
+        for number, one in enumerate(found.artifacts):
+            asking.tell("downloading", number / len(found.artifacts))
+            target = Path(folder) / Path(one.name).name  # never outside the folder
+            paths.append((yield from _download(asking, _artifact_address(found, one.name), target, one.sha256)))
+        asking.tell("downloading", 1.0)
+        return paths
+
+
+class LibraryCalls:
+    """Objects by name. An ``Entry`` may be given wherever a field may."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def add(
+        self,
+        name: str,
+        field: FieldLike,
+        tags: Sequence[str] = (),
+        unit: str | None = None,
+        note: str | None = None,
+        symmetry: dict[str, Any] | None = None,
+        progress: Report | None = None,
+    ) -> Flow[Entry]:
+        """Make a field an entry; a file is uploaded. symmetry: order, axis, continuous; None: the detected one.
+
+        Raises ServiceError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY), InvalidInputError (LIBRARY_ENTRY_INVALID).
+        """
+        notes = EntryNotes.checked(name, tags, unit, note, symmetry)
+        asking = self._connection.asking(progress)
+        sent = yield from fields.upload(asking, field, "object")
+        return (yield from _one(asking, Entry, "POST", "/library", json=notes.to_dict() | {"field": sent.sha256}))
+
+    def entries(self, tag: str | None = None, name: str | None = None) -> Flow[list[Entry]]:
+        """Those with the tag, and with ``name`` in their names; the one added last first."""
+        found = yield from _pages(self._connection.asking(), "library", {"tag": tag, "name": name})
+        return [parsed(Entry, one) for one in found]
+
+    def get(self, name: str) -> Flow[Entry]:
+        """Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        return _one(self._connection.asking(), Entry, "GET", _entry_address(name))
+
+    def change(self, name: str, /, **changes: Any) -> Flow[Entry]:
+        """Change name, tags, unit, note or symmetry; None takes one back. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
+        return _one(self._connection.asking(), Entry, "PATCH", _entry_address(name), json=changes)
+
+    def remove(self, name: str) -> Flow[None]:
+        """Take an entry out; its field stays. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        return _done(self._connection.asking(), "DELETE", _entry_address(name))
+
+    def download(self, name: str, target: str | Path) -> Flow[Path]:
+        """Write an entry's field, in the safe format. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        return _download(self._connection.asking(), f"{_entry_address(name)}/file", Path(target))
+
+
+def id_of(job: JobLike) -> str:
+    """The id of a job. Raises InvalidInputError (INVALID_JOB)."""
+    if isinstance(job, Job):
+        return job.id
+    name = job if isinstance(job, str) else getattr(job, "job", None)
+    if isinstance(name, str) and name and all(part.isalnum() or part in "-_" for part in name):
+        return name
+    hint = "Give what `submit` returned, or its `id`."
+    raise InvalidInputError(f"{job!r} names no job", reason="INVALID_JOB", hint=hint)
+
+
+def request_body(
+    detection: BoxLike,
+    options: OptionsLike = None,
+    seed: int = 0,
+    initial_transform: Any = None,
+    more: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What a registration asks for beside its fields, as it is sent. initial_transform: a T_object_scene, or
+    ``{"T_scene_object": ...}``. Raises InvalidDetectionError and InvalidOptionsError."""
+    body = {
+        "detection": detection_of(detection).canonical(),
+        "options": None if options is None else options_of(options).to_dict(),
+        "seed": seed,
+        "initial_transform": plain(initial_transform),
+        **(more or {}),
+    }
+    return {name: value for name, value in body.items() if value is not None}
+
+
+def plain(value: Any) -> Any:
+    """Arrays and tuples as lists, boxes as detections, transforms as their matrices: what JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(part) for name, part in value.items()}
+    if hasattr(value, "to_detection"):
+        return value.to_detection().canonical()
+    if callable(getattr(value, "matrix", None)):
+        return plain(value.matrix())
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def _submit(asking: Asking, scene: FieldLike, obj: FieldLike | list[FieldLike], body: dict[str, Any]) -> Flow[Job]:
+    """Upload what the service lacks, then ask for the registration, or for the search among a list of objects."""
+    sources: dict[str, str] = {}
+    sent: dict[str, Any] = {}
+    if isinstance(obj, list):
+        sent["scene"] = (yield from fields.upload(asking, scene, "scene")).sha256
+        for one, held in zip(obj, (yield from fields.upload_all(asking, obj, "object")), strict=True):
+            sources.setdefault(held.sha256, _name_of(one))
+        sent["candidates"] = list(sources)
+    else:
+        for role, field in smallest_first({"scene": scene, "object": obj}):
+            sent[role] = (yield from fields.upload(asking, field, role)).sha256
+        sources[sent["object"]] = _name_of(obj)
+    job = yield from _post(asking, "/register", {**sent, **body})
+    return job.model_copy(update={"sources": sources})
+
+
+def _post(asking: Asking, address: str, body: Mapping[str, Any]) -> Flow[Job]:
+    """The job of a request. One that is sent again, because an answer was lost, starts nothing anew."""
+    return _one(asking, Job, "POST", address, json=body, headers={"Idempotency-Key": uuid4().hex})
+
+
+def _wait(asking: Asking, job: JobLike) -> Flow[Job]:
+    address, etag, deadline = f"/jobs/{id_of(job)}", None, asking.deadline()
+    while True:
+        # who wants no progress is not told of every change: one request lasts for many seconds
+        headers: dict[str, str] = {} if etag is None or asking.report is None else {"If-None-Match": etag}
+        params = {"wait": deadline.hold_s()}
+        answer = yield from call(asking.patience, "GET", address, params=params, headers=headers)
+        if answer.status_code != 304:
+            found = parsed(Job, checked(answer))
+            etag = answer.headers.get("etag")
+            asking.tell(found.phase or found.status, found.progress)
+            if found.finished:
+                return found.model_copy(update={"sources": _sources(job)})
+        deadline.check(f"the job {id_of(job)}")
+        yield from look(asking.watch, asking.patience)
+
+
+def _document(asking: Asking, job: JobLike) -> Flow[dict[str, Any]]:
+    return checked((yield from call(asking.patience, "GET", f"/jobs/{id_of(job)}/result")))
+
+
+def _result(asking: Asking, job: JobLike) -> Flow[Result]:
+    document, sources = (yield from _document(asking, job)), _sources(job)
+    found = parsed(Result, {**document, "job": id_of(job), "document": document})
+    if found.candidates is None:
+        return found.model_copy(update={"source": next(iter(sources.values()), None)})
+    ranking = [one.model_copy(update={"source": sources.get(one.object)}) for one in found.candidates]
+    return found.model_copy(update={"source": sources.get(found.object or ""), "candidates": ranking})
+
+
+def _sources(job: JobLike) -> dict[str, str]:
+    return job.sources if isinstance(job, Job) else {}
+
+
+def _outcome(asking: Asking, pair: tuple[int, int], job: Job | RegnfError) -> Flow[BatchOutcome]:
+    if isinstance(job, RegnfError):
+        return BatchOutcome(*pair, None, job)
+    try:
+        yield from _wait(asking, job)
+        return BatchOutcome(*pair, (yield from _result(asking, job)))
+    except RegnfError as error:
+        return BatchOutcome(*pair, None, error)
+
+
+def _one(asking: Asking, model: type[_Document], method: str, address: str, **how: Any) -> Flow[_Document]:
+    return parsed(model, checked((yield from call(asking.patience, method, address, **how))))
+
+
+def _done(asking: Asking, method: str, address: str) -> Flow[None]:
+    answer = yield from call(asking.patience, method, address)
+    if not answer.is_success:
+        raise refusal(answer)
+
+
+def _pages(asking: Asking, what: str, chosen: dict[str, str | None]) -> Flow[list[dict[str, Any]]]:
+    """Every entry of every page: a page may be short or empty and not be the last."""
+    params: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None} | {"limit": _PAGE}
+    found: list[dict[str, Any]] = []
+    while True:
+        page = checked((yield from call(asking.patience, "GET", f"/{what}", params=params)))
+        found += page[what if what in page else "entries"]
+        if page["next_page_token"] is None:
+            return found
+        params = params | {"page_token": page["next_page_token"]}
+
+
+def _download(asking: Asking, address: str, target: Path, sha256: str | None = None) -> Flow[Path]:
+    """Raises ServiceError: ARTIFACT_NOT_FOUND, DIGEST_MISMATCH for bytes that are not those of ``sha256``."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(target.name + _PART)
+    part.unlink(missing_ok=True)
+    answer = yield from again(asking.patience, Download(address, part))
+    if not answer.is_success:
+        raise refusal(answer)
+    if sha256 is not None and (yield from work(partial(digest_of, part))) != sha256:
+        part.unlink()
+        hint = "Download it again; if that does not help, register again."
+        message = f"{target.name}: the bytes that came are not the result's"
+        raise ServiceError(message, reason="DIGEST_MISMATCH", hint=hint)
+    part.replace(target)
+    return target
+
+
+def _artifact_address(job: JobLike, name: str) -> str:
+    return f"/jobs/{id_of(job)}/artifacts/{quote(name, safe='')}"
+
+
+def _entry_address(name: str) -> str:
+    """Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
+    return f"/library/{quote(checked_name(name), safe='')}"
+
+
+def _several(objects: Sequence[FieldLike]) -> list[FieldLike]:
+    """A single path would be taken for a list of its letters."""
+    if isinstance(objects, str) or not isinstance(objects, Sequence):
+        hint = "Write a list: [object]."
+        raise InvalidInputError("objects must be a list of fields", reason="INVALID_INPUT", hint=hint)
+    if not objects:
+        hint = "Give the objects to choose among."
+        raise InvalidInputError("the list of objects is empty", reason="LIBRARY_EMPTY", hint=hint)
+    return list(objects)
+
+
+def _name_of(field: FieldLike) -> str:
+    if isinstance(field, Entry):
+        return field.name
+    if not isinstance(field, str | os.PathLike) and not hasattr(field, "named"):
+        return type(field).__name__
+    return known_sha256(field) or str(getattr(field, "named", field))
