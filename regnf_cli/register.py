@@ -125,7 +125,8 @@ def _register_here(
     files.check()
     with reporting("loading") as report:
         import_smallest_first((scene, object_))
-        opened, obj = open_scene(scene, detection), load_field(object_)
+        obj = load_field(object_)
+        opened = open_scene(scene, detection, obj.field)
         result = run(
             opened.field,
             obj.field,

@@ -124,14 +124,18 @@ def check_box_by_header(scene: Path, box: Detection, obj: Path | None = None) ->
         _require_in(scene, box, bounds, None if obj is None else stored_bounds(obj))
 
 
-def open_scene(source: FieldSource, box: Detection) -> LoadedField:
-    """The scene's field, refused as above by the bounds that only its import told."""
+def open_scene(source: FieldSource, box: Detection, obj: SdfField | None = None) -> LoadedField:
+    """The scene's field, refused as above by the bounds that only the imports of scene and object told."""
     from regnf_core.loading import load_field
 
     loaded = load_field(source)
-    lower, upper = loaded.field.bounds.tolist()
-    _require_in(source.named, box, (lower, upper), None)
+    _require_in(source.named, box, _bounds_of(loaded.field), None if obj is None else _bounds_of(obj))
     return loaded
+
+
+def _bounds_of(field: SdfField) -> Bounds:
+    lower, upper = field.bounds.tolist()
+    return lower, upper
 
 
 def _require_in(path: Path, box: Detection, scene: Bounds, obj: Bounds | None) -> None:
