@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
-
-from regnf_state.ownership import ANONYMOUS
-from regnf_state.records import JobRecord
+from typing import Literal
 
 QUEUE_NAME = "regnf"
 IMPORT_QUEUE_NAME = "regnf-import"
@@ -54,60 +50,3 @@ class Work:
         if match is None:
             raise ValueError("not a name of this queue")
         return cls(kind, match["argument"], int(match["attempt"]))
-
-
-class JobQueue(Protocol):
-    """Hands ids to workers, each at most once per attempt: enqueueing what is known already changes nothing.
-
-    Callers take turns by the time that their work has cost the workers.
-    """
-
-    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
-        """of_batch: it waits behind all that its owner has posted by itself, so that a batch holds nothing up."""
-        ...
-
-    def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
-        """The same for several accepted jobs, in one round trip, in their order."""
-        ...
-
-    def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
-        """Its owner is named in the field's reference."""
-        ...
-
-    def holds_registration(self, job_id: str, attempt: int) -> bool:
-        """Whether the transport still knows of this attempt, waiting or running."""
-        ...
-
-    def holds_import(self, sha256: str, attempt: int) -> bool: ...
-
-    def stop(self, job_id: str, attempt: int) -> None:
-        """Take a waiting job out of the queue, or tell the worker to end a running one."""
-        ...
-
-    def drop_import(self, sha256: str, attempt: int) -> None:
-        """Take a waiting import out of the queue: its field is gone. One that runs goes on, and finds that itself."""
-        ...
-
-    def turn(self) -> None:
-        """Hand the next in turn to the workers, if a process died before it did so."""
-        ...
-
-    def awaited(self) -> list[str]:
-        """The fields whose import registrations wait for, off the queue."""
-        ...
-
-    def release(self, reference: str) -> None:
-        """Queue what waited for this field: its import has ended."""
-        ...
-
-    def position(self, work: Work) -> int | None:
-        """1 for the work that is expected to be next; None for what does not wait in line."""
-        ...
-
-    def spent(self, owner: str) -> dict[int, float]:
-        """The worker seconds of an owner in the last hour, by minute (of the epoch)."""
-        ...
-
-    def live_workers(self) -> int:
-        """How many workers have reported lately."""
-        ...

@@ -17,10 +17,10 @@ from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.record_store import RecordStore
 from regnf_state.records import ORIGINAL_UNTIL, FieldRecord, RecordsFullError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
 from regnf_state.redis.counters import Owners
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 
 # Uploads that stay for a while after their import: a question of the import is then answered without a second upload.

@@ -9,10 +9,9 @@ from redis import Redis
 from regnf_state.blobs.base import BlobStore
 from regnf_state.blobs.local import open_blobs
 from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.queue import JobQueue
 from regnf_state.redis.bounded_client import connect_bounded
 from regnf_state.redis.client import connect, redis_address
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 
 
@@ -36,5 +35,5 @@ def open_stores(settings: Settings, *, retries: int | None, storage_wait_s: floa
     url = redis_address(settings)
     redis = connect_bounded(url) if retries is None else connect(url, retries=retries)
     blobs = open_blobs(settings, storage_wait_s, existing)
-    queue = RqJobQueue(redis, settings.queue_key, settings.caller_weights, settings.worker_reserve_s)
+    queue = JobQueue(redis, settings.queue_key, settings.caller_weights, settings.worker_reserve_s)
     return Stores(redis, JournaledRecordStore(redis, settings.retention_s, blobs), blobs, queue)

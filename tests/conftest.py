@@ -14,9 +14,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 from redis import Redis
 
-from regnf_state.record_store import RecordStore
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from tests.grouping import pytest_collection_modifyitems
 from tests.live_stack import demo_fields, live_client, live_stack
 from tests.object_store import ObjectServer, object_server
@@ -78,4 +77,4 @@ def any_redis(redis_server: Callable[[str], str]) -> Iterator[Redis]:
 @pytest.fixture
 def store(redis: Redis) -> RecordStore:
     """A record store, empty."""
-    return RedisRecordStore(redis)
+    return RecordStore(redis)

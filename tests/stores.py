@@ -19,8 +19,8 @@ from regnf_state.journal.journaled_records import JournaledRecordStore, Rebuilde
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.client import connect
 from regnf_state.redis.documents import RedisDocuments, text
-from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from regnf_state.stores import Stores
 from tests.redis_server import private_redis
@@ -47,7 +47,7 @@ class HeldBlobs(LocalBlobStore):
             os.utime(self.path_of(key), (0, 0))
 
 
-class WatchedQueue(RqJobQueue):
+class WatchedQueue(JobQueue):
     """A queue in Redis that shows what it holds, and what it was told to stop."""
 
     def __init__(self, redis: Redis, workers: int | None = None) -> None:
@@ -111,7 +111,7 @@ class ShiftedClock(RedisDocuments):
         return (now if self.frozen is None else self.frozen) + self.ahead_s
 
 
-class ShiftedRecords(ShiftedClock, RedisRecordStore):
+class ShiftedRecords(ShiftedClock, RecordStore):
     """Records alone."""
 
 

@@ -53,7 +53,7 @@ from regnf_state.ownership import reference_of
 from regnf_state.pieces import view_key
 from regnf_state.records import FieldRecord
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 
 _TOKENS = {name: f"token-of-{name}-for-the-benchmark" for name in ("alice", "bob", "carol")}
 _NDJSON = {"Content-Type": "application/x-ndjson"}
@@ -407,7 +407,7 @@ def furnish(house: House) -> list[str]:
     names = [hashlib.sha256(f"furnished {number}".encode()).hexdigest() for number in range(_FIELDS)]
     report = {"bounds": [[-1.0] * 3, [1.0] * 3], "warnings": ["x" * 200], "of": ["y" * 40] * 10}
     with connect(house.redis.url) as client:
-        store = RedisRecordStore(client)
+        store = RecordStore(client)
         now = store.now()
         for number, name in enumerate(names):
             record = FieldRecord(reference_of("alice", name), "validating", 1000, now - number, now, label="furnished")

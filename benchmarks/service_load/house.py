@@ -17,7 +17,7 @@ import httpx
 from redis import Redis
 
 from regnf_state.redis.client import connect
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from tests.processes import children_of
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import eventually
@@ -91,7 +91,7 @@ class House:
             worker.wait(30)
         self.workers += [self._worker(index) for index in range(len(self.workers), count)]
         with connect(self.redis.url) as client:
-            eventually(lambda: RqJobQueue(client).live_workers() == count, self.log, self.patience_s)
+            eventually(lambda: JobQueue(client).live_workers() == count, self.log, self.patience_s)
 
     def empty_redis(self) -> None:
         """Everything that it holds is lost."""

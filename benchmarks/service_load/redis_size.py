@@ -19,7 +19,7 @@ from redis import Redis
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from tests.contract.world import BOX, field_bytes
 
 _PHASES = ("loading", "sampling", "initializing", "optimizing", "verifying", "exporting")
@@ -38,7 +38,7 @@ def post(house: House, jobs: int) -> tuple[list[str], float]:
 
 def finish(redis: Redis, ids: list[str]) -> None:
     """Each job taken up, through its phases, and to its end; the queue forgets it."""
-    records = RedisRecordStore(redis, _RETENTION_S)
+    records = RecordStore(redis, _RETENTION_S)
     for job_id in ids:
         records.update_job(job_id, 1, status="running", phase=_PHASES[0], worker="w" * 32)
         records.update_job(job_id, 1, engine={"version": "0.1.0", "device": "cpu"})

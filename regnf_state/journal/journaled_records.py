@@ -20,7 +20,6 @@ from redis import Redis
 from regnf_core.library_entries import EntryNotes
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journal import GENERATION_KEY, Journal, claim_storage
-from regnf_state.queue import JobQueue
 from regnf_state.records import (
     FINISHED,
     NO_QUOTA,
@@ -32,7 +31,8 @@ from regnf_state.records import (
     UnreadableRecordError,
 )
 from regnf_state.redis.documents import Kind, text
-from regnf_state.redis.jobs import JOB, RedisRecordStore
+from regnf_state.redis.jobs import JOB, RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.redis.unreadable import PREFIX, Stored
 from regnf_state.transitions import fields_of
 
@@ -81,7 +81,7 @@ _USED = f"{PREFIX}fields:used"
 logger = logging.getLogger(__name__)
 
 
-class JournaledRecordStore(RedisRecordStore):
+class JournaledRecordStore(RecordStore):
     """A RecordStore in Redis and in the journal of ``blobs``. Accepting raises OSError when that takes no bytes."""
 
     def __init__(self, redis: Redis, retention_s: int, blobs: BlobStore) -> None:

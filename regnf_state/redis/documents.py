@@ -100,6 +100,7 @@ class RedisDocuments:
         self.unreadable = UnreadableRecords(redis)
 
     def now(self) -> float:
+        """The Redis server's clock, seconds since the epoch."""
         seconds, microseconds = self._redis.time()
         return seconds + microseconds / 1e6
 

@@ -223,6 +223,11 @@ class RedisFieldRecords(RedisRejections):
             self._redis.zrem(_originals_key(owner_of(name)), name)
 
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
+        """Store a new field, or return the one that exists (False).
+
+        A rejected field starts anew with what ``record`` says, as the next attempt (True): enqueue its import.
+        Rejected ones count towards no quota. Raises QuotaError.
+        """
         while True:
             known, now = self._read_to_create(FIELD, record.sha256)
             fresh = self._first(record) if known is None else transitions.restarted_field(known, record, now)
@@ -241,9 +246,14 @@ class RedisFieldRecords(RedisRejections):
         return record if before is None else replace(record, attempt=record.attempt + int(before))
 
     def importing(self, owner: str) -> int:
+        """How many of an owner's imports wait or run."""
         return int(self._redis.scard(_importing_key(owner)))
 
     def stored(self, owner: str) -> tuple[int, int]:
+        """How many fields an owner has of which bytes are kept, and these bytes: few of the rejected ones.
+
+        Of a ready field these are the bytes of its upload or of what the import made, whichever are more.
+        """
         sizes: Any = self._redis.hvals(_stored_key(owner))
         return len(sizes), sum(map(int, sizes))
 
@@ -258,42 +268,58 @@ class RedisFieldRecords(RedisRejections):
         return found
 
     def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
+        """Several fields in one round trip, in the order asked for."""
         return self._read_each(FIELD, references)
 
     def list_fields(
         self, label: str | None, limit: int, before: Position | None, owner: str | None = None
     ) -> Page[FieldRecord]:
+        """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's."""
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
         return self._page(index, FIELD, limit, before, lambda record: label in (None, record.label))
 
     def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        """Compare-and-set. Raises StaleAttemptError for a field that is gone, or past ``attempt`` (None: any).
+
+        ready and rejected are final within an attempt.
+        """
         return self._change_field(sha256, lambda known, now: transitions.changed_field(known, attempt, changes, now))
 
     def validating_fields(self) -> list[FieldRecord]:
+        """Every field whose import has not ended."""
         names = sorted(text(name) for name in self._redis.smembers(_VALIDATING))
         return self._read_many(FIELD, names)
 
     def undrawn_fields(self) -> list[str]:
+        """The ready fields whose mesh and picture are to be made, those asked for last first."""
         names: Any = self._redis.zrevrange(_UNDRAWN, 0, -1)
         return [text(name) for name in names]
 
     def draw_next(self, sha256: str) -> None:
+        """Note that somebody wants to see a field whose mesh and picture are to be made."""
         self._redis.zadd(_UNDRAWN, {sha256: self.now()}, xx=True)
 
     def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
+        """Start an import anew as the next attempt; ``lost`` as in requeue_job. Raises StaleAttemptError."""
         return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
     def reimport_field(self, known: FieldRecord, description: dict[str, Any], label: str | None) -> FieldRecord:
+        """A field whose import has ended, to be imported anew as the next attempt, with another description.
+
+        Raises StaleAttemptError when it has changed since it was ``known``.
+        """
         return self._change_field(
             known.sha256, lambda now_held, now: transitions.reimported_field(now_held, known, description, label, now)
         )
 
     def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
+        """The field as it was ``before`` that attempt, which has not begun. Raises StaleAttemptError."""
         return self._change_field(
             before.sha256, lambda known, now: transitions.restored_field(known, before, attempt, now)
         )
 
     def fields_with_original(self, owner: str) -> list[FieldRecord]:
+        """An owner's fields whose uploads are kept after their import, those whose time is over first, first."""
         names: Any = self._redis.zrange(_originals_key(owner), 0, _LOOKED_AT - 1)
         return self._read_many(FIELD, [text(name) for name in names])
 
@@ -330,6 +356,10 @@ class RedisLibrary(RedisFieldRecords):
     """The part of the record store that is about libraries."""
 
     def set_entry(self, known: FieldRecord, notes: EntryNotes | None) -> FieldRecord:
+        """Make the field an entry of its owner's library, change the entry, or (None) take it out.
+
+        Raises NameTakenError, and StaleAttemptError when the entry is no longer as it was ``known``.
+        """
         while True:
             field, now = self._current_field(known.sha256)
             if field.library != known.library:
@@ -345,6 +375,7 @@ class RedisLibrary(RedisFieldRecords):
                 raise NameTakenError(notes.name)
 
     def entries_named(self, owner: str, names: Sequence[str]) -> list[LibraryEntry | None]:
+        """An owner's entries by their names, in the order asked for."""
         keys = [name_key(owner, name) for name in names]
         references: list[Any] = self._redis.mget(keys) if keys else []
         held = {key: text(reference) for key, reference in zip(keys, references, strict=True) if reference is not None}
@@ -362,6 +393,8 @@ class RedisLibrary(RedisFieldRecords):
     def list_entries(
         self, owner: str, tag: str | None, part: str | None, limit: int, before: Position | None
     ) -> Page[FieldRecord]:
+        """An owner's entries, the one added last first: those with the tag, and with ``part`` in their names."""
+
         def wanted(field: FieldRecord) -> bool:
             said = field.library
             if said is None or (tag is not None and tag not in said["tags"]):

@@ -118,8 +118,11 @@ def _gone_key(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}:gone"
 
 
-class RedisRecordStore(RedisLibrary):
-    """A RecordStore that any number of processes share. Its clock is the Redis server's."""
+class RecordStore(RedisLibrary):
+    """Where records live. Any number of processes share it; its clock is the Redis server's.
+
+    Every method blocks; the API calls them off the event loop or through short threads.
+    """
 
     def __init__(self, redis: Redis, retention_s: int = 7 * 24 * 3600) -> None:
         super().__init__(redis)
@@ -127,6 +130,10 @@ class RedisRecordStore(RedisLibrary):
         self._expire = redis.register_script(_EXPIRE)
 
     def set_if_absent(self, key: str, value: str, ttl_s: int, owner: str = ANONYMOUS) -> str:
+        """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic.
+
+        It counts as one of the owner's, who has ten thousand at most: beyond that the oldest is forgotten.
+        """
         name = f"{PREFIX}once:{key}"
         known = self._redis.set(name, value, nx=True, get=True, ex=ttl_s)
         if known is None:
@@ -200,6 +207,13 @@ class RedisRecordStore(RedisLibrary):
         return self._redis.zscore(f"{_CREATED}:{owner}", job_id) is not None
 
     def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
+        """Store a new job, or return the one that exists under its id (False).
+
+        A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
+        returned, with its attempt. A webhook of ``record`` that the job does not have yet is added to it, and told at
+        once if the job has finished. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
+        QuotaError when the owner, or the job of webhooks, has as many as it may.
+        """
         (answer,) = self.create_jobs([record], max_active, quota)
         if isinstance(answer, RecordError):
             raise answer
@@ -208,6 +222,7 @@ class RedisRecordStore(RedisLibrary):
     def create_jobs(
         self, records: Sequence[JobRecord], max_active: int, quota: Quota = NO_QUOTA
     ) -> list[tuple[JobRecord, bool] | RecordError]:
+        """The same for several, in a few round trips: a refusal takes the place of a job that is refused."""
         answers: dict[int, tuple[JobRecord, bool] | RecordError] = {}
         while left := [place for place in range(len(records)) if place not in answers]:
             stored, now = self._fetch_now(JOB, [records[place].id for place in left])
@@ -256,6 +271,7 @@ class RedisRecordStore(RedisLibrary):
         return found
 
     def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
+        """Several jobs in one round trip, in the order asked for; one that cannot be read keeps no other back."""
         found = {name: self._held(name, stored) for name, stored in self._fetch(JOB, job_ids)}
         damaged = self.unreadable.among([JOB.key(name) for name, held in found.items() if held is None])
         for name in found:
@@ -270,6 +286,7 @@ class RedisRecordStore(RedisLibrary):
             return error
 
     def active_among(self, job_ids: Sequence[str]) -> set[str]:
+        """Which of these jobs wait or run, without reading their records. Redis may have lost some."""
         return {name for name, held in zip(job_ids, self._are_active(job_ids), strict=True) if held}
 
     def _are_active(self, job_ids: Sequence[str]) -> list[int]:
@@ -281,6 +298,7 @@ class RedisRecordStore(RedisLibrary):
             return [0] * len(job_ids)  # a damaged index holds nothing
 
     def room_for_jobs(self, owner: str, max_active: int, quota: Quota) -> tuple[int, str]:
+        """How many jobs ``create_job`` takes of the owner now, and the reason that one more is refused for."""
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.scard(_ACTIVE)
             pipeline.scard(_active_key(owner))
@@ -296,6 +314,7 @@ class RedisRecordStore(RedisLibrary):
         return max(0, min(of_owner, max_active - every)), reason
 
     def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
+        """Whether a job of this id and owner was kept once and has outlived its retention."""
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.exists(JOB.key(job_id))
             pipeline.get(_gone_key(job_id))
@@ -307,25 +326,38 @@ class RedisRecordStore(RedisLibrary):
     def list_jobs(
         self, status: str | None, limit: int, before: Position | None, owner: str | None = None
     ) -> Page[JobRecord]:
+        """Newest first, older than ``before`` = (created, id); ``owner`` None: everybody's."""
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
         return self._page(index, JOB, limit, before, lambda record: status in (None, record.status))
 
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+        """Compare-and-set: applies ``changes`` if ``attempt`` is current and the state machine allows it.
+
+        A change of status must be a move: the second attempt to set ``running`` fails, so it serves as a claim.
+        Raises StaleAttemptError. Publishes an event whenever status, phase or progress changes.
+        """
         return self._change_job(job_id, lambda known, now: transitions.changed_job(known, attempt, changes, now))
 
     def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
+        """Say that the running attempt lives; the record returned tells whether to stop. Raises StaleAttemptError."""
         return self._change_job(job_id, lambda known, now: transitions.with_heartbeat(known, attempt, now))
 
     def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
+        """A running job back to accepted as its next attempt, fencing the old one off. Raises StaleAttemptError.
+
+        ``lost``: its worker vanished, which counts in ``requeues``; otherwise the worker gave it back in good order.
+        """
         return self._change_job(job_id, lambda known, now: transitions.requeued_job(known, attempt, now, lost))
 
     def request_cancel(self, job_id: str) -> JobRecord | None:
+        """Set cancel_requested; an accepted job is dismissed at once, a running one when its worker notices."""
         try:
             return self._change_job(job_id, transitions.cancelled_job)
         except StaleAttemptError:
             return None
 
     def delete_job(self, job_id: str) -> bool:
+        """Forget a finished job wholly; False when there is none. Raises StaleAttemptError while it is active."""
         while True:
             known, _ = self._read_to_create(JOB, job_id)
             if known is not None and known.status in ACTIVE:
@@ -341,10 +373,12 @@ class RedisRecordStore(RedisLibrary):
                 return known is not None
 
     def active_jobs(self) -> list[JobRecord]:
+        """Every accepted or running job."""
         names = sorted(text(name) for name in self._redis.smembers(_ACTIVE))
         return self._read_many(JOB, names)
 
     def expire_jobs(self) -> list[str]:
+        """Delete what is left of finished jobs after their retention; their ids, so that their files go too."""
         now = self.now()
         expired = []
         names: Any = self._redis.zrangebyscore(_EXPIRING, "-inf", now)
@@ -355,16 +389,19 @@ class RedisRecordStore(RedisLibrary):
         return expired
 
     def queue_position(self, job_id: str) -> int | None:
+        """1 for the accepted job that is next; None for a job that does not wait."""
         rank: Any = self._redis.zrank(_WAITING, job_id)
         return None if rank is None else int(rank) + 1
 
     def events(self, job_id: str, after: str | None) -> list[JobEvent]:
+        """Events after the given id (None: from the start). Raises ValueError when ``after`` is no event id."""
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.xread({_events_key(job_id): start_of(after)})
             (answer,) = pipeline.execute(raise_on_error=False)
         return events_in(answer)
 
     def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
+        """For each (job id, event id): the job, and its events after that one. One round trip for all of them."""
         with self._redis.pipeline(transaction=False) as pipeline:
             for job_id, after in positions:
                 ask(pipeline, JOB.key(job_id))
@@ -374,6 +411,7 @@ class RedisRecordStore(RedisLibrary):
         return [JobNews(self._readable(JOB, name, held), events_in(entries)) for (name, _), held, entries in found]
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
+        """Ids of active jobs that need this field."""
         names = sorted(map(text, self._redis.smembers(_active_key(owner_of(sha256)))))
         for name, _, stored in self._fetch_in_portions(JOB, names):
             record = self._readable(JOB, name, stored)

@@ -105,8 +105,10 @@ def _data(value: bytes) -> Any:
         return None
 
 
-class RqJobQueue:
-    """A JobQueue over RQ's lists and the fair queue before them, which has ``weights`` and ``reserve_s``. ``key`` signs
+class JobQueue:
+    """Hands ids to workers, each at most once per attempt: enqueueing what is known already changes nothing.
+
+    RQ's lists, and the fair queue before them, which has ``weights`` and ``reserve_s``. ``key`` signs
     what is put into Redis.
     """
 
@@ -122,12 +124,15 @@ class RqJobQueue:
         self.fair = FairQueue(redis, weights, reserve_s)
 
     def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
+        """of_batch: it waits behind all that its owner has posted by itself, so that a batch holds nothing up."""
         self._enqueue([(Work("registration", job_id, attempt), owner, of_batch)])
 
     def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
+        """The same for several accepted jobs, in one round trip, in their order."""
         self._enqueue([(Work("registration", job.id, job.attempt), job.owner, job.is_of_batch) for job in jobs])
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
+        """Its owner is named in the field's reference."""
         self._enqueue([(Work("import", sha256, attempt), owner_of(sha256), False)])
 
     def _enqueue(self, waiting: Sequence[tuple[Work, str, bool]]) -> None:
@@ -136,12 +141,14 @@ class RqJobQueue:
         )
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
+        """Whether the transport still knows of this attempt, waiting or running."""
         return self.fair.holds(Work("registration", job_id, attempt).name)
 
     def holds_import(self, sha256: str, attempt: int) -> bool:
         return self.fair.holds(Work("import", sha256, attempt).name)
 
     def stop(self, job_id: str, attempt: int) -> None:
+        """Take a waiting job out of the queue, or tell the worker to end a running one."""
         name = Work("registration", job_id, attempt).name
         if self.fair.remove(name):
             return
@@ -150,21 +157,27 @@ class RqJobQueue:
             send_command(self._redis, shown(worker), "stop-job", job_id=name)
 
     def drop_import(self, sha256: str, attempt: int) -> None:
+        """Take a waiting import out of the queue: its field is gone. One that runs goes on, and finds that itself."""
         self.fair.remove(Work("import", sha256, attempt).name)
 
     def turn(self) -> None:
+        """Hand the next in turn to the workers, if a process died before it did so."""
         self.fair.turn()
 
     def awaited(self) -> list[str]:
+        """The fields whose import registrations wait for, off the queue."""
         return self.fair.awaited()
 
     def release(self, reference: str) -> None:
+        """Queue what waited for this field: its import has ended."""
         self.fair.release(reference)
 
     def position(self, work: Work) -> int | None:
+        """1 for the work that is expected to be next; None for what does not wait in line."""
         return self.fair.position(work)
 
     def spent(self, owner: str) -> dict[int, float]:
+        """The worker seconds of an owner in the last hour, by minute (of the epoch)."""
         return self.fair.spent(owner)
 
     def lines(self) -> list[Line]:
@@ -172,6 +185,7 @@ class RqJobQueue:
         return self.fair.lines()
 
     def live_workers(self) -> int:
+        """How many workers have reported lately."""
         names = [shown(name) for name in self._redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)]
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:

@@ -23,8 +23,8 @@ from regnf_state.batches import Batches
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.pieces import Pieces
-from regnf_state.queue import JobQueue
 from regnf_state.records import JobNews, Quota, quota_of
+from regnf_state.redis.queue import JobQueue
 from regnf_state.room import Originals, Room
 from regnf_state.settings import Settings
 

@@ -16,8 +16,8 @@ from redis.exceptions import AuthenticationError, NoPermissionError
 
 from regnf_cli.embedded_redis import answers
 from regnf_state.redis.client import RedisPasswordError, connect, redis_address
-from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from tests.docker.files import ROOT, services
 from tests.redis_server import installed_servers
@@ -65,10 +65,10 @@ def test_without_the_password_nothing_is_done(folder: Path) -> None:
 
 def test_the_service_works_with_what_is_left(folder: Path) -> None:
     with connect(address(folder)) as redis:
-        store = RedisRecordStore(redis)
+        store = RecordStore(redis)
         finished(store, "successful")
         store.create_job(job(store, "j2"), 10)
-        queue = RqJobQueue(redis)
+        queue = JobQueue(redis)
         queue.enqueue_registration("j2", 1)
         assert queue.holds_registration("j2", 1)
         assert queue.live_workers() == 0

@@ -19,12 +19,12 @@ from regnf_service.upkeep import reaper
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.logs import configure_logging
 from regnf_state.records import JobRecord
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 
 
-class DyingQueue(RqJobQueue):
+class DyingQueue(JobQueue):
     """A queue that the process does not reach."""
 
     _calls_left = int(os.environ.get("REGNF_TEST_DIE", "1"))
@@ -47,7 +47,7 @@ def shorten_waits() -> None:
 
 def serve(descriptor: int) -> None:
     settings = Settings()
-    kind = DyingQueue if "REGNF_TEST_DIE" in os.environ else RqJobQueue
+    kind = DyingQueue if "REGNF_TEST_DIE" in os.environ else JobQueue
     stores = server.open_stores(settings, retries=None, storage_wait_s=server._STORAGE_WAIT_S)
     application = server.create_app(settings, replace(stores, queue=kind(stores.redis)))
     config = uvicorn.Config(application, log_config=None, access_log=False, lifespan="on", timeout_graceful_shutdown=2)

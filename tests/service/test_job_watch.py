@@ -13,7 +13,7 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from regnf_service.http.sse import event_stream
 from regnf_service.services import JobWatch, Position
 from regnf_state.records import JobNews
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from tests.round_trips import counted_round_trips
 from tests.state.record_makers import finished, started
@@ -41,7 +41,7 @@ def test_any_number_of_streams_is_one_round_trip_a_round(
 
 
 def test_a_stream_that_comes_during_a_look_is_answered_by_the_next(redis: Redis) -> None:
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     started(store)
     looks: list[list[Position]] = []
 

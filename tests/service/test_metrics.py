@@ -21,7 +21,7 @@ from regnf_service.metrics import Metrics, served
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.counters import BOUNDS_S, Counters
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from tests.contract.world import assert_refused, make_world
 from tests.redis_server import private_redis
@@ -49,14 +49,14 @@ def scrape(metrics: Metrics) -> dict[tuple[str, ...], float]:
     return values(generate_latest(metrics.registry).decode())
 
 
-def metrics_of(redis: Redis, folder: Path) -> tuple[RedisRecordStore, Metrics]:
+def metrics_of(redis: Redis, folder: Path) -> tuple[RecordStore, Metrics]:
     services = services_over(redis, Settings(state_dir=folder))
     assert isinstance(services.queue, WatchedQueue)
     services.queue.workers = None  # those that have reported are counted
     return services.records, Metrics(services)
 
 
-def job(store: RedisRecordStore, name: str) -> JobRecord:
+def job(store: RecordStore, name: str) -> JobRecord:
     return store.create_job(JobRecord(name, "registration", "accepted", {}, {}, store.now(), store.now()), 10)[0]
 
 
@@ -103,7 +103,7 @@ def test_seconds_go_into_the_buckets_of_their_bounds(redis: Redis) -> None:
 
 
 def test_the_time_in_a_phase_begins_with_it(redis: Redis) -> None:
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     job(store, "j")
     began = store.update_job("j", 1, status="running", phase="loading")
     later = store.update_job("j", 1, progress=0.4)
@@ -213,7 +213,7 @@ def test_trickling_connections_do_not_keep_the_metrics_port(
 
 
 def test_the_verdict_is_kept_with_the_job(redis: Redis) -> None:
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     record = job(store, "j")
     assert replace(record, verdict=None) == record
     store.update_job("j", 1, status="running")

@@ -10,7 +10,7 @@ import pytest
 from redis import Redis
 
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Message, RedisOutbox, line_of
 from tests.service.webhook_receiver import OneByOne, Receiver, ask, deliverer, delivery, due, finish
 
@@ -21,7 +21,7 @@ def test_a_message_outlives_who_took_it(redis: Redis, receiver: Receiver) -> Non
     assert RedisOutbox(redis).claim() == Message("j1", 1, 0, line_of("alice", receiver.address))
     assert not deliverer(redis, [receiver.address]).run_once()
     score = float(redis.zscore(due(receiver.address), "j1-1-0"))  # type: ignore[arg-type]
-    assert score == pytest.approx(RedisRecordStore(redis).now() + 60, abs=20)
+    assert score == pytest.approx(RecordStore(redis).now() + 60, abs=20)
     redis.zadd(due(receiver.address), {"j1-1-0": 0})
     assert deliverer(redis, [receiver.address]).run_once()
     assert len(receiver.received) == 1
@@ -50,7 +50,7 @@ def test_many_deliverers_send_each_message_once(redis: Redis, redis_url: str, re
 
 
 def test_a_job_that_is_deleted_or_started_anew_takes_its_message_along(redis: Redis, receiver: Receiver) -> None:
-    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    store, outbox = RecordStore(redis), RedisOutbox(redis)
     finish(redis, receiver.address, "failed")
     record = store.get_job("j1")
     assert record is not None
@@ -83,7 +83,7 @@ def test_a_webhook_that_comes_after_the_end_is_told_at_once_and_the_others_not_a
 
 
 def test_every_request_is_told_of_the_end_by_itself(redis: Redis, receiver: Receiver) -> None:
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     for path in ("first", "second", "third"):
         ask(redis, f"{receiver.address}/{path}")
     store.update_job("j1", 1, status="running")
@@ -100,7 +100,7 @@ def test_every_request_is_told_of_the_end_by_itself(redis: Redis, receiver: Rece
 
 
 def test_all_messages_of_a_job_go_with_it(redis: Redis, receiver: Receiver) -> None:
-    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    store, outbox = RecordStore(redis), RedisOutbox(redis)
     finish(redis, f"{receiver.address}/first", "failed")
     again = ask(redis, f"{receiver.address}/second")
     assert (again.attempt, again.webhooks) == (2, [f"{receiver.address}/second", f"{receiver.address}/first"])

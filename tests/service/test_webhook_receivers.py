@@ -16,7 +16,7 @@ from redis import Redis
 from regnf_service.webhooks import service
 from regnf_service.webhooks.service import HttpSender, SendError, deliver_until_stopped, full
 from regnf_service.webhooks.targets import AllowList, Webhooks, read_secrets
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Message, RedisOutbox, line_of
 from tests.service.webhook_receiver import SECRET, Receiver, delivery, finish
 
@@ -162,7 +162,7 @@ def test_a_receiver_that_does_not_answer_keeps_no_other_waiting(
 
     async def serve() -> None:
         stopping = asyncio.Event()
-        serving = asyncio.create_task(deliver_until_stopped(webhooks, RedisRecordStore(redis), redis, stopping))
+        serving = asyncio.create_task(deliver_until_stopped(webhooks, RecordStore(redis), redis, stopping))
         await asyncio.to_thread(until, lambda: slow.opened == 4 and len(receiver.received) == 2)
         assert not slow.closed.acquire(timeout=0)
         stopping.set()

@@ -8,7 +8,7 @@ import json
 import pytest
 from redis import Redis
 
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
 from tests.service.webhook_receiver import KEY, Receiver, deliverer, delivery, due, finish, hmac_by_hand
 
@@ -32,7 +32,7 @@ def test_a_message_arrives_signed(redis: Redis, receiver: Receiver, status: str)
     assert (path, headers["content-type"], len(receiver.received)) == ("/hook?x=1", "application/json", 1)
     signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
     assert headers["webhook-signature"] == "v1," + base64.b64encode(hmac_by_hand(KEY, signed)).decode()
-    assert abs(int(headers["webhook-timestamp"]) - RedisRecordStore(redis).now()) < 60
+    assert abs(int(headers["webhook-timestamp"]) - RecordStore(redis).now()) < 60
     assert "." not in headers["webhook-id"]
     message = json.loads(body)
     assert message["type"] == f"job.{status}"
@@ -59,7 +59,7 @@ def test_pauses_grow_and_end(redis: Redis, receiver: Receiver) -> None:
     finish(redis, receiver.address)
     sent, outbox = deliverer(redis, [receiver.address], (60.0, 3600.0)), RedisOutbox(redis)
     for sends, pause in ((1, 60), (2, 3600)):
-        now = RedisRecordStore(redis).now()
+        now = RecordStore(redis).now()
         assert sent.run_once()
         found = delivery(redis)
         assert (found.state, found.sends, found.next_at is not None) == ("pending", sends, True)

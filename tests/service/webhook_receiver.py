@@ -17,7 +17,7 @@ from regnf_service.webhooks.service import Deliverer, HttpSender
 from regnf_service.webhooks.targets import AllowList, read_secrets
 from regnf_state.ownership import reference_of
 from regnf_state.records import JobRecord
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox, due_key, line_of
 
 KEY = bytes(range(24))
@@ -85,7 +85,7 @@ class OneByOne:
 def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> OneByOne:
     hosts = AllowList(allowed)
     secrets = read_secrets([f"alice:{SECRET}"], None)
-    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    store, outbox = RecordStore(redis), RedisOutbox(redis)
     return OneByOne(Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s))
 
 
@@ -96,7 +96,7 @@ def due(url: str) -> str:
 
 def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1", owner: str = "alice") -> JobRecord:
     """A job with a webhook, ended."""
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     request = {"scene": reference_of(owner, "a" * 64), "webhook": {"url": url}}
     now = store.now()
     record, _ = store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)
@@ -107,14 +107,14 @@ def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1",
 
 def delivery(redis: Redis, place: int = 0, name: str = "j1") -> Delivery:
     """How the message to one of the job's webhooks fares."""
-    record = RedisRecordStore(redis).get_job(name)
+    record = RecordStore(redis).get_job(name)
     assert record is not None
     return RedisOutbox(redis).deliveries(record)[place]
 
 
 def ask(redis: Redis, url: str, name: str = "j1") -> JobRecord:
     """Another request of alice's for the same job, with a webhook of its own."""
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     request = {"scene": reference_of("alice", "a" * 64), "webhook": {"url": url}}
     now = store.now()
     return store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)[0]

@@ -7,8 +7,8 @@ from typing import Any
 
 from redis import Redis
 
-from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.jobs import RecordStore
 
 SCENE, OBJECT = "a" * 64, "b" * 64
 

@@ -12,7 +12,7 @@ from redis import Redis
 from regnf_state.manifest import read_manifest
 from regnf_state.records import Quota, UnreadableRecordError
 from regnf_state.redis.counters import COUNTERS_KEY, Counters
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox, due_key, line_of
 from tests.state.journal_world import World, fresh_world
 from tests.state.record_makers import OBJECT, SCENE, change, field, finished, job, started
@@ -61,7 +61,7 @@ DAMAGES: dict[str, Callable[[Redis, str], object]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_a_damaged_record_is_set_aside_and_the_others_go_on(
-    store: RedisRecordStore, redis: Redis, damage: Callable[[Redis, str], object], caplog: pytest.LogCaptureFixture
+    store: RecordStore, redis: Redis, damage: Callable[[Redis, str], object], caplog: pytest.LogCaptureFixture
 ) -> None:
     started(store)
     started(store, "j2")
@@ -81,7 +81,7 @@ def test_a_damaged_record_is_set_aside_and_the_others_go_on(
     assert store.get_job("j1") is not None, "it may be asked for anew"
 
 
-def test_a_record_of_a_later_format_stays_where_it_is(store: RedisRecordStore, redis: Redis) -> None:
+def test_a_record_of_a_later_format_stays_where_it_is(store: RecordStore, redis: Redis) -> None:
     started(store)
     redis.hset("regnf:job:j1", mapping={"format": "2", "document": "whatever that is"})
     for _ in range(2):
@@ -109,7 +109,7 @@ def test_a_damaged_record_is_made_anew_from_the_journal(world: World) -> None:
     assert {one.id for one in world.records.active_jobs()} == {"j1"}
 
 
-def test_a_damaged_field_is_set_aside(store: RedisRecordStore, redis: Redis) -> None:
+def test_a_damaged_field_is_set_aside(store: RecordStore, redis: Redis) -> None:
     for name in (SCENE, OBJECT):
         store.create_field(field(store, name))
     redis.hset(f"regnf:field:{SCENE}", "document", "{")
@@ -121,14 +121,14 @@ def test_a_damaged_field_is_set_aside(store: RedisRecordStore, redis: Redis) -> 
     assert store.create_field(field(store))[1]
 
 
-def test_those_set_aside_take_no_place_among_an_owner_s_jobs(store: RedisRecordStore, redis: Redis) -> None:
+def test_those_set_aside_take_no_place_among_an_owner_s_jobs(store: RecordStore, redis: Redis) -> None:
     started(store)
     redis.hset("regnf:job:j1", "document", "{")
     assert store.active_jobs() == []
     assert store.create_job(job(store, "j2"), 1, Quota(active_jobs=1))[1]
 
 
-def test_a_thousand_are_noted_at_most(store: RedisRecordStore, redis: Redis, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thousand_are_noted_at_most(store: RecordStore, redis: Redis, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("regnf_state.redis.unreadable._MOST", 3)
     for number in range(5):
         started(store, f"j{number}")
@@ -139,7 +139,7 @@ def test_a_thousand_are_noted_at_most(store: RedisRecordStore, redis: Redis, mon
 
 
 @pytest.mark.parametrize("key", ["regnf:job:j1:events", "regnf:jobs:created", "regnf:jobs:expiring"])
-def test_an_index_of_another_type_is_begun_anew(store: RedisRecordStore, redis: Redis, key: str) -> None:
+def test_an_index_of_another_type_is_begun_anew(store: RecordStore, redis: Redis, key: str) -> None:
     started(store)
     redis.delete(key)
     redis.set(key, "a string")
@@ -161,7 +161,7 @@ def _no_numbers(redis: Redis) -> None:
 
 @pytest.mark.parametrize("damage", [_another_type, _no_numbers])
 def test_damaged_counters_keep_no_record_from_being_set_aside_or_written(
-    store: RedisRecordStore, redis: Redis, damage: Callable[[Redis], None]
+    store: RecordStore, redis: Redis, damage: Callable[[Redis], None]
 ) -> None:
     for name in ("j1", "j2"):
         started(store, name)
@@ -179,7 +179,7 @@ def test_damaged_counters_keep_no_record_from_being_set_aside_or_written(
     assert list(Counters(redis).counts("job_attempts")) == [((), 1.0)]
 
 
-def test_a_damaged_list_of_the_unreadable_is_begun_anew(store: RedisRecordStore, redis: Redis) -> None:
+def test_a_damaged_list_of_the_unreadable_is_begun_anew(store: RecordStore, redis: Redis) -> None:
     started(store)
     redis.hset("regnf:job:j1", "document", "{")
     redis.set("regnf:unreadable", "a string")
@@ -190,16 +190,14 @@ def test_a_damaged_list_of_the_unreadable_is_begun_anew(store: RedisRecordStore,
 
 
 @pytest.mark.parametrize("held", ["a string", {"a" * 64: "x"}])
-def test_what_an_owner_has_counts_as_nothing_where_it_is_damaged(
-    store: RedisRecordStore, redis: Redis, held: Any
-) -> None:
+def test_what_an_owner_has_counts_as_nothing_where_it_is_damaged(store: RecordStore, redis: Redis, held: Any) -> None:
     for key in ("regnf:owner:anonymous:active", "regnf:owner:anonymous:stored"):
         redis.set(key, held) if isinstance(held, str) else redis.hset(key, mapping=held)
     assert store.create_job(job(store), 10, Quota(active_jobs=1))[1]
     assert store.create_field(field(store), Quota(fields=2, stored_bytes=100))[1]
 
 
-def test_a_damaged_message_does_not_keep_the_others(store: RedisRecordStore, redis: Redis) -> None:
+def test_a_damaged_message_does_not_keep_the_others(store: RecordStore, redis: Redis) -> None:
     line = line_of("anonymous", "https://hooks.example/x")
     redis.zadd(due_key(line), {"nonsense": 1.0, "j1-1-0": 2.0})
     redis.zadd("regnf:webhooks:lines", {line: 0, "anonymous gone.example": 0})
@@ -230,7 +228,7 @@ def test_a_damaged_journal_does_not_keep_a_job_from_being_asked_for(world: World
     assert world.job().attempt == 2
 
 
-def test_a_damaged_end_of_a_job_is_no_end(store: RedisRecordStore, redis: Redis) -> None:
+def test_a_damaged_end_of_a_job_is_no_end(store: RecordStore, redis: Redis) -> None:
     """Expiry goes on past a tombstone that cannot be read."""
     for name in ("j1", "j2"):
         finished(store, "successful", name)

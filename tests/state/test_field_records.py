@@ -5,10 +5,9 @@ from dataclasses import replace
 import pytest
 
 from regnf_state.ownership import reference_of
-from regnf_state.record_store import RecordStore
 from regnf_state.records import Quota, QuotaError, StaleAttemptError
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from tests.state.record_makers import OBJECT, SCENE, field, job, started
 
 # fields
@@ -102,7 +101,7 @@ def test_a_script_run_twice_by_a_broken_connection_counts_once(redis_url: str, m
     """The client repeats a script when it never saw the answer: the second run must neither fail nor apply again."""
     with connect(redis_url) as redis:
         redis.flushall()
-        store = RedisRecordStore(redis)
+        store = RecordStore(redis)
         store.create_job(job(store), 10)
         script = store._write
 
@@ -145,7 +144,7 @@ def test_lists_and_tombstones_are_each_owners_own(store: RecordStore) -> None:
 def test_an_expired_job_is_so_to_its_owner_alone(redis_url: str) -> None:
     with connect(redis_url) as redis:
         redis.flushall()
-        store = RedisRecordStore(redis, retention_s=0)
+        store = RecordStore(redis, retention_s=0)
         store.create_job(replace(job(store), request={"scene": reference_of("alice", SCENE)}), 10)
         store.update_job("j1", 1, status="failed", error={"reason": "INTERNAL"})
         redis.set("regnf:job:j1:gone", "alice")  # with no retention at all the tombstone would be gone as well

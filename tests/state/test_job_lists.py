@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from redis import Redis
 
-from regnf_state.record_store import RecordStore, all_of
+from regnf_state.record_store import all_of
 from regnf_state.records import QueueFullError, StaleAttemptError
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from tests.state.record_makers import field, finished, job, started
 from tests.stores import expire
 
@@ -162,7 +162,7 @@ def test_deleting(store: RecordStore) -> None:
 def test_finished_jobs_expire_and_leave_a_tombstone(redis_url: str) -> None:
     with connect(redis_url) as redis:
         redis.flushall()
-        store = RedisRecordStore(redis, retention_s=2)
+        store = RecordStore(redis, retention_s=2)
 
         def wait() -> None:
             gone = threading.Event()
@@ -199,7 +199,7 @@ def _assert_expiry(store: RecordStore, wait) -> None:  # type: ignore[no-untyped
 
 
 def test_an_expired_job_can_be_asked_for_again(redis: Redis) -> None:
-    store = RedisRecordStore(redis)
+    store = RecordStore(redis)
     finished(store, "successful")
     expire(redis, "j1")
     assert store.create_job(job(store), 10)[1]

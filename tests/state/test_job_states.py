@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from regnf_state.record_store import RecordStore
 from regnf_state.records import StaleAttemptError
+from regnf_state.redis.jobs import RecordStore
 from tests.state.record_makers import finished, job, started
 
 # jobs: the state machine

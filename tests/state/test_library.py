@@ -11,9 +11,9 @@ from redis import Redis
 from regnf_core.errors import InvalidInputError
 from regnf_core.library_entries import EntryNotes, checked_symmetry
 from regnf_state.ownership import reference_of
-from regnf_state.record_store import NameTakenError, RecordStore
+from regnf_state.record_store import NameTakenError
 from regnf_state.records import FieldRecord, StaleAttemptError, UnreadableRecordError
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from tests.state.journal_world import World, fresh_world
 from tests.state.record_makers import OBJECT, SCENE, change, field
 
@@ -87,7 +87,7 @@ def test_the_entry_outlives_imports_and_goes_with_its_field(store: RecordStore) 
     store.set_entry(ready(store, OBJECT), CHAIR)
 
 
-def test_a_name_whose_entry_was_lost_is_free_again(store: RedisRecordStore, redis: Redis) -> None:
+def test_a_name_whose_entry_was_lost_is_free_again(store: RecordStore, redis: Redis) -> None:
     """An earlier release deletes a field, and does not know of names."""
     store.set_entry(ready(store), CHAIR)
     redis.delete(f"regnf:field:{SCENE}")
@@ -97,7 +97,7 @@ def test_a_name_whose_entry_was_lost_is_free_again(store: RedisRecordStore, redi
 
 
 @pytest.mark.parametrize("said", [{"name": 3}, {"name": "a", "tags": "b", "added": 1}, {"name": "a", "tags": []}])
-def test_a_damaged_entry_is_noticed(store: RedisRecordStore, redis: Redis, said: dict[str, Any]) -> None:
+def test_a_damaged_entry_is_noticed(store: RecordStore, redis: Redis, said: dict[str, Any]) -> None:
     ready(store)
     change(redis, f"regnf:field:{SCENE}", library=said)
     with pytest.raises(UnreadableRecordError, match="library"):

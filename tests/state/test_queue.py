@@ -10,15 +10,15 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from tests.worker.bench import eventually
 
 SHA = "a" * 64
 
 
 @pytest.fixture
-def queue(redis: Redis) -> RqJobQueue:
-    return RqJobQueue(redis)
+def queue(redis: Redis) -> JobQueue:
+    return JobQueue(redis)
 
 
 def listed(redis: Redis) -> list[bytes]:
@@ -65,7 +65,7 @@ def test_other_names_mean_nothing(queue_name: str, name: str) -> None:
         Work.named(queue_name, name)
 
 
-def test_a_job_is_one_id_as_json(redis: Redis, queue: RqJobQueue) -> None:
+def test_a_job_is_one_id_as_json(redis: Redis, queue: JobQueue) -> None:
     queue.enqueue_registration("j1", 2)
     queue.enqueue_import(SHA)
     assert listed(redis) == [b"j1-2"], "the next in turn, and nothing else"
@@ -79,7 +79,7 @@ def test_a_job_is_one_id_as_json(redis: Redis, queue: RqJobQueue) -> None:
         assert json.loads(zlib.decompress(bytes(data))) == [function, None, [argument], {}]
 
 
-def test_every_attempt_is_queued_once(redis: Redis, queue: RqJobQueue) -> None:
+def test_every_attempt_is_queued_once(redis: Redis, queue: JobQueue) -> None:
     for _ in range(3):
         queue.enqueue_registration("j1", 1)
         queue.enqueue_import(SHA, 2)
@@ -87,7 +87,7 @@ def test_every_attempt_is_queued_once(redis: Redis, queue: RqJobQueue) -> None:
     assert listed(redis) + lined(redis) == [b"j1-1", f"import-{SHA}-2".encode(), b"j1-2"]
 
 
-def test_what_the_transport_holds(queue: RqJobQueue) -> None:
+def test_what_the_transport_holds(queue: JobQueue) -> None:
     assert not queue.holds_registration("j1", 1)
     assert not queue.holds_import(SHA, 1)
     queue.enqueue_registration("j1", 1)
@@ -97,7 +97,7 @@ def test_what_the_transport_holds(queue: RqJobQueue) -> None:
     assert queue.holds_import(SHA, 1)
 
 
-def test_work_in_progress_is_held_while_its_worker_reports(redis: Redis, queue: RqJobQueue) -> None:
+def test_work_in_progress_is_held_while_its_worker_reports(redis: Redis, queue: JobQueue) -> None:
     for job_id in ("j1-1", "j2-1"):
         queue.enqueue_registration(job_id[:2], 1)
         assert redis.lpop("rq:queue:regnf") == job_id.encode()
@@ -114,7 +114,7 @@ def test_work_in_progress_is_held_while_its_worker_reports(redis: Redis, queue: 
     assert queue.holds_registration("j1", 1)
 
 
-def test_an_id_that_fell_between_two_lists_is_queued_anew(redis: Redis, queue: RqJobQueue) -> None:
+def test_an_id_that_fell_between_two_lists_is_queued_anew(redis: Redis, queue: JobQueue) -> None:
     """A worker that dies right after taking an id leaves the job's hash, and the id in no list."""
     queue.enqueue_registration("j1", 1)
     redis.delete("rq:queue:regnf")
@@ -123,7 +123,7 @@ def test_an_id_that_fell_between_two_lists_is_queued_anew(redis: Redis, queue: R
     assert listed(redis) == [b"j1-1"]
 
 
-def test_what_the_previous_release_has_queued_is_worked_off_first(redis: Redis, queue: RqJobQueue) -> None:
+def test_what_the_previous_release_has_queued_is_worked_off_first(redis: Redis, queue: JobQueue) -> None:
     redis.rpush("rq:queue:regnf", "old-1", "old-2")
     queue.enqueue_registration("j1", 1)
     assert queue.holds_registration("old", 1)
@@ -134,7 +134,7 @@ def test_what_the_previous_release_has_queued_is_worked_off_first(redis: Redis, 
     assert listed(redis) == [b"j1-1"]
 
 
-def test_stopping_a_waiting_job_leaves_nothing_of_it(redis: Redis, queue: RqJobQueue) -> None:
+def test_stopping_a_waiting_job_leaves_nothing_of_it(redis: Redis, queue: JobQueue) -> None:
     for name in ("j1", "j2", "j3"):
         queue.enqueue_registration(name, 1)
     for name in ("j1", "j3", "j9"):
@@ -143,7 +143,7 @@ def test_stopping_a_waiting_job_leaves_nothing_of_it(redis: Redis, queue: RqJobQ
     assert [*redis.keys("*j1-1*"), *redis.keys("*j3-1*")] == []
 
 
-def test_live_workers_are_those_that_reported_lately(redis: Redis, queue: RqJobQueue) -> None:
+def test_live_workers_are_those_that_reported_lately(redis: Redis, queue: JobQueue) -> None:
     assert queue.live_workers() == 0
     redis.sadd("rq:workers:regnf", "rq:worker:a", "rq:worker:b", "rq:worker:c")
     redis.hset("rq:worker:a", "pid", "1")

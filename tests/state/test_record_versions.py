@@ -10,7 +10,7 @@ from redis import Redis
 
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.manifest import read_manifest
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
 from tests.state.captured import put_back
 from tests.state.journal_world import World, fresh_world
@@ -80,7 +80,7 @@ def test_the_journal_of_the_release_before_is_read(upgraded: World) -> None:
 # members of a later release
 
 
-def test_members_that_are_not_known_are_written_back(store: RedisRecordStore, redis: Redis) -> None:
+def test_members_that_are_not_known_are_written_back(store: RecordStore, redis: Redis) -> None:
     started(store)
     change(redis, "regnf:job:j1", budget={"seconds": 12.5}, note=None)
     redis.hset("regnf:job:j1", "extra", "of another release")
@@ -103,7 +103,7 @@ def test_members_that_are_not_known_survive_in_the_journal(world: World) -> None
     assert world.job().unknown_members == {"budget": 3}
 
 
-def test_members_that_are_missing_have_their_defaults(store: RedisRecordStore, redis: Redis) -> None:
+def test_members_that_are_missing_have_their_defaults(store: RecordStore, redis: Redis) -> None:
     started(store)
     document = json.loads(redis.hget("regnf:job:j1", "document"))  # type: ignore[arg-type]
     for member in ("verdict", "more_webhooks", "phase_since", "requeues"):

@@ -10,8 +10,8 @@ import yaml
 
 from regnf_cli.embedded_redis import server_binary
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from tests.redis_server import installed_servers
 from tests.restartable_redis import restartable_redis
 from tests.state.record_makers import job
@@ -41,14 +41,14 @@ def test_valkey_opens_what_redis_has_kept() -> None:
     with restartable_redis(server="redis") as server:
         with connect(server.url) as redis:
             assert "valkey_version" not in redis.info("server")
-            store = RedisRecordStore(redis)
+            store = RecordStore(redis)
             store.create_job(job(store), 10)
-            RqJobQueue(redis).enqueue_registration("j1", 1)
+            JobQueue(redis).enqueue_registration("j1", 1)
         server.kill()
         server.start("valkey")
         with connect(server.url) as redis:
             assert "valkey_version" in redis.info("server")
-            kept = RedisRecordStore(redis).get_job("j1")
+            kept = RecordStore(redis).get_job("j1")
             assert kept is not None
             assert kept.status == "accepted"
             assert redis.lrange("rq:queue:regnf", 0, -1) == [b"j1-1"]

@@ -13,8 +13,8 @@ import trimesh
 from regnf_core.viewing.field_views import mesh_file
 from regnf_state.blobs.base import BlobStore
 from regnf_state.ownership import sha256_of
-from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.room import original_key
 from tests.ui.stories import field_picture
 

@@ -17,8 +17,8 @@ from playwright.sync_api import expect
 from regnf_service.server import create_app
 from regnf_state.blobs.base import BlobStore
 from regnf_state.ownership import ANONYMOUS, reference_of
-from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from regnf_state.stores import Stores
 from tests.stores import private_stores

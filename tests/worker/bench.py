@@ -19,8 +19,8 @@ from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.ownership import ANONYMOUS, reference_of
 from regnf_state.records import FINISHED, FieldRecord, JobRecord
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from regnf_worker.models import Context
 from tests.listing import below
@@ -121,9 +121,9 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         environment |= {f"REGNF_{name.upper()}": str(value) for name, value in given.items()}
         values = Settings(**given)  # type: ignore[arg-type]
         stores = (
-            RedisRecordStore(redis),
+            RecordStore(redis),
             LocalBlobStore(values.blob_dir),
-            RqJobQueue(redis, reserve_s=values.worker_reserve_s),
+            JobQueue(redis, reserve_s=values.worker_reserve_s),
         )
         made = Bench(Context(values, *stores), redis, folder, environment)
         try:

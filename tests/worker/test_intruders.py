@@ -175,12 +175,12 @@ def test_orders_over_redis_end_neither_workers_nor_other_jobs(table: Bench, comm
 
 def test_with_a_key_only_what_is_signed_runs(tmp_path: Path) -> None:
     from regnf_state.queue import Work
-    from regnf_state.redis.queue import SIGNATURE, RqJobQueue, signature
+    from regnf_state.redis.queue import SIGNATURE, JobQueue, signature
 
     key = "correct horse battery staple"
     with bench(tmp_path, queue_key=key) as table:
         table.add_ready_fields()
-        signed, forged = RqJobQueue(table.redis, key), RqJobQueue(table.redis, "another key, long enough")
+        signed, forged = JobQueue(table.redis, key), JobQueue(table.redis, "another key, long enough")
         table.submit("succeed", "unsigned")
         for name, queue in (("forged", forged), ("signed", signed)):
             table.submit("succeed", name)

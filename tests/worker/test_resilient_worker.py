@@ -13,7 +13,7 @@ from rq.exceptions import StopRequested
 from rq.worker.base import BaseWorker
 
 from regnf_state.queue import Work
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from regnf_worker import kernel, process
 from regnf_worker.kernel import Scratch
@@ -184,7 +184,7 @@ def work_off(redis: RefusingRedis, worker_over: Callable[[], ChildlessWorker], r
     redis.refuse_at = -1
     redis.flushall()
     for letter in "ab":
-        RqJobQueue(redis).enqueue_import(letter * 64)
+        JobQueue(redis).enqueue_import(letter * 64)
     worker = worker_over()
     done.clear()
     redis.sent, redis.refuse_at, redis.error = 0, refuse_at, error
@@ -214,7 +214,7 @@ def test_no_refused_command_ends_the_loop_or_loses_work(
 def test_an_error_that_does_not_pass_still_ends_the_loop(
     redis: RefusingRedis, worker_over: Callable[[], ChildlessWorker]
 ) -> None:
-    RqJobQueue(redis).enqueue_import("a" * 64)
+    JobQueue(redis).enqueue_import("a" * 64)
     worker = worker_over()
     redis.set(worker.redis_workers_keys, "not a set")
     with pytest.raises(ResponseError, match="WRONGTYPE"):
@@ -235,7 +235,7 @@ def test_a_worker_that_redis_forgot_is_known_again_after_its_next_report(redis: 
     for report in (worker.heartbeat, lambda: redis_pipeline_report(redis, worker)):
         redis.flushall()
         report()
-        assert RqJobQueue(redis).live_workers() == 1
+        assert JobQueue(redis).live_workers() == 1
         assert redis.hget(worker.key, "hostname") == worker.hostname.encode(), "the container's health check reads it"
         assert 0 < redis.ttl(worker.key) <= 45
 

@@ -9,7 +9,7 @@ from redis import Redis
 
 from regnf_service.upkeep.reaper import Reaper
 from regnf_state.queue import Work
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from regnf_worker.models import Context
 from regnf_worker.resilient_worker import Taken, Taking
@@ -23,7 +23,7 @@ def taking(context: Context, any_redis: Redis) -> Taking:
     """A worker's, and a registration that waits."""
     accept(context)
     context.queue.enqueue_registration("j1", 1)
-    return Taking(any_redis, RqJobQueue(any_redis).fair, None)
+    return Taking(any_redis, JobQueue(any_redis).fair, None)
 
 
 def import_again(context: Context) -> None:

@@ -269,12 +269,12 @@ def test_a_registration_of_a_rejected_field_fails(tmp_path: Path) -> None:
 
 def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
     with bench(tmp_path) as table:
-        from regnf_state.redis.queue import RqJobQueue
+        from regnf_state.redis.queue import JobQueue
 
         now = table.context.records.now()
         table.context.blobs.put(f"fields/{SCENE}/original", b"no field at all")
         table.context.records.create_field(FieldRecord(SCENE, "validating", 15, now, now))
-        RqJobQueue(table.redis).enqueue_import(SCENE)
+        JobQueue(table.redis).enqueue_import(SCENE)
         table.start_worker("regnf_worker.main")
         rejected = field_state(table, SCENE)
         assert rejected.error is not None

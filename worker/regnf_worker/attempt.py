@@ -27,8 +27,8 @@ from regnf_state.logs import log_context
 from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.ownership import sha256_of
 from regnf_state.reasons import problem_document
-from regnf_state.record_store import RecordStore
 from regnf_state.records import WARNINGS, FieldRecord, JobRecord, StaleAttemptError, UnreadableRecordError
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.registration_request import RegistrationRequest, RenderingRequest, request_of
 from regnf_worker.engine import Candidate, Engine, Made
 from regnf_worker.job_limits import (

@@ -26,7 +26,7 @@ from regnf_core.field_notes import FieldViews
 from regnf_state.ownership import owner_of
 from regnf_state.pieces import delete_views, view_key
 from regnf_state.records import FieldRecord, StaleAttemptError, ViewState
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.job_limits import JobLimits
@@ -150,7 +150,7 @@ class FieldDrawer:
     """Draws for one worker. No method raises RedisError or OSError: what fails is tried another time."""
 
     def __init__(self, redis: Redis, settings: Settings, draw: Draw) -> None:
-        self._records = RedisRecordStore(redis)  # without the journal: its storage does not survive the worker's forks
+        self._records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
         self._lock = settings.scratch_dir / _LOCK
         self._limits = JobLimits.of(settings)
         self._niceness = min(_NICENESS, settings.job_niceness)

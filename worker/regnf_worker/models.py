@@ -16,9 +16,9 @@ from regnf_core.errors import RegnfError
 from regnf_core.options import RegistrationOptions
 from regnf_core.version import ENGINE_REVISION
 from regnf_state.blobs.base import BlobStore
-from regnf_state.queue import JobQueue
-from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, StaleAttemptError
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.room import Originals
 from regnf_state.settings import Settings
 from regnf_state.stores import open_stores

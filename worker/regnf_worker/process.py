@@ -31,12 +31,13 @@ from rq.utils import now
 from rq.worker import WorkerStatus
 
 from regnf_core.importing.gate.child import LONGEST
-from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, JobQueue, Kind, Work
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis import queue as payload
 from regnf_state.redis.client import WORKER_RETRIES, connect, redis_address
 from regnf_state.redis.fair_queue import FairQueue
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_worker import jobs, kernel, resilient_worker
 from regnf_worker.job_limits import JobLimits, start_refused
 from regnf_worker.jobs import Draw, FieldDrawer
@@ -111,7 +112,7 @@ class LateEntries:
     model, and is not tried again."""
 
     def __init__(self, redis: Redis, queue: JobQueue) -> None:
-        self._records = RedisRecordStore(redis)  # without the journal: its storage does not survive the worker's forks
+        self._records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
         self._queue = queue
         self._known = False
 

@@ -43,7 +43,7 @@ from regnf_state.redis import queue
 from regnf_state.redis.counters import count
 from regnf_state.redis.documents import text
 from regnf_state.redis.fair_queue import FairQueue
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.transitions import fields_of
 
 # Waiting for a Redis that is full, away or read-only.
@@ -255,7 +255,7 @@ class Taking:
         self._redis = redis
         self._fair = fair
         self._key = key
-        self._records = RedisRecordStore(redis)  # without the journal: its storage does not survive the worker's forks
+        self._records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
 
     def pop(self, timeout: int | None) -> Taken | None:
         """The next name, waited for so many seconds (None: not at all); None when there is none."""

@@ -19,10 +19,10 @@ from redis.exceptions import RedisError
 from regnf_service.upkeep.housekeeping import Housekeeper, Lease, LeaseLostError, Term
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import Rebuilder
-from regnf_state.queue import JobQueue
 from regnf_state.reasons import problem_document
-from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError
+from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.redis.unreadable import PREFIX
 from regnf_state.settings import Settings
 

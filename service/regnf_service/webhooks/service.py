@@ -21,8 +21,8 @@ from redis.exceptions import RedisError
 
 from regnf_service.times import rfc3339
 from regnf_service.webhooks.targets import AllowList, Secrets, Webhooks, read_secrets, signed_headers
-from regnf_state.record_store import RecordStore
 from regnf_state.records import FINISHED, JobRecord, UnreadableRecordError
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
 from regnf_state.settings import Settings
 

@@ -20,7 +20,7 @@ from regnf_state.journal.journaled_records import JournaledRecordStore, Rebuilde
 from regnf_state.manifest import Artifact, Manifest, manifest_key
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.queue import JobQueue
 from tests.redis_server import private_redis
 
 FIELDS = {name: (digit * 64, digit * 64 + "_lab")[name == "of_lab"] for name, digit in
@@ -79,7 +79,7 @@ def main(output: Path) -> None:
     with private_redis() as url, connect(url) as redis, TemporaryDirectory() as folder:
         blobs = LocalBlobStore(Path(folder))
         records = JournaledRecordStore(redis, 7 * 24 * 3600, blobs)
-        Rebuilder(records, RqJobQueue(redis), blobs).run_if_needed()
+        Rebuilder(records, JobQueue(redis), blobs).run_if_needed()
         fill(records, blobs)
         text = Redis.from_url(url, decode_responses=True)
         keys = {key: [text.type(key), value_of(text, key)] for key in sorted(text.scan_iter())}
