@@ -9,13 +9,13 @@ from itertools import count
 import torch
 from torch import Tensor
 
+from regnf_core.document import STARTS, IterationRecord, RegistrationResult, Run
 from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import STARTS, IterationRecord, RegistrationResult, Run
 from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
 from regnf_core.robust.constants.model import Stage
 from regnf_core.robust.model import ObjectModel, SelfSymmetry, model_object

@@ -39,7 +39,7 @@ CUT_OFF = [
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch", "torch._C", "torch.nn")],
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_core.library", "scipy.spatial", "PIL.Image")],
     *[(name, "torch", ["register", *PAIR]) for name in ("SIGTERM", "SIGHUP")],
-    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.document")],
+    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
     *[("SIGINT", name, ["inspect", PAIR[1]]) for name in ("regnf_cli.inspect", "torch")],
     ("SIGINT", "igl", ["convert", PAIR[1], "chair.ply"]),
     ("SIGINT", "igl.pyigl_core", ["convert", PAIR[1], "chair.ply"]),
