@@ -471,7 +471,9 @@ def result_document(
         metrics={name: json_number(value) for name, value in metrics.items()},
         object=object_name,
         candidates=None if candidates is None else [CandidateDocument(**one) for one in candidates],
-        fields=None if fields is None else {role: _notes(fields[role]) for role in _ROLES if role in fields},
+        fields=None
+        if fields is None
+        else {role: FieldNotesDocument(**fields[role].to_dict()) for role in _ROLES if role in fields},
         seed=result.seed,
         options=result.options,
         engine={"name": "regnf", "version": __version__, "device": str(device), "torch": torch.__version__},
@@ -516,10 +518,6 @@ def _both_ways(pose: Alternative | ConsideredPose) -> dict[str, Any]:
 
 def _transform(T: Sim3) -> TransformDocument:
     return TransformDocument(**T.to_dict())
-
-
-def _notes(notes: FieldNotes) -> FieldNotesDocument:
-    return FieldNotesDocument(**notes.to_dict())
 
 
 def json_number(value: float) -> float | None:
