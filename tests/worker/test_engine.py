@@ -54,7 +54,7 @@ def test_a_search_makes_clouds_for_its_pictures_alone(
     found = SimpleNamespace(ranking=[SimpleNamespace(name="c" * 64)], result="a result")
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.library.search_library", lambda *_, **how: calls.append(how) or found)
-    monkeypatch.setattr("regnf_core.viewing.ranking_document", lambda *_: [])
+    monkeypatch.setattr("regnf_core.document.ranking_document", lambda *_: [])
     monkeypatch.setattr("regnf_core.viewing.artifacts.write_result", lambda *_, **__: ["result.json"])
     monkeypatch.setattr("regnf_core.library.with_late_clouds", lambda result, *given: given[:2])
     monkeypatch.setattr("regnf_core.viewing.artifacts.write_pictures", lambda result, _: list(result))
