@@ -30,7 +30,7 @@ from regnf_core.errors import RegnfError
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from regnf_core.viewing import write_artifacts
+from regnf_core.viewing.artifacts import write_artifacts
 from regnf_worker import kernel
 from regnf_worker.job_limits import JobLimits
 from tests.core.analytic import AnalyticField, boxes

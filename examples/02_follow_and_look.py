@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 from regnf_core import OrientedBox, RegistrationOptions, Sim3, open_field, register
-from regnf_core.viewing import result_document, write_artifacts
+from regnf_core.document import result_document
+from regnf_core.viewing.artifacts import write_artifacts
 
 if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
     sys.exit(f"usage: {__doc__}")

@@ -138,11 +138,11 @@ def failure(error: RegnfError) -> dict[str, Any]:
 
 def _document(pair: FilePair) -> dict[str, Any]:
     from regnf_core.detections import parse_detection, require_in_scene
+    from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.library import WarmStart, register, search_library
     from regnf_core.options import RegistrationOptions
-    from regnf_core.viewing import ranking_document, result_document
 
     request = pair.request or {}
     options = RegistrationOptions.from_dict(request["options"])

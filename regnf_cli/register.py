@@ -111,12 +111,12 @@ def _request(
 def _register_here(
     scene: FieldSource, object_: FieldSource, detection: Detection, request: dict[str, Any], files: Files
 ) -> dict[str, Any]:
+    from regnf_core.document import result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.library import WarmStart
     from regnf_core.library import register as run
     from regnf_core.loading import import_smallest_first, load_field
-    from regnf_core.viewing import result_document
 
     options = RegistrationOptions.from_dict(request["options"])
     box = OrientedBox.from_detection(detection)

@@ -32,11 +32,11 @@ from regnf_core.library_folder import LibraryFolder
 from regnf_core.options import RegistrationOptions, RobustOptions
 
 if TYPE_CHECKING:
+    from regnf_core.document import RegistrationResult
     from regnf_core.fields.observation import SdfField
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import LibraryObject
     from regnf_core.loading import LoadedField
-    from regnf_core.result import RegistrationResult
 
 
 # The objects of a search: entries of libraries by their names, and fields by their files.
@@ -103,7 +103,7 @@ def tell_files(output: Path | None, recording: Path | None = None) -> None:
 
 def write_into(output: Path | None, result: RegistrationResult, **said: Any) -> None:
     """Write every artifact, each whole or not at all; ``said`` goes on to ``write_artifacts``."""
-    from regnf_core.viewing import write_artifacts
+    from regnf_core.viewing.artifacts import write_artifacts
 
     if output is None:
         return
@@ -249,10 +249,10 @@ def _modeled(
 def _search_here(
     scene: FieldSource, objects: list[FieldSource], detection: Detection, request: dict[str, Any], output: Path | None
 ) -> dict[str, Any]:
+    from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import search_library
     from regnf_core.loading import import_smallest_first, safe_field
-    from regnf_core.viewing import ranking_document, result_document
 
     options = RegistrationOptions.from_dict(request["options"])
     box = OrientedBox.from_detection(detection)

@@ -15,9 +15,10 @@ from pydantic import BeforeValidator, Field
 from regnf_client.answers import checked, refusal, service_error
 from regnf_client.calls import request_body
 from regnf_client.fields import Asking, Deadline, FieldLike, known_sha256, upload
-from regnf_client.models import Alternative, Array, Document, Matrix, Verdict
+from regnf_client.models import Alternative, Array, Document, Matrix
 from regnf_client.steps import Flow, Pause, call, look
 from regnf_core.detections.parsing import BoxLike
+from regnf_core.document import Verdict
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.field_source import FieldSource, Role
 from regnf_core.options import OptionsLike

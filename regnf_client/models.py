@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 from pydantic import Field as MemberField
 
+from regnf_core.document import AlternativeDocument, ArtifactEntry, CandidateDocument, ResultDocument, Verdict
 from regnf_core.errors import RegnfError
 
 Floats = NDArray[np.float64]
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
-Verdict = Literal["registered", "ambiguous", "rejected"]
 FINISHED = frozenset({"successful", "failed", "dismissed"})
 
 
@@ -113,71 +113,41 @@ class Event(Document):
     data: dict[str, Any]
 
 
-class Artifact(Document):
+class Artifact(Document, ArtifactEntry):
     """A file of a result. One that is ``pending`` has no bytes yet: downloading it waits for them."""
 
-    name: str
-    state: Literal["ready", "pending"] = "ready"
-    bytes: int | None = None
-    sha256: str | None = None
-    url: str
 
-
-class Alternative(Document):
+class Alternative(Document, AlternativeDocument):
     """Another pose that agrees with the data as well."""
 
-    T_scene_object: Matrix
-    T_object_scene: Matrix
-    score: float
-    relation: str
+    T_scene_object: Matrix  # type: ignore[assignment]
+    T_object_scene: Matrix  # type: ignore[assignment]
 
 
-class Candidate(Document):
+class Candidate(Document, CandidateDocument):
     """What a search found out about one object. source: as the caller named it."""
 
-    object: str
-    stage: str
-    score: float | None = None
-    verdict: Verdict | None = None
-    verdict_reason: str | None = None
-    probability: float | None = None
-    T_scene_object: Matrix | None = None
-    T_object_scene: Matrix | None = None
+    T_scene_object: Matrix | None = None  # type: ignore[assignment]
+    T_object_scene: Matrix | None = None  # type: ignore[assignment]
     source: str | None = None
 
 
-class Result(Document):
-    """What a registration or a search found. Transforms are (4, 4) arrays, x -> s R x + t.
+class Result(Document, ResultDocument):
+    """What a registration or a search found: the members of ``regnf_core.document.ResultDocument``, and those below.
 
-    job: its id · object: SHA-256 of the object's field · source: the object as the caller named it.
+    Transforms are (4, 4) arrays, x -> s R x + t · center_scene: (3,) · covariance: (7, 7) · job: its id · source: the
+    object as the caller named it.
     """
 
     job: str
-    verdict: Verdict
-    verdict_reason: str
-    verdict_detail: str = ""
-    verdict_hint: str = ""
-    probability: float | None = None
-    """That the pose, or one of the alternatives that place nearly the same surface, is right, 0..1: what the option
-    ``min_probability`` is compared with. None from the preset `paper`."""
-    T_scene_object: Matrix
-    """The object's pose in the scene."""
-    T_object_scene: Matrix
-    center_scene: Array | None = None
-    """(3,), scene frame: where the object's center is."""
-    uncertainty: dict[str, Any] | None = None
-    """One standard deviation: ``center_scene``, scene units, ``rotation_deg``, ``scale_percent``."""
-    alternatives: list[Alternative] = []
-    covariance: Array | None = None
-    """(7, 7), in the order of ``covariance_ordering``; docs/api.md says what it is of."""
-    covariance_ordering: list[str] | None = None
-    metrics: dict[str, float | None] = {}
-    object: str | None = None
+    T_scene_object: Matrix  # type: ignore[assignment]
+    T_object_scene: Matrix  # type: ignore[assignment]
+    center_scene: Array | None = None  # type: ignore[assignment]
+    covariance: Array | None = None  # type: ignore[assignment]
+    alternatives: list[Alternative] = []  # type: ignore[assignment]
+    candidates: list[Candidate] | None = None  # type: ignore[assignment]
+    artifacts: list[Artifact] = []  # type: ignore[assignment]
     source: str | None = None
-    candidates: list[Candidate] | None = None
-    seed: int = 0
-    options: dict[str, Any] = {}
-    artifacts: list[Artifact] = []
     document: dict[str, Any] = MemberField(default={}, exclude=True)
     """The same as the service sends it, plain (JSON) values."""
 
@@ -224,8 +194,6 @@ class BatchOutcome:
 
 # A job's server-sent events: lines become events.
 
-TERMINAL = frozenset({"successful", "failed", "dismissed"})
-
 
 class EventReader:
     """Takes a stream's lines; of each blank line an event may come. Knows where a new connection would go on."""
@@ -255,5 +223,5 @@ class EventReader:
             return None
         event = Event(id=lines.get("id", ""), name=lines.get("event", "message"), data=json.loads(lines["data"]))
         self.last_id = event.id or self.last_id
-        self.ended = event.data.get("status") in TERMINAL
+        self.ended = event.data.get("status") in FINISHED
         return event

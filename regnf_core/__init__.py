@@ -18,6 +18,7 @@ from regnf_core.version import __version__
 
 if TYPE_CHECKING:
     from regnf_core.api import BatchOutcome, Registered, Search, compose, register, register_batch, render, search
+    from regnf_core.document import RegistrationResult
     from regnf_core.editing.edits import Insertion, Removal, Replacement, Substitution
     from regnf_core.errors import RegnfError
     from regnf_core.fields.observation import SdfField
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from regnf_core.options import RegistrationOptions
     from regnf_core.rendering.camera import Camera
     from regnf_core.rendering.request import RenderOptions
-    from regnf_core.result import RegistrationResult
     from regnf_core.robust.pipeline import WarmStart
 
 _HOMES = {
@@ -39,7 +39,7 @@ _HOMES = {
     "OrientedBox": "regnf_core.geometry.box",
     "Registered": "regnf_core.api",
     "RegistrationOptions": "regnf_core.options",
-    "RegistrationResult": "regnf_core.result",
+    "RegistrationResult": "regnf_core.document",
     "RegnfError": "regnf_core.errors",
     "Removal": "regnf_core.editing.edits",
     "RenderOptions": "regnf_core.rendering.request",

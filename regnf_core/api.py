@@ -20,6 +20,7 @@ import regnf_core.batch as engine_batch
 import regnf_core.library as engine
 from regnf_core.batch import ModeledObject
 from regnf_core.detections.parsing import BoxLike, detection_of
+from regnf_core.document import Candidate, ProgressCallback, RegistrationResult, result_document
 from regnf_core.editing.compose import compose as engine_compose
 from regnf_core.editing.edited_scene import EditedScene
 from regnf_core.editing.edits import Edit
@@ -37,8 +38,9 @@ from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import FieldSource, Role, find_source
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.metrics import uncertainty
 from regnf_core.in_memory import FieldWarning, HasGeometry, HasPoints, HasVertices, field_of
-from regnf_core.library import Candidate, LibraryObject, model_object, search_library
+from regnf_core.library import LibraryObject, model_object, search_library
 from regnf_core.loading import import_smallest_first, load_field
 from regnf_core.object_models import object_model
 from regnf_core.options import OptionsLike, RobustOptions, options_of, seed_of
@@ -46,10 +48,9 @@ from regnf_core.pairs import pairs_of
 from regnf_core.rendering.camera import Camera, Frame
 from regnf_core.rendering.render import render as engine_render
 from regnf_core.rendering.request import RenderOptions
-from regnf_core.result import ProgressCallback, RegistrationResult
 from regnf_core.robust.pipeline import WarmStart
 from regnf_core.texts import json_value
-from regnf_core.viewing.document import result_document, uncertainty, write_artifacts
+from regnf_core.viewing.artifacts import write_artifacts
 from regnf_core.viewing.recording import write_recording
 from regnf_core.viewing.registration_picture import registration_picture, show
 

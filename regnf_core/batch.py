@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+from regnf_core.document import Phase, ProgressCallback, RegistrationResult, Run
 from regnf_core.errors import CancelledError, RegnfError
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.pairs import pairs_of
-from regnf_core.result import Phase, ProgressCallback, RegistrationResult, Run
 from regnf_core.robust.model import ObjectModel, model_object
 from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
 from regnf_core.robust.scene import SceneView, view_scene

@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
+from regnf_core.document import STARTS, Candidate, ProgressCallback, RegistrationResult, Run
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.paper import pipeline as paper
-from regnf_core.result import STARTS, ProgressCallback, RegistrationResult, Run, Verdict
 from regnf_core.robust.library_search import (
     CoarseMatch,
     LibraryQuery,
@@ -33,8 +31,6 @@ from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust,
 from regnf_core.robust.scene import view_scene
 from regnf_core.surface.result_clouds import with_clouds
 
-Stage = Literal["refined", "coarse", "signature"]
-
 
 @dataclass(frozen=True, eq=False)
 class LibraryObject:
@@ -43,28 +39,6 @@ class LibraryObject:
     name: str
     field: Callable[[], SdfField]
     model: ObjectModel
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """What a search tells about one object.
-
-    stage: the last stage that it reached · score: 0..1, smaller is better, comparable only within a stage. Verdict,
-    reason, transform and probability are those of a registration, for ``refined`` objects; None for the others.
-    """
-
-    name: str
-    stage: Stage
-    score: float
-    verdict: Verdict | None = None
-    verdict_reason: str | None = None
-    T_object_scene: Sim3 | None = None
-    probability: float | None = None
-
-    @property
-    def T_scene_object(self) -> Sim3 | None:
-        """The object's pose in the scene; None for the others."""
-        return None if self.T_object_scene is None else self.T_object_scene.inverse()
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.document import IterationRecord
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import SdfField, differentiable_signed_distance
 from regnf_core.geometry.metrics import NearestNeighbors, euler_from_rotation, rotation_from_euler
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import OptimizationOptions, RegistrationOptions, ResamplingOptions
-from regnf_core.result import IterationRecord
 
 # Barron's general and adaptive robust kernel ("A General and Adaptive Robust Loss Function", CVPR 2019).
 #

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from regnf_core.document import STARTS, IterationRecord, RegistrationResult, Run, Verdict
 from regnf_core.errors import InitializationError, NoSurfaceError
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import CountingField, SdfField
@@ -19,7 +20,6 @@ from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, InitializationOptions, RegistrationOptions, SamplingOptions
 from regnf_core.paper.optimization import Refinement, refine
 from regnf_core.paper.sampling import in_detection, sample_object, sample_scene
-from regnf_core.result import STARTS, IterationRecord, RegistrationResult, Run, Verdict
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
 from regnf_core.surface.result_clouds import mean_residual, object_residuals, scene_residuals
 from regnf_core.surface.sphere_tracing import surface_bounds

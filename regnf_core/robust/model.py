@@ -14,12 +14,12 @@ from safetensors.torch import save
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
+from regnf_core.document import ObjectSymmetry
 from regnf_core.errors import FieldFormatError, atomic_path
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
-from regnf_core.result import ObjectSymmetry
 from regnf_core.robust.constants import MODEL, SIGNATURE
 from regnf_core.robust.refine.levenberg_marquardt import RefinementContext, Settings, coarse_to_fine, minimize
 from regnf_core.robust.refine.loss import disagreement

@@ -1,7 +1,4 @@
-"""The preset `robust` as one call: sample both surfaces, search, refine on the fields, evaluate.
-
-What each step does stands in docs/robust.md.
-"""
+"""The preset `robust` as one call, in seven steps. What each does stands in docs/robust.md."""
 
 from __future__ import annotations
 
@@ -12,18 +9,18 @@ from itertools import count
 import torch
 from torch import Tensor
 
+from regnf_core.document import STARTS, IterationRecord, RegistrationResult, Run
 from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import STARTS, IterationRecord, RegistrationResult, Run
 from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
 from regnf_core.robust.constants.model import Stage
 from regnf_core.robust.model import ObjectModel, SelfSymmetry, model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.refine.levenberg_marquardt import Descent, RefinementContext, coarse_to_fine
+from regnf_core.robust.refine.levenberg_marquardt import RefinementContext, coarse_to_fine
 from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.scene import SceneView, view_scene
@@ -39,10 +36,188 @@ from regnf_core.robust.search.distance_grid import feature_seeds
 from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates, pose_covariance
 from regnf_core.robust.working_frame import Samples, WorkingFrame, fixed_generator
 
-# From an evaluation to the result that callers get, in the fields' own frames.
-
 _GEMAN_MCCLURE = -2.0
 """The Geman-McClure kernel as the shape of Barron's general kernel (CVPR 2019)."""
+ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, *REFINEMENT.last_stages))
+"""Of the refinement on the fields."""
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """What is known before a registration with the preset `robust`.
+
+    T_object_scene: its neighborhood is searched first, everything else only if that ends in a rejection or in an answer
+    less likely than 0.95 · object_model: what ``model_object`` made of the object's field earlier; saves making it
+    again.
+    """
+
+    T_object_scene: Sim3 | None = None
+    object_model: ObjectModel | None = None
+
+
+def register_robust(
+    scene_field: SdfField,
+    object_field: SdfField,
+    detection: OrientedBox,
+    options: RegistrationOptions,
+    seed: int,
+    run: Run,
+    warm_start: WarmStart | None = None,
+    scene_view: SceneView | None = None,
+) -> RegistrationResult:
+    """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
+
+    ``scene_view`` saves making one; it must be of this scene, box and options.
+    The work is done on the device of the scene's field. Random numbers are drawn on the CPU, whatever the device.
+    Deterministic for a seed, on one machine and with the same number of threads.
+    Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
+    """
+    known = warm_start or WarmStart()
+    scene, obj = CountingField(scene_field), CountingField(object_field)
+    generator = torch.Generator().manual_seed(seed)
+    with run.phase("sampling"):
+        # 1. Surface points of the scene in the box.
+        view = scene_view or view_scene(scene_field, detection, options.robust)
+        # 2. Surface points of the object, and its symmetries.
+        model = known.object_model or model_object(obj, options.robust)
+        problem = make_problem(view, model, scene, obj, options.robust)
+    evaluation: Evaluation | None = None
+    for start in _starts(problem, options, seed, generator, known.T_object_scene):
+        # 3. Seeds: around a given pose; else from the two shapes and the box; else from matched features too.
+        with run.phase("initializing"):
+            # 4. Search: where the seeds lead to on distance grids. No field is evaluated.
+            searched = search_poses(problem.view, problem.model, start.seeds, generator, problem.bound, start.stages)
+        with run.phase("optimizing"):
+            # 5. Refinement of the best poses, and of their symmetric equivalents, on the fields.
+            poses = Sim3.cat([searched.T, start.given])
+            refined = refine_poses(problem, poses, generator, _progress_of_steps(run))
+        with run.phase("verifying"):
+            # 6. Verdict on held-out samples. A pose is compared with all that earlier starts led to.
+            evaluation = _evaluated(evaluation, problem, refined, options)
+        if not evaluation.doubtful:
+            break
+    assert evaluation is not None  # there is always a start
+    # 7. Covariance, and all of it in the fields' own frames.
+    evaluations = view.evaluations + scene.evaluations + obj.evaluations
+    return result_of(problem, evaluation, options, seed, evaluations)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """What an attempt begins with. seeds: (H,) · given: what is refined whatever the search finds, (1,) or (0,) ·
+    stages: of the search."""
+
+    seeds: Sim3
+    given: Sim3
+    stages: Sequence[Stage] = SEARCH.stages
+
+
+def _starts(
+    problem: RegistrationProblem,
+    options: RegistrationOptions,
+    seed: int,
+    generator: torch.Generator,
+    T_known: Sim3 | None,
+) -> Iterator[_Start]:
+    """Slower ways where the faster ones before fail or leave doubt, each made when its turn comes."""
+    view, model, device = problem.view, problem.model, problem.view.foreground.points.device
+    if T_known is not None:
+        near = problem.in_working_frames(T_known).on(device)
+        yield _Start(seed_poses_around(near, generator), near.expand(1))
+    seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
+    yield _Start(seeds, seeds[:0])
+    if options.robust.feature_draws:
+        matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
+        yield _Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
+
+
+def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
+    """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
+    box, device = view.detection, view.foreground.points.device
+    return seed_poses(
+        view.foreground.on_surface(),
+        model.samples.on_surface(),
+        box.rotation.to(device),
+        (box.size / box.diagonal).to(device),
+        rotations.to(device),
+        torch.tensor(SEARCH.scale_factors, device=device),
+        scale,
+    )
+
+
+def search_poses(
+    view: SceneView,
+    model: ObjectModel,
+    seeds: Sim3,
+    generator: torch.Generator,
+    bound: PoseBound,
+    stages: Sequence[Stage] = SEARCH.stages,
+) -> PoseCandidates:
+    """The best poses that the seeds (H,) lead to, best first, from the samples alone: no field is evaluated.
+
+    bound: what is known of a pose. Seeds that it does not admit, loosened, are left out, unless it admits none.
+    """
+    seeds = bound.scale.limited_poses(seeds)
+    near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
+    seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
+    grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
+    context = RefinementContext(
+        model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
+    )
+    return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
+
+
+def refine_poses(
+    problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
+) -> PoseCandidates:
+    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them for the last stages. Best
+    first.
+
+    ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
+    """
+    bound, offset = problem.bound, problem.view.max_offset
+    context = RefinementContext(
+        problem.model.extremal_points, generator, bound.scale, offset, on_step, bound.admits, bound.penalty
+    )
+    start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
+    found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
+    # The last stages' samples are the same for every seed: the same optimum is met at the same place.
+    last = replace(context, generator=fixed_generator())
+    return coarse_to_fine(problem.fit, _with_equivalents(problem, found), REFINEMENT.last_stages, last)
+
+
+def _with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
+    """The candidates, and the best one's symmetry equivalents that are not among them."""
+    equivalents = _missing_equivalents(found.T, problem.model.symmetry, problem.model.extremal_points)
+    origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
+    origins = origins.where(origins < len(found), 0)
+    return replace(found[origins], T=Sim3.cat([found.T, equivalents]))
+
+
+def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
+    """The best pose (the first of T) under each of the object's symmetries, without those that T holds already."""
+    if len(symmetry.T) == 0:
+        return T[:0]
+    equivalents = symmetry.T @ T[:1]
+    nearest = torch.stack([displacement(equivalents, one, points) for one in T]).amin(0)
+    return equivalents[nearest > REFINEMENT.same_pose]
+
+
+def _evaluated(
+    last: Evaluation | None, problem: RegistrationProblem, refined: PoseCandidates, options: RegistrationOptions
+) -> Evaluation:
+    """The evaluation of these candidates and of those of the ``last`` attempt, which has those of all before."""
+    if last is None:
+        return evaluate_candidates(problem, refined, options)
+    candidates = PoseCandidates.cat([last.candidates.to(refined.scores.device), refined])
+    return evaluate_candidates(problem, candidates, options, last.held_out)
+
+
+def _progress_of_steps(run: Run) -> Callable[[], None]:
+    """What to call after each iteration: reports the share done, and lets the caller cancel."""
+    taken = count(1)
+    span = STARTS["verifying"] - STARTS["optimizing"]
+    return lambda: run.report("optimizing", STARTS["optimizing"] + span * next(taken) / ITERATIONS)
 
 
 def result_of(
@@ -94,236 +269,9 @@ def _record(problem: RegistrationProblem, iteration: int, step: Step, winner: in
     )
 
 
-ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, *REFINEMENT.last_stages))
-"""Of the refinement on the fields."""
-
-
-@dataclass(frozen=True, eq=False)
-class WarmStart:
-    """What is known before a registration with the preset `robust`.
-
-    T_object_scene: its neighborhood is searched first, everything else only if that ends in a rejection or in an answer
-    less likely than 0.95 · object_model: what ``model_object`` made of the object's field earlier; saves making it
-    again.
-    """
-
-    T_object_scene: Sim3 | None = None
-    object_model: ObjectModel | None = None
-
-
-def register_robust(
-    scene_field: SdfField,
-    object_field: SdfField,
-    detection: OrientedBox,
-    options: RegistrationOptions,
-    seed: int,
-    run: Run,
-    warm_start: WarmStart | None = None,
-    scene_view: SceneView | None = None,
-) -> RegistrationResult:
-    """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
-
-    ``scene_view`` saves making one; it must be of this scene, box and options.
-    The work is done on the device of the scene's field. Random numbers are drawn on the CPU, whatever the device.
-    Deterministic for a seed, on one machine and with the same number of threads.
-    Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
-    """
-    known = warm_start or WarmStart()
-    scene, obj = CountingField(scene_field), CountingField(object_field)
-    generator = torch.Generator().manual_seed(seed)
-    with run.phase("sampling"):
-        view = scene_view or view_scene(scene_field, detection, options.robust)
-        model = known.object_model or model_object(obj, options.robust)
-        problem = make_problem(view, model, scene, obj, options.robust)
-    best = _best_attempt(problem, options, seed, run, generator, known.T_object_scene)
-    evaluations = view.evaluations + scene.evaluations + obj.evaluations
-    return result_of(problem, best, options, seed, evaluations)
-
-
 def cloud_region(detection: OrientedBox) -> Callable[[Tensor], Tensor]:
     """What says which points (N, 3) of the scene may belong to a result's clouds, (N,) bool.
 
     Those in the detection box, grown a little. No ground is removed: which way is up need not be known.
     """
     return lambda points: detection.contains(points, SAMPLING.cloud_margin)
-
-
-def search_poses(
-    view: SceneView,
-    model: ObjectModel,
-    seeds: Sim3,
-    generator: torch.Generator,
-    bound: PoseBound,
-    stages: Sequence[Stage] = SEARCH.stages,
-) -> PoseCandidates:
-    """The best poses that the seeds (H,) lead to, best first, from the samples alone: no field is evaluated.
-
-    bound: what is known of a pose.
-    """
-    start = search_start(view, model, seeds, generator, bound)
-    return coarse_to_fine(start.surfaces, start.candidates, stages, start.context)
-
-
-def search_start(
-    view: SceneView, model: ObjectModel, seeds: Sim3, generator: torch.Generator, bound: PoseBound
-) -> Descent:
-    """What the search begins with: the seeds (H,) that the bound, loosened, admits, on distance grids."""
-    seeds = bound.scale.limited_poses(seeds)
-    near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
-    seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
-    grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
-    context = RefinementContext(
-        model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
-    )
-    return Descent(grids, PoseCandidates.start(seeds), context)
-
-
-def refine_poses(
-    problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
-) -> PoseCandidates:
-    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them for the last stages. Best
-    first.
-
-    ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
-    """
-    start = refinement_start(problem, T, generator, on_step)
-    found = coarse_to_fine(start.surfaces, start.candidates, REFINEMENT.stages, start.context)
-    last = last_descent(problem, start, found)
-    return coarse_to_fine(last.surfaces, last.candidates, REFINEMENT.last_stages, last.context)
-
-
-def refinement_start(
-    problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
-) -> Descent:
-    """What the refinement begins with: poses T (H,), on the fields."""
-    bound = problem.bound
-    context = RefinementContext(
-        problem.model.extremal_points,
-        generator,
-        bound.scale,
-        problem.view.max_offset,
-        on_step=on_step,
-        admits=bound.admits,
-        penalty=bound.penalty,
-    )
-    start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
-    return Descent(problem.fit, start, context)
-
-
-def last_descent(problem: RegistrationProblem, start: Descent, found: PoseCandidates) -> Descent:
-    """What the last stages begin with: what was found and its equivalents. Their samples are the same for every seed:
-    the same optimum is met at the same place."""
-    context = replace(start.context, generator=fixed_generator())
-    return Descent(start.surfaces, _with_equivalents(problem, found), context)
-
-
-def _with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
-    """The candidates, and the best one's symmetry equivalents that are not among them."""
-    equivalents = _missing_equivalents(found.T, problem.model.symmetry, problem.model.extremal_points)
-    origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
-    origins = origins.where(origins < len(found), 0)
-    return replace(found[origins], T=Sim3.cat([found.T, equivalents]))
-
-
-def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
-    """The best pose (the first of T) under each of the object's symmetries, without those that T holds already."""
-    if len(symmetry.T) == 0:
-        return T[:0]
-    equivalents = symmetry.T @ T[:1]
-    nearest = torch.stack([displacement(equivalents, one, points) for one in T]).amin(0)
-    return equivalents[nearest > REFINEMENT.same_pose]
-
-
-def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
-    """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
-    box, device = view.detection, view.foreground.points.device
-    return seed_poses(
-        view.foreground.on_surface(),
-        model.samples.on_surface(),
-        box.rotation.to(device),
-        (box.size / box.diagonal).to(device),
-        rotations.to(device),
-        torch.tensor(SEARCH.scale_factors, device=device),
-        scale,
-    )
-
-
-def _best_attempt(
-    problem: RegistrationProblem,
-    options: RegistrationOptions,
-    seed: int,
-    run: Run,
-    generator: torch.Generator,
-    T_start: Sim3 | None,
-) -> Evaluation:
-    """Around a given start, else from the shapes, else thoroughly and from feature matches too: slower ways where
-    others fail or leave doubt. What earlier attempts found stays among the candidates: a pose is compared with all of
-    them."""
-    starts = starts_of(problem, options, seed, generator, T_start)
-    best = _attempt(problem, next(starts), [], options, run, generator)
-    while best.doubtful and (start := next(starts, None)) is not None:
-        best = _attempt(problem, start, [best], options, run, generator)
-    return best
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """What an attempt begins with. seeds: (H,) · given: what is refined whatever the search finds, (1,) or (0,) ·
-    stages: of the search."""
-
-    seeds: Sim3
-    given: Sim3
-    stages: Sequence[Stage] = SEARCH.stages
-
-
-def starts_of(
-    problem: RegistrationProblem,
-    options: RegistrationOptions,
-    seed: int,
-    generator: torch.Generator,
-    T_start: Sim3 | None,
-) -> Iterator[Start]:
-    """One attempt after another, each made when its turn comes."""
-    view, model, device = problem.view, problem.model, problem.view.foreground.points.device
-    if T_start is not None:
-        start = problem.in_working_frames(T_start).on(device)
-        yield Start(seed_poses_around(start, generator), start.expand(1))
-    seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
-    yield Start(seeds, seeds[:0])
-    if options.robust.feature_draws:
-        matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-        yield Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
-
-
-def _attempt(
-    problem: RegistrationProblem,
-    start: Start,
-    earlier: Sequence[Evaluation],
-    options: RegistrationOptions,
-    run: Run,
-    generator: torch.Generator,
-) -> Evaluation:
-    with run.phase("initializing"):
-        candidates = search_poses(problem.view, problem.model, start.seeds, generator, problem.bound, start.stages)
-    with run.phase("optimizing"):
-        refined = refine_poses(problem, Sim3.cat([candidates.T, start.given]), generator, _progress_of_steps(run))
-    with run.phase("verifying"):
-        return evaluate_with(earlier, problem, refined, options)
-
-
-def evaluate_with(
-    earlier: Sequence[Evaluation], problem: RegistrationProblem, refined: PoseCandidates, options: RegistrationOptions
-) -> Evaluation:
-    """The evaluation of these candidates and of those of the last of the ``earlier`` attempts, which has all before."""
-    if not earlier:
-        return evaluate_candidates(problem, refined, options)
-    last = earlier[-1]
-    candidates = PoseCandidates.cat([last.candidates.to(refined.scores.device), refined])
-    return evaluate_candidates(problem, candidates, options, last.held_out)
-
-
-def _progress_of_steps(run: Run) -> Callable[[], None]:
-    """What to call after each iteration: reports the share done, and lets the caller cancel."""
-    taken = count(1)
-    span = STARTS["verifying"] - STARTS["optimizing"]
-    return lambda: run.report("optimizing", STARTS["optimizing"] + span * next(taken) / ITERATIONS)

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from regnf_core.document import RegistrationResult
 from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import gaps
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
-from regnf_core.result import RegistrationResult
 
 # Residuals between two fields under a transform. Unlike those of the published loss, they keep the scale.
 #

@@ -5,9 +5,9 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+from regnf_core.document import RegistrationResult
 from regnf_core.errors import RECORDING_SUFFIX, MissingExtraError, atomic_path, made_folder, new_file
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.result import RegistrationResult
 
 
 def write_recording(

@@ -27,11 +27,11 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from torch import Tensor
 
+from regnf_core.document import Considered, ConsideredPose, RegistrationResult
 from regnf_core.errors import InvalidInputError, verdict_hint, verdict_in_words
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.result import Considered, ConsideredPose, RegistrationResult
-from regnf_core.viewing.document import CONTEXT_COLOR
+from regnf_core.viewing.artifacts import CONTEXT_COLOR
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, residual_colors_of
 
 # The texts of a recording: the verdict as Markdown, and what is said of a pose that was judged.

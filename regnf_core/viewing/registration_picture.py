@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from regnf_core.document import RegistrationResult
 from regnf_core.geometry.metrics import gaps
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
-from regnf_core.result import RegistrationResult
 from regnf_core.surface.sphere_tracing import axis_vector
 from regnf_core.viewing.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
 

@@ -11,8 +11,8 @@ import httpx
 import numpy as np
 import pytest
 
+from regnf_core.document import ResultDocument
 from regnf_core.version import ENGINE_REVISION
-from regnf_service.http.schemas.results import ResultDocument
 from tests.contract.live import Live, eventually
 from tests.contract.test_openapi import validator
 from tests.contract.world import assert_refused, field_bytes, sha256

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from regnf_core.document import RegistrationResult
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import RegistrationResult
 from tests.core.analytic import chair, chair_box, chair_pose, room
 
 QUICK = {

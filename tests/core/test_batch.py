@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from regnf_core.batch import ModeledObject, register_batch
+from regnf_core.document import Phase
 from regnf_core.errors import CancelledError, InvalidInputError, InvalidOptionsError
 from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.library import model_object, register
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import Phase
 from tests.core.analytic import chair, chair_pose, room, table
 from tests.core.robust.shapes import ROBUST, detection
 

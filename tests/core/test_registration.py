@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from regnf_core.document import Phase
 from regnf_core.errors import CancelledError, InitializationError, InvalidInputError, InvalidOptionsError
 from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.box import OrientedBox
@@ -17,7 +18,6 @@ from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import WarmStart, model_object, register
 from regnf_core.options import OptimizationOptions, RegistrationOptions
-from regnf_core.result import Phase
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere, table
 from tests.core.conftest import QUICK, ChairRun
 

@@ -30,7 +30,7 @@ def test_the_request_reaches_the_engine(
         written.append(said["fields"])
         return ["result.json"]
 
-    monkeypatch.setattr("regnf_core.viewing.document.write_result", write_result)
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_result", write_result)
     asked: dict[str, Any] = {"seed": 3, "initial_transform": start, "pictures": pictures}
     request = registration_request("a" * 64, "b" * 64, options=RegistrationOptions(), **asked)
     files = Path("scene"), Path("object")
@@ -54,10 +54,10 @@ def test_a_search_makes_clouds_for_its_pictures_alone(
     found = SimpleNamespace(ranking=[SimpleNamespace(name="c" * 64)], result="a result")
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.library.search_library", lambda *_, **how: calls.append(how) or found)
-    monkeypatch.setattr("regnf_core.viewing.ranking_document", lambda *_: [])
-    monkeypatch.setattr("regnf_core.viewing.document.write_result", lambda *_, **__: ["result.json"])
+    monkeypatch.setattr("regnf_core.document.ranking_document", lambda *_: [])
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_result", lambda *_, **__: ["result.json"])
     monkeypatch.setattr("regnf_core.library.with_late_clouds", lambda result, *given: given[:2])
-    monkeypatch.setattr("regnf_core.viewing.document.write_pictures", lambda result, _: list(result))
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_pictures", lambda result, _: list(result))
     request = registration_request("a" * 64, None, options=RegistrationOptions(), pictures=pictures)
     several = [Candidate(sha256 * 64, partial(Path, sha256), "a model") for sha256 in "bc"]
     made = CoreEngine("cpu").search(Path("scene"), several, request, lambda phase, share: None, tmp_path, {})

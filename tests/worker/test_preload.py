@@ -90,7 +90,7 @@ before = set(sys.modules)
 child = os.fork()
 if child == 0:
     from regnf_core.library import register
-    from regnf_core.viewing.document import write_pictures, write_result
+    from regnf_core.viewing.artifacts import write_pictures, write_result
     found = register(room(chair_pose()), chair(), chair_box(chair_pose()))
     write_result(found, Path(sys.argv[1]))
     write_pictures(found, Path(sys.argv[1]))

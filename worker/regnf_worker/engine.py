@@ -150,7 +150,7 @@ class CoreEngine:
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
         from regnf_core.library import WarmStart, register, with_late_clouds
-        from regnf_core.viewing.document import PICTURES, write_pictures, write_result
+        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         _one_thread()
         start, truth = request.initial_transform, request.ground_truth
@@ -177,11 +177,11 @@ class CoreEngine:
         folder: Path,
         notes: Notes,
     ) -> Made:
+        from regnf_core.document import ranking_document
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.library import LibraryObject, search_library, with_late_clouds
-        from regnf_core.viewing import ranking_document
-        from regnf_core.viewing.document import PICTURES, write_pictures, write_result
+        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         _one_thread()
 

@@ -36,7 +36,7 @@ _MODULES = (
     "regnf_worker.engine",
     "regnf_worker.attempt",
     "regnf_core.geometry.box",
-    "regnf_core.viewing",
+    "regnf_core.viewing.artifacts",
     "regnf_core.fields.build",
     "regnf_core.library",
     "regnf_core.library",

@@ -24,13 +24,13 @@ class Settings:
     """What may move, and how the kernel widths are meant.
 
     widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
-    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters, also
-    (H,), one for each pose; 0: the offset stays as it is · normals: whether the loss counts them.
+    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters;
+    0: the offset stays as it is · normals: whether the loss counts them.
     """
 
     widest: float = 0.0
     scale: ScaleBound | ScaleBounds = ANY_SCALE
-    max_offset: float | Tensor = REFINEMENT.max_offset
+    max_offset: float = REFINEMENT.max_offset
     normals: bool = True
 
 
@@ -103,7 +103,7 @@ def _moved_offset(now: Residuals, step: Tensor, settings: Settings) -> Tensor | 
     if now.offset is None:
         return None
     most, moved = settings.max_offset, now.offset + step[:, 7]
-    return moved.clamp(-most, most)  # type: ignore[arg-type]  # two numbers or two tensors
+    return moved.clamp(-most, most)
 
 
 def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
@@ -124,9 +124,7 @@ def _step(
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest
-    if isinstance(settings.max_offset, Tensor):
-        extra[:, 7:] += REFINEMENT.fixed_damping * (settings.max_offset == 0.0).to(extra)[:, None]
-    elif settings.max_offset == 0.0:
+    if settings.max_offset == 0.0:
         extra[:, 7:] += REFINEMENT.fixed_damping
     step = _solved(H + torch.diag_embed(extra), -b, scale.double(), settings.scale)
     longest = step.abs().amax(-1, keepdim=True)
@@ -174,36 +172,21 @@ class RefinementContext:
     penalty: Callable[[Sim3], Tensor] = lambda T: torch.zeros_like(T.scale)
 
 
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """A pair of surfaces, its pose candidates, and the context: what goes through the stages."""
-
-    surfaces: SurfacePair
-    candidates: PoseCandidates
-    context: RefinementContext
-
-    def prepared(self, stage: Stage) -> Descent:
-        """With the copies that the stage asks for, and its samples of the surfaces."""
-        candidates, context = self.candidates, self.context
-        if stage.copies:
-            candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
-            candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
-        return Descent(self.surfaces.subsample(stage.points, context.generator), candidates, context)
-
-
 def coarse_to_fine(
     surfaces: SurfacePair, candidates: PoseCandidates, stages: Sequence[Stage], context: RefinementContext
 ) -> PoseCandidates:
     """The candidates that are left after all stages, best first."""
     for stage in stages:
-        ready = Descent(surfaces, candidates, context).prepared(stage)
-        numbers = torch.arange(len(ready.candidates), device=candidates.scores.device)
+        if stage.copies:
+            candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
+            candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
+        few = surfaces.subsample(stage.points, context.generator)
         parts = []
-        for part in torch.split(numbers, SEARCH.batch):
-            some = ready.candidates[part]
+        for part in torch.split(torch.arange(len(candidates), device=candidates.scores.device), SEARCH.batch):
+            some = candidates[part]
             scale = ScaleBounds.same(some.T) if stage.keeps_scale else context.scale
             settings = Settings(stage.widest, scale, context.max_offset, stage.normals)
-            done = refined(ready.surfaces, some, stage, settings, context.on_step)
+            done = refined(few, some, stage, settings, context.on_step)
             parts.append(replace(done, scores=done.scores + context.penalty(done.T)))
         candidates = PoseCandidates.cat(parts)
         left = survivors(candidates, context.admits(candidates.T), stage, context.extremal_points)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.document import Alternative, Considered, ConsideredPose, Verdict
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions, RobustOptions
-from regnf_core.result import Alternative, Considered, ConsideredPose, Verdict
 from regnf_core.robust.constants import REFINEMENT, RELATION, VERDICT
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.loss import adaptive_width

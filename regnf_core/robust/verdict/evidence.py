@@ -46,7 +46,7 @@ class Evidence:
     offsets: Tensor
     """How much farther out the scene's surface lies than the object's."""
     scene_signs: Tensor
-    """(H, N) uint8, see :class:`regnf_core.result.Considered`."""
+    """(H, N) uint8, see :class:`regnf_core.document.Considered`."""
     object_signs: Tensor
     """(H, M) uint8, likewise."""
     partial: bool = False

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from regnf_core.document import RegistrationResult
 from regnf_core.fields.composite import TransformedField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import RegistrationResult
 from tests.core.analytic import AnalyticField, boxes, chair, chair_box, chair_pose, room, seen_from, union
 
 ROBUST = RegistrationOptions(preset="robust")

@@ -9,9 +9,9 @@ import pytest
 
 import regnf
 from regnf_core import RegistrationOptions, RegistrationResult, WarmStart, register, register_batch
+from regnf_core.document import result_document
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import LibraryObject, model_object, search_library
-from regnf_core.viewing import result_document
 from tests.core.analytic import chair, chair_box, chair_pose, room, table
 from tests.core.robust.shapes import slab_table, table_room
 from tests.golden.cases import SLAB_BOX

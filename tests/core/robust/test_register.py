@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
+from regnf_core.document import RegistrationResult
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import WarmStart, register
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import RegistrationResult
 from regnf_core.robust import pipeline
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, table

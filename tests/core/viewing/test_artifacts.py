@@ -13,12 +13,11 @@ import torch
 import trimesh
 from PIL import Image
 
+from regnf_core.document import Alternative, Candidate, ObjectSymmetry, ranking_document, result_document
 from regnf_core.errors import VERDICT_REASONS
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.library import Candidate
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import Alternative, ObjectSymmetry
-from regnf_core.viewing import ranking_document, result_document, write_artifacts
+from regnf_core.viewing.artifacts import write_artifacts
 from regnf_core.viewing.registration_picture import _up_axis, residual_colors
 from regnf_core.viewing.splats import Surfels, View, nearest_surfels, render
 from tests.core.conftest import ChairRun

@@ -17,8 +17,8 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 import regnf
+from regnf_core.document import Considered, ConsideredPose
 from regnf_core.errors import MissingExtraError
-from regnf_core.result import Considered, ConsideredPose
 from regnf_core.viewing.recording import write_recording
 from tests.cli.conftest import DATA
 from tests.core.conftest import ChairRun

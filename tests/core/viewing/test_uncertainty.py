@@ -13,10 +13,10 @@ from torch import Tensor
 
 from regnf_core import RegistrationResult, WarmStart, register
 from regnf_core.fields.composite import TransformedField
+from regnf_core.geometry.metrics import center_covariance, uncertainty
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.verdict.covariance import in_object_units
 from regnf_core.robust.working_frame import WorkingFrame
-from regnf_core.viewing.document import center_covariance, uncertainty
 from tests.core.analytic import chair, chair_box, chair_pose, room
 
 POSE = Sim3.from_quaternion(1.6, [0.1, -0.4, 0.2, 0.9], [3.0, -5.0, 2.0])

@@ -8,11 +8,11 @@ from fastapi import APIRouter, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
+from regnf_core.document import ResultDocument
 from regnf_service.concurrency import blocking
 from regnf_service.http.body import CallerDep, PrefixDep, ServicesDep, wait_for
 from regnf_service.http.ranges import IfNoneMatchDep, RangeDep, file_answer
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
-from regnf_service.http.schemas.results import ResultDocument
 from regnf_service.http.schemas.scenes import RenderResultDocument
 from regnf_service.jobs.edits import find_job, manifest_of, result_of
 from regnf_service.problem import Problem

@@ -6,20 +6,11 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from regnf_core.document import AlternativeDocument, Outgoing, TransformDocument, UncertaintyDocument, Verdict
 from regnf_service.batches import COUNTED, BatchState
 from regnf_service.http.query import NEXT_PAGE
 from regnf_service.http.schemas.registrations import RegisterRequest
-from regnf_service.http.schemas.results import (
-    AlternativeDocument,
-    Label,
-    Links,
-    Moment,
-    Outgoing,
-    ProblemDocument,
-    TransformDocument,
-    UncertaintyDocument,
-    Verdict,
-)
+from regnf_service.http.schemas.results import Label, Links, Moment, ProblemDocument
 from regnf_service.times import rfc3339
 from regnf_state.batches import Batch
 from regnf_state.batches import BatchSummary as Summary

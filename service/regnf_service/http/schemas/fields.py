@@ -8,19 +8,10 @@ from pydantic import Field, GetJsonSchemaHandler, TypeAdapter
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from regnf_core.document import Outgoing, Sha256, SymmetryDocument
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.http.query import NEXT_PAGE
-from regnf_service.http.schemas.results import (
-    Incoming,
-    Label,
-    Links,
-    Moment,
-    Outgoing,
-    ProblemDocument,
-    Sha256,
-    SymmetryDocument,
-    outgoing_problem,
-)
+from regnf_service.http.schemas.results import Incoming, Label, Links, Moment, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
 from regnf_state.records import CANDIDATES, DRAWINGS, ORIGINAL_UNTIL, VIEWS, FieldRecord

@@ -9,16 +9,9 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, WithJsonSchema
 
+from regnf_core.document import Outgoing, Sha256, Verdict
 from regnf_service.http.query import NEXT_PAGE
-from regnf_service.http.schemas.results import (
-    Links,
-    Moment,
-    Outgoing,
-    ProblemDocument,
-    Sha256,
-    Verdict,
-    outgoing_problem,
-)
+from regnf_service.http.schemas.results import Links, Moment, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
 from regnf_state.records import ACTIVE, WARNINGS, JobRecord

@@ -7,6 +7,7 @@ from urllib.parse import quote
 
 from pydantic import AfterValidator, Discriminator, Field, StringConstraints, Tag, model_validator
 
+from regnf_core.document import Outgoing, Sha256, SymmetryDocument
 from regnf_core.errors import InvalidInputError
 from regnf_core.library_entries import (
     LABEL_PATTERN,
@@ -21,7 +22,7 @@ from regnf_core.library_entries import (
     text_pattern,
 )
 from regnf_service.http.query import NEXT_PAGE
-from regnf_service.http.schemas.results import Incoming, Links, Moment, Outgoing, Sha256, SymmetryDocument
+from regnf_service.http.schemas.results import Incoming, Links, Moment
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
 from regnf_state.record_store import LibraryEntry

@@ -21,6 +21,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from regnf_core.document import Outgoing, Sha256
 from regnf_core.options import RegistrationOptions
 from regnf_core.rotations import Rows, inverse_rows, normal_quaternion, rotation_columns, similarity_fault
 from regnf_service.http.schemas.detections import Detection
@@ -33,7 +34,7 @@ from regnf_service.http.schemas.library import (
     Named,
     Selected,
 )
-from regnf_service.http.schemas.results import Coordinate, Incoming, Outgoing, Sha256
+from regnf_service.http.schemas.results import Coordinate, Incoming
 from regnf_state.registration_request import RegistrationRequest, recorded_detection
 
 # Similarity transforms as clients send them: a bare 4x4, or the transform object that results carry.

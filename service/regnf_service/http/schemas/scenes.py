@@ -8,12 +8,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Discriminator, Field, StringConstraints, model_validator
 
+from regnf_core.document import ArtifactEntry, Outgoing
 from regnf_core.editing.request import MOST_EDITS, Axis, Name, Residual
 from regnf_core.rendering.request import OrbitRequest, Output, PoseRequest, RenderOptions, RenderRequest, StationRequest
 from regnf_core.rgb import Rgb
 from regnf_service.http.schemas.detections import Detection
 from regnf_service.http.schemas.registrations import Reference, Similarity, Webhook, rows_of
-from regnf_service.http.schemas.results import ArtifactEntry, Incoming, Outgoing
+from regnf_service.http.schemas.results import Incoming
 
 KINDS = frozenset({"substitution", "replacement", "removal", "insertion"})
 _JobId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,64}$")]

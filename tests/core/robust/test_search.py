@@ -1,4 +1,4 @@
-"""What a detection allows: by hand, for a cube of edge 1 in a box of edge 2, scaled to a diagonal of 1."""
+"""The search: seeds, candidates, bounds, features."""
 
 from __future__ import annotations
 
@@ -7,14 +7,71 @@ import math
 import pytest
 import torch
 
+from regnf_core.fields.composite import TransformedField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.constants import SEARCH
+from regnf_core.robust.model import model_object
 from regnf_core.robust.pipeline import WarmStart
-from regnf_core.robust.search.bounds import PoseBound
+from regnf_core.robust.refine.pose_candidates import PoseCandidates
+from regnf_core.robust.search import bounds
+from regnf_core.robust.search.bounds import PoseBound, super_fibonacci
+from regnf_core.robust.search.distance_grid import feature_seeds
+from regnf_core.robust.working_frame import Samples
+from tests.core.analytic import AnalyticField, sphere, union
 from tests.core.robust.shapes import random_pose, reframed
+
+# Seeds of the search: the same poses, however many are made at once.
+
+
+def poses(points: torch.Tensor) -> torch.Tensor:
+    scales = torch.tensor([0.85, 1.0, 1.18])
+    axes, size = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    return bounds.seed_poses(points, 2.0 * points, axes, size, super_fibonacci(301), scales).matrix()
+
+
+def test_turned_in_parts_objects_have_the_same_extents(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    whole = poses(points)
+    monkeypatch.setattr(bounds, "_POINTS_AT_ONCE", 10_000)
+    assert torch.equal(poses(points), whole)
+    monkeypatch.setattr(bounds, "_POINTS_AT_ONCE", 1)
+    assert poses(points).shape == whole.shape
+
+
+# Copies of pose candidates.
+
+
+def candidates() -> PoseCandidates:
+    poses = Sim3.cat([random_pose(1, 1.0), random_pose(2, 3.0)])
+    return PoseCandidates(poses, torch.tensor([0.1, 0.2]), torch.tensor([0.01, 0.02]))
+
+
+def test_copies_are_about_as_far_off_as_the_spread_says() -> None:
+    own = candidates()
+    found = own.with_copies(400, (0.1, 0.03, 0.05), torch.Generator().manual_seed(0))
+    assert len(found) == 2 * 401
+    torch.testing.assert_close(found.T[:2].matrix(), own.T.matrix(), rtol=0, atol=0)
+    assert found.scores.tolist() == own.scores.tolist() * 401
+    for number in (0, 1):
+        copies = found.T[number + 2 :: 2]
+        growth = (copies.scale / own.T.scale[number]).log()
+        turn = (copies.rotation @ own.T.rotation[number].mT).diagonal(dim1=-2, dim2=-1).sum(-1)
+        angle = ((turn - 1.0) / 2.0).clamp(-1.0, 1.0).acos()
+        assert 0.045 < float(growth.std()) < 0.055
+        assert 0.09 < float((angle.square().mean() / 3.0).sqrt()) < 0.11
+
+
+def test_no_copies_leave_all_as_it_is() -> None:
+    own = candidates()
+    found = own.with_copies(0, (0.1, 0.03, 0.05), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(found.T.matrix(), own.T.matrix(), rtol=0, atol=0)
+
+
+# What a detection allows: by hand, for a cube of edge 1 in a box of edge 2, scaled to a diagonal of 1.
 
 CORNERS = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
 EDGE = 1.0 / math.sqrt(3.0)
@@ -104,3 +161,33 @@ def test_a_flat_boxs_thickness_is_compared_with_more_than_itself() -> None:
     )
     twice = Sim3(true.scale / 2.2, true.rotation, true.translation)
     assert PoseBound.of(box, thick, 0.5).admits(Sim3.cat([true, twice])).tolist() == [True, False]
+
+
+# Feature matches: the pose among them whatever the scale and the frame, and nothing odd where there is nothing.
+
+
+def blob() -> AnalyticField:
+    """Balls of different sizes stuck together: curved differently everywhere. Flat faces would all look alike."""
+    generator = torch.Generator().manual_seed(0)
+    radii = [0.12, 0.16, 0.2, 0.24, 0.1, 0.14, 0.18]
+    return union([sphere(r, (0.6 * torch.rand(3, generator=generator) - 0.3).tolist()) for r in radii])
+
+
+def test_the_pose_is_among_the_seeds_at_any_scale() -> None:
+    pose = random_pose(4, 37.0)
+    one, two = model_object(TransformedField(blob(), pose.inverse())), model_object(blob())
+    truth = two.frame.to_field().inverse() @ pose.inverse() @ one.frame.to_field()
+    found = feature_seeds(one.samples, two.samples, 4, seed=1)
+    assert displacement(found, truth, two.extremal_points).min() < 0.05
+    torch.testing.assert_close(
+        found.rotation @ found.rotation.mT, torch.eye(3).double().expand_as(found.rotation), atol=1e-9, rtol=0
+    )
+    again = feature_seeds(one.samples, two.samples, 4, seed=1)
+    torch.testing.assert_close(again.rotation, found.rotation, rtol=0, atol=0)
+    torch.testing.assert_close(again.scale, found.scale, rtol=0, atol=0)
+
+
+def test_too_small_a_cloud_gives_no_seed() -> None:
+    few = Samples(torch.randn(20, 3), torch.zeros(20), torch.tensor([[0.0, 0.0, 1.0]]).expand(20, 3))
+    assert feature_seeds(few, model_object(blob()).samples, 2, seed=0).scale.numel() == 0
+    assert feature_seeds(few, few, 0, seed=0).scale.numel() == 0

@@ -1,19 +1,82 @@
-"""Surfaces too thick by the same everywhere: told from a larger scale, on exact fields."""
+"""Attempts in turn, a scale that is kept, an offset."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import REFINEMENT
+from regnf_core.library import register
+from regnf_core.robust.constants import REFINEMENT, SEARCH, VERDICT
+from regnf_core.robust.model import model_object
+from regnf_core.robust.pipeline import search_poses
+from regnf_core.robust.problem import make_problem
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.refine.loss import normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.scene import view_scene
+from regnf_core.robust.search.distance_grid import feature_seeds
 from regnf_core.robust.working_frame import sample_object_surface
 from tests.core.analytic import AnalyticField, chair, chair_pose, room
-from tests.core.robust.shapes import detection, run
+from tests.core.robust.shapes import ROBUST, can, detection, placement_error, run
+
+# How often a pose is searched for: once more where the first answer is rejected or leaves doubt.
+
+
+@pytest.fixture
+def thorough(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """One entry for each thorough search, of which feature matches are a part."""
+    searches: list[int] = []
+
+    def counted(*arguments: Any) -> Any:
+        searches.append(1)
+        return feature_seeds(*arguments)
+
+    monkeypatch.setattr("regnf_core.robust.pipeline.feature_seeds", counted)
+    return searches
+
+
+@pytest.mark.parametrize(("doubtful", "more"), [(0.9, 0), (1.0, 1)])
+def test_an_accepted_answer_that_leaves_doubt_is_searched_for_once_more(
+    doubtful: float, more: int, thorough: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("regnf_core.robust.verdict.evaluation.VERDICT", replace(VERDICT, doubtful=doubtful))
+    result = register(room(chair_pose()), chair(), detection(), ROBUST, clouds=False)
+    assert len(thorough) == more
+    assert result.verdict == "registered"
+    assert 0.95 < result.metrics["probability"] < 1.0
+    assert placement_error(result, chair_pose()) < 0.005
+
+
+def test_a_rejected_answer_is_searched_for_once_more(thorough: list[int]) -> None:
+    assert register(room(chair_pose()), can(), detection(), ROBUST, clouds=False).verdict == "rejected"
+    assert thorough == [1]
+
+
+# Stages that keep the poses' scales.
+
+STAGE = replace(SEARCH.stages[1], keep=8, min_distance=0.0)
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_scales_stay_where_the_stage_says_so(keeps: bool) -> None:
+    scene = room(chair_pose())
+    view = view_scene(scene, detection(), ROBUST.robust)
+    one = make_problem(view, model_object(chair()), scene, chair(), ROBUST.robust)
+    steps = 0.05 * torch.randn(6, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    seeds = one.in_working_frames(chair_pose()).expand(6).perturb(steps)
+    stage = replace(STAGE, keeps_scale=keeps)
+    found = search_poses(one.view, one.model, seeds, torch.Generator().manual_seed(0), one.bound, [stage])
+    before, after = seeds.scale.sort().values, found.T.scale.sort().values
+    assert torch.equal(before, after) == keeps
+    assert not torch.equal(seeds.translation.sort(0).values, found.T.translation.sort(0).values)
+
+
+# Surfaces too thick by the same everywhere: told from a larger scale, on exact fields.
 
 D = torch.float64
 

@@ -1,0 +1,166 @@
+"""The files of one registration: result document, history, point clouds, residuals, picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from regnf_core.document import Considered, IterationRecord, RegistrationResult, json_number, result_document
+from regnf_core.field_notes import FieldNotes
+from regnf_core.geometry.metrics import Symmetries
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
+from regnf_core.schema.similarity import local_origin
+from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, registration_picture
+
+# Point clouds as binary little-endian PLY, which every viewer reads.
+
+_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
+
+
+def write_ply(
+    path: Path, points: NDArray[np.float32 | np.float64], normals: NDArray[Any], colors: NDArray[np.uint8]
+) -> None:
+    """Write points (N, 3) in their own precision, unit normals (N, 3) and colors (N, 3), 0 to 255."""
+    columns = {
+        **dict.fromkeys(("x", "y", "z"), "f8" if points.dtype == np.float64 else "f4"),
+        **dict.fromkeys(("nx", "ny", "nz"), "f4"),
+        **dict.fromkeys(("red", "green", "blue"), "u1"),
+    }
+    vertices = np.empty(points.shape[0], dtype=[(name, f"<{code}") for name, code in columns.items()])
+    for name, values in zip(columns, np.hstack([points.astype(np.float64), normals, colors]).T, strict=True):
+        vertices[name] = values
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {vertices.size}",
+        *(f"property {_TYPES[code]} {name}" for name, code in columns.items()),
+        "end_header",
+        "",
+    ]
+    path.write_bytes("\n".join(header).encode("ascii") + vertices.tobytes())
+
+
+def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
+    """One plain entry an iteration: the loss, its parts, the kernel, and T_object_scene as a row-major 4x4 matrix."""
+    return [
+        {
+            "iteration": record.iteration,
+            "loss": json_number(record.loss),
+            "residual_scene": json_number(record.residual_scene),
+            "residual_object": json_number(record.residual_object),
+            "regularizer": json_number(record.regularizer),
+            "kernel_shape": record.kernel_shape,
+            "kernel_scale": record.kernel_scale,
+            "scene_samples": record.scene_samples,
+            "object_samples": record.object_samples,
+            "T_object_scene": {"matrix": record.T_object_scene.matrix().tolist()},
+        }
+        for record in trace
+    ]
+
+
+# The files of one registration, written into a folder.
+
+CONTEXT_COLOR = (0.80, 0.82, 0.85)
+_CLOUDS = ("scene_points.ply", "object_points.ply", "aligned.ply", "residuals.npz")
+_CONTEXT, _PICTURE = "context_points.ply", "preview.png"
+PICTURES = (*_CLOUDS, _CONTEXT, _PICTURE)
+"""What ``write_pictures`` may write."""
+
+
+def write_artifacts(
+    result: RegistrationResult,
+    directory: Path,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    object_name: str | None = None,
+    candidates: list[dict[str, Any]] | None = None,
+    fields: Mapping[str, FieldNotes] | None = None,
+) -> list[str]:
+    """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
+
+    ``truth``, ``symmetries``, ``object_name``, ``candidates`` and ``fields`` are for the result document.
+    """
+    said: dict[str, Any] = {"object_name": object_name, "candidates": candidates, "fields": fields}
+    return write_pictures(result, directory) + write_result(result, directory, truth, symmetries, **said)
+
+
+def write_result(
+    result: RegistrationResult,
+    directory: Path,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    **said: Any,
+) -> list[str]:
+    """What was found: trace.json, T_scene_object.npy (4x4), considered.npz (what the held-out samples say of each pose
+    that was judged, if the result has it), result.json. said: as ``result_document``.
+    """
+    _write_json(directory / "trace.json", trace_document(result.trace))
+    np.save(directory / "T_scene_object.npy", result.T_scene_object.matrix().double().cpu().numpy())
+    document = result_document(result, truth, symmetries, result.scene_samples.points.device, **said)
+    _write_json(directory / "result.json", document)
+    names = ["trace.json", "T_scene_object.npy", "result.json"]
+    if result.considered is not None:
+        _write_considered(directory / "considered.npz", result.considered)
+        names.append("considered.npz")
+    return names
+
+
+def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
+    """What people look at, of a result with clouds.
+
+    scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, colored by
+    source), context_points.ply (the scene around the detection, if the result has it), residuals.npz, preview.png.
+    """
+    scene, obj = result.scene_samples, result.object_samples
+    placed = obj.transformed(result.T_scene_object)
+    _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOR))
+    _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOR))
+    _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))
+    names = list(_CLOUDS)
+    if result.surroundings is not None and len(result.surroundings.points):
+        _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
+        names.append(_CONTEXT)
+    arrays: dict[str, Any] = {name: _numbers(value) for name, value in result.residuals.items()}
+    np.savez(directory / "residuals.npz", **arrays)
+    registration_picture(result).save(directory / _PICTURE)
+    return [*names, _PICTURE]
+
+
+def _write_considered(path: Path, considered: Considered) -> None:
+    """The held-out samples, and what they say of each pose that was judged."""
+    points = {name: _numbers(getattr(considered, name)) for name in ("scene_points", "object_points")}
+    signs = {name: getattr(considered, name).cpu().numpy() for name in ("scene_signs", "object_signs")}
+    arrays: dict[str, Any] = points | signs
+    np.savez(path, **arrays)
+
+
+def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:
+    points = np.concatenate([_numbers(samples.points) for samples, _ in parts])
+    normals = np.concatenate([_numbers(samples.normals) for samples, _ in parts])
+    colors = np.concatenate(
+        [
+            np.tile((255 * np.array(color)).round().astype(np.uint8), (len(samples.points), 1))
+            for samples, color in parts
+        ]
+    )
+    write_ply(path, points, normals, colors)
+
+
+def _write_json(path: Path, values: Any) -> None:
+    path.write_text(json.dumps(values, allow_nan=False, separators=(",", ":")), encoding="utf-8")
+
+
+def _numbers(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32 | np.float64]]:
+    """In single precision, unless they are places too far from the origin for it."""
+    array = values.detach().cpu()
+    far = array.ndim == 2 and len(array) > 0 and local_origin([array.amin(0).tolist(), array.amax(0).tolist()])
+    found: np.ndarray[Any, np.dtype[np.float32 | np.float64]] = (array.double() if far else array.float()).numpy()
+    return found

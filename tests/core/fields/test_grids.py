@@ -1,0 +1,276 @@
+"""Kinds of grids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields import voxel_blocks
+from regnf_core.fields.build import build_field, open_field
+from regnf_core.fields.grid_mlp import OneBlob
+from regnf_core.fields.observation import SdfField, has_color
+from regnf_core.fields.voxel_blocks import CellIndex
+from regnf_core.schema.safe_format import parse_description, write_safe_field
+from regnf_core.schema.tensor_check import TensorSpec
+from tests.core.fields.grids import numeric_gradient, slow_trilinear
+
+# The index of occupied cells: against a search through all of them.
+
+
+def some_cells(count: int, reach: int) -> torch.Tensor:
+    """Distinct cells (count, 3), in no order."""
+    drawn = torch.randint(-reach, reach, (4 * count, 3), generator=torch.Generator().manual_seed(1))
+    return torch.unique(drawn, dim=0)[torch.randperm(count, generator=torch.Generator().manual_seed(2))]
+
+
+def test_every_cell_is_found_and_no_other() -> None:
+    cells = some_cells(60, 8)
+    asked = torch.cartesian_prod(*[torch.arange(-10, 11)] * 3)
+    row, found = CellIndex.of(cells).find(asked)
+    same = (asked[:, None] == cells[None]).all(-1)  # (M, N)
+    assert found.equal(same.any(-1))
+    assert row[found].equal(same.long().argmax(-1)[found])
+
+
+@pytest.mark.parametrize("most", [1 << 18, 200])
+def test_the_nearest_cells_are_near(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """With a table of single cells exactly so; with a coarser one to the cells of the table."""
+    monkeypatch.setattr(voxel_blocks, "_TABLE_CELLS", most)
+    cells = some_cells(60, 8)
+    index = CellIndex.of(cells)
+    assert (index.step == 1) == (most > 16**3)
+    asked = torch.cartesian_prod(*[torch.arange(-8, 8)] * 3)
+    asked = asked[((asked >= cells.amin(0)) & (asked <= cells.amax(0))).all(-1)]
+    distance = torch.cdist(asked.float(), cells.float())
+    nearest = distance.sort(dim=-1).values[:, :4]
+    found = distance.gather(1, index.nearest(asked))
+    slack = 3**0.5 * (index.step - 1)
+    assert (found <= nearest + slack + 1e-5).all()
+    assert index.nearest(torch.tensor([[1000, -1000, 3]])).shape == (1, 4)
+
+
+def test_few_cells_far_apart_take_little_memory() -> None:
+    cells = torch.tensor([[-1_000_000, 0, 0], [0, 1_000_000, 0], [3, 4, 1_000_000]])
+    index = CellIndex.of(cells)
+    assert index.table.numel() <= 3 << 18
+    row, found = index.find(cells)
+    assert found.all()
+    assert row.tolist() == [0, 1, 2]
+    moved = index.to("cpu")
+    assert moved.find(cells[1:])[0].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        torch.zeros(0, 3),
+        torch.tensor([[1, 2, 3], [1, 2, 3]]),
+        torch.tensor([[1 << 20, 0, 0]]),
+        torch.tensor([[-(1 << 63), 0, 0]]),
+    ],
+)
+def test_faulty_cells_are_refused(cells: torch.Tensor) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        CellIndex.of(cells)
+    assert caught.value.reason == "FIELD_INDEX_INVALID"
+
+
+# The kind grid_network: its one-blob encoding against integrals, its gradients against differences.
+
+GRID = {"levels": 3, "features_per_level": 2, "log2_table_size": 9, "base_resolution": 4, "per_level_scale": 2.0}
+ENTRIES = 64 + 512 + 512
+BOX = [[-1.0, -2.0, 0.5], [1.0, 1.0, 4.0]]
+
+
+def share_of_bins(x: float, bins: int) -> np.ndarray:
+    """By sums over a fine division of the ring: what of the bump about x falls into each bin."""
+    fine = (np.arange(bins * 4000) + 0.5) / (bins * 4000)
+    away = (fine - x + 0.5) % 1.0 - 0.5
+    bump = 15 / 16 * np.clip(1 - (bins * away) ** 2, 0, None) ** 2 / 4000
+    return np.asarray(bump.reshape(bins, -1).sum(axis=1))
+
+
+@pytest.mark.parametrize("bins", [2, 5, 16])
+def test_the_one_blob_encoding_is_the_integral_of_its_bump(bins: int) -> None:
+    points = np.random.default_rng(bins).uniform(0, 1, (20, 3))
+    points[0] = (0.0, 0.5, 1.0)
+    encoded = OneBlob(bins).encode(torch.tensor(points))
+    assert encoded.shape == (20, 3 * bins)
+    for point, row in zip(points, encoded, strict=True):
+        expected = np.concatenate([share_of_bins(x, bins) for x in point])
+        assert np.abs(row.numpy() - expected).max() < 1e-6
+        assert float(row.sum()) == pytest.approx(3.0)
+
+
+def test_the_one_blob_encoding_s_gradient() -> None:
+    at = torch.rand(30, 3, dtype=torch.float64, requires_grad=True)
+    weights = torch.randn(30, 24, dtype=torch.float64)
+    (expected,) = torch.autograd.grad((OneBlob(8).encode(at) * weights).sum(), at)
+    assert torch.allclose(OneBlob(8).pull_back(at.detach(), weights), expected)
+
+
+def described(**changed: Any) -> dict[str, Any]:
+    values = {"kind": "grid_network", "bounds": BOX, "hash": GRID, "grid_box": BOX, "one_blob_bins": 4}
+    return values | {"positional_encoding": {"degree": 2}, "skip_layer": 2} | changed
+
+
+def tensors(width: int, skip: int | None) -> dict[str, torch.Tensor]:
+    source = torch.Generator().manual_seed(1)
+    inputs = [width, 16, 16 + (width if skip == 2 else 0)]
+    made = {"hash_table": torch.randn(ENTRIES, 2, generator=source)}
+    for i, (columns, rows) in enumerate(zip(inputs, (16, 16, 1), strict=True)):
+        made[f"layers.{i}.weight"] = torch.randn(rows, columns, generator=source) / columns**0.5
+        made[f"layers.{i}.bias"] = torch.randn(rows, generator=source)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("changed", "width", "skip"),
+    [({}, 33, 2), ({"one_blob_bins": 0, "activation": "relu"}, 21, 2), ({"skip_layer": None}, 33, None)],
+)
+def test_gradients(changed: dict[str, Any], width: int, skip: int | None) -> None:
+    """Within the box, where it ends, and beyond it, where the field is carried on."""
+    field = build_field(parse_description(described(**changed)), tensors(width, skip))
+    points = torch.tensor(np.random.default_rng(2).uniform([-1.5, -2.5, 0], [1.5, 1.5, 4.5], (60, 3))).float()
+    values, gradients = field.signed_distance_and_gradient(points)
+    assert torch.allclose(values, field.signed_distance(points), atol=1e-5)
+    steps = 1e-3 * torch.eye(3)
+    slopes = [(field.signed_distance(points + step) - field.signed_distance(points - step)) / 2e-3 for step in steps]
+    apart = (torch.stack(slopes, dim=1) - gradients).norm(dim=1)
+    assert (apart < 0.02 * (1 + gradients.norm(dim=1))).float().mean() > 0.9  # the others cross a kink
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"skip_layer": 3}, {"grid_box": [[0.0, 0.0, 0.0], [1.0, 0.0, 1.0]]}, {"one_blob_bins": 5}, {"hash": {}}],
+)
+def test_what_does_not_fit_is_refused(changed: dict[str, Any]) -> None:
+    specs = {name: TensorSpec(tuple(value.shape), "F32") for name, value in tensors(33, 2).items()}
+    parse_description(described()).check(specs)
+    with pytest.raises(FieldFormatError) as caught:
+        parse_description(described(**changed)).check(specs)
+    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+
+
+# The kind ``voxel_grid``: against slow interpolation, on the grid's borders, and far outside.
+
+ORIGIN, SPACING = np.array([-0.4, 0.2, 1.0]), np.array([0.1, 0.25, 0.05])
+VALUES = np.random.default_rng(5).normal(size=(5, 4, 6)).astype(np.float32)
+FAR = ORIGIN + SPACING * (np.array(VALUES.shape) - 1)
+
+
+def description(**changes: Any) -> dict[str, Any]:
+    values = {"kind": "voxel_grid", "origin": ORIGIN.tolist(), "spacing": SPACING.tolist()}
+    return values | {"bounds": [ORIGIN.tolist(), FAR.tolist()]} | changes
+
+
+def field(values: NDArray[Any] = VALUES, **changes: Any) -> SdfField:
+    return build_field(parse_description(description(**changes)), {"values": torch.from_numpy(values)})
+
+
+def slow(point: NDArray[np.float64], sign: float = 1.0) -> float:
+    """The grid's value at a point, extended: the nearest point of the box, plus the way there."""
+    inside = np.clip(point, ORIGIN, FAR)
+    position = np.clip((inside - ORIGIN) / SPACING, 0.0, np.array(VALUES.shape) - 1.000000001)
+    within = slow_trilinear(lambda node: float(VALUES[node]), position)
+    return within + sign * float(np.linalg.norm(point - inside))
+
+
+def points(count: int, reach: float) -> NDArray[np.float64]:
+    """Points in the grid's box grown by ``reach`` on all sides, off the cells' borders."""
+    rng = np.random.default_rng(2)
+    drawn = ORIGIN - reach + rng.random((count, 3)) * (FAR - ORIGIN + 2 * reach)
+    return drawn[(np.abs((drawn - ORIGIN) / SPACING % 1.0 - 0.5) < 0.49).all(axis=1)]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("reach", [0.0, 0.7])
+def test_values_and_gradients_are_those_of_slow_interpolation(reach: float, sign: int) -> None:
+    where = points(150, reach)
+    value, gradient = field(sign=sign).signed_distance_and_gradient(torch.from_numpy(where))
+    expected = [sign * slow(point, sign) for point in where]
+    slopes = [sign * numeric_gradient(lambda p: slow(p, sign), point) for point in where]
+    np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(gradient.numpy(), slopes, rtol=0, atol=2e-3)
+
+
+def test_nodes_have_their_own_values_the_last_ones_too() -> None:
+    nodes = np.stack(np.meshgrid(*map(np.arange, VALUES.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    value = field().signed_distance(torch.from_numpy(ORIGIN + SPACING * nodes))
+    np.testing.assert_allclose(value.numpy(), VALUES.reshape(-1), rtol=0, atol=1e-5)
+
+
+def test_there_is_no_jump_at_the_box_and_none_beyond() -> None:
+    ray = np.linspace(FAR - 0.01, FAR + np.array([0.5, 0.1, 0.3]), 4000)
+    value = field().signed_distance(torch.from_numpy(ray)).numpy()
+    step = float(np.linalg.norm(ray[1] - ray[0]))
+    steepest = np.abs(np.diff(VALUES, axis=0)).max() / SPACING.min() * 3
+    assert np.abs(np.diff(value)).max() < step * (steepest + 1.0)
+    assert np.isfinite(field().signed_distance(torch.tensor([[1e8, -1e8, 1e8]])).numpy()).all()
+
+
+def test_colors_are_interpolated_between_the_nodes_that_have_one() -> None:
+    rng = np.random.default_rng(8)
+    colors = rng.random((*VALUES.shape, 3)).astype(np.float32)
+    colors[rng.random(VALUES.shape) < 0.3] = -1.0
+    tensors = {"values": torch.from_numpy(VALUES), "color.values": torch.from_numpy(colors)}
+    made = build_field(parse_description(description(color={"form": "values"})), tensors)
+    assert has_color(made)
+    where = np.concatenate([points(80, 0.0), points(40, 0.5)])
+    found = made.color(torch.from_numpy(where).float(), torch.zeros(len(where), 3)).numpy()
+    for point, color in zip(where, found, strict=True):
+        position = np.clip((np.clip(point, ORIGIN, FAR) - ORIGIN) / SPACING, 0.0, np.array(VALUES.shape) - 1.000000001)
+        known = slow_trilinear(lambda node: float(colors[node][0] >= 0.0), position)
+        total = [slow_trilinear(lambda n, k=k: max(float(colors[n][k]), 0.0), position) for k in range(3)]
+        np.testing.assert_allclose(color, np.array(total) / known if known > 1e-6 else 0.0, atol=2e-5)
+    assert not has_color(field())
+
+
+def test_colors_of_other_shapes_are_refused(tmp_path: Path) -> None:
+    described = description(color={"form": "values"})
+    colors = np.zeros((*VALUES.shape[:2], 3), np.float32)
+    with pytest.raises(FieldFormatError) as error:
+        write_safe_field(tmp_path / "f.safetensors", described, {"values": VALUES, "color.values": colors})
+    assert error.value.reason == "FIELD_SHAPES_MISMATCH"
+
+
+def test_half_precision_stays_half_and_is_evaluated_in_single(tmp_path: Path) -> None:
+    half = VALUES.astype(np.float16)
+    write_safe_field(tmp_path / "f", description(), {"values": half})
+    where = torch.from_numpy(points(50, 0.2))
+    opened = open_field(tmp_path / "f")
+    torch.testing.assert_close(
+        opened.signed_distance(where), field(half.astype(np.float32)).signed_distance(where), rtol=0, atol=0
+    )
+    torch.testing.assert_close(opened.to("cpu").signed_distance(where), opened.signed_distance(where))
+
+
+def test_world_scale_moves_the_grid_along() -> None:
+    where = torch.from_numpy(points(50, 0.3))
+    bounds = [(2.0 * ORIGIN).tolist(), (2.0 * FAR).tolist()]
+    scaled = field(world_scale=2.0, bounds=bounds).signed_distance(2.0 * where)
+    torch.testing.assert_close(scaled, 2.0 * field().signed_distance(where))
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros((4, 4), np.float32), np.zeros((1, 4, 4), np.float32), np.zeros((4, 4, 4), np.int32)]
+)
+def test_other_shapes_and_types_are_refused(tmp_path: Path, values: NDArray[Any]) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        write_safe_field(tmp_path / "f", description(), {"values": values})
+    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"spacing": [0.1, 0.0, 0.1]}, {"spacing": [0.1, -0.1, 0.1]}, {"origin": [0.0, float("nan"), 0.0]}]
+)
+def test_faulty_placements_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        parse_description(description(**changes))
+    assert caught.value.reason == "SAFE_FORMAT_INVALID"
