@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, NamedTuple, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -84,6 +84,8 @@ NO_QUOTA = Quota()
 class JobRecord:
     """One job. Times are seconds since the epoch; ``error`` is a problem object; ``version`` grows with each change."""
 
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
     id: str
     kind: str
     status: JobStatus
@@ -112,8 +114,6 @@ class JobRecord:
     """Of a successful search: the SHA-256 of the object that its result is about."""
     more_webhooks: list[str] = field(default_factory=list)
     """Addresses named by later requests for this job, which are told of its end as well."""
-    unknown_members: dict[str, Any] = field(default_factory=dict)
-    """What another release has written and this one does not know: it is written back as it is."""
 
     @property
     def webhooks(self) -> list[str]:
@@ -162,6 +162,8 @@ class SettingsFile(NamedTuple):
 class FieldRecord:
     """One field. ``sha256`` is its reference: the SHA-256 of the bytes that were uploaded, and its owner's name."""
 
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
     sha256: str
     state: FieldState
     bytes: int
@@ -183,8 +185,6 @@ class FieldRecord:
     """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
     library: dict[str, Any] | None = None
     """What its owner's library says of it: see ``regnf_state.record_store``. None: it is no entry of it."""
-    unknown_members: dict[str, Any] = field(default_factory=dict)
-    """As in JobRecord."""
 
     @property
     def owner(self) -> str:
@@ -295,37 +295,22 @@ def quota_of(settings: Settings) -> Quota:
     )
 
 
-# How records are written and read by several releases: docs/adr/0010-versioned-records.md.
-#
-# A document has a format, a whole number. Members that this release does not know are kept and written back. A
-# document of a later format, or one that is damaged, is unreadable: nothing is made of it, and nothing else suffers
-# from it.
+# How records are written and read. A document has a format, a whole number. A document of another format, or one that
+# is damaged, is unreadable: nothing is made of it, and nothing else suffers from it (docs/adr/0010).
 
 FORMAT = 1
-"""Raised by a release whose documents an earlier one must not touch: another meaning, another status."""
-_UNKNOWN = "unknown_members"
-_NEW = ("library",)
-"""Members that the release before this one does not know."""
+"""Raised by a release whose documents an earlier one cannot read."""
 LAST_TIME = 253402300800.0
 """The year 10000: what no calendar shows."""
 _TIMES = ("created", "updated", "started", "finished", "heartbeat", "phase_since", "original_until")
 _PROBLEM = {"type": str, "title": str, "status": int, "reason": str, "detail": str, "hint": str, "errors": list}
 _READERS: dict[type[Any], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in (JobRecord, FieldRecord)}
-_MEMBERS: dict[type[Any], frozenset[str]] = {
-    kind: frozenset(one.name for one in fields(kind)) - {_UNKNOWN} for kind in (JobRecord, FieldRecord)
-}
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 
 
 def document_of(record: JobRecord | FieldRecord) -> dict[str, Any]:
-    """The members of a record as they are written: those that the release before this one knows, and newer ones where
-    they say something. That release keeps what it does not know."""
-    document = dict(vars(record))  # no copies of what is in them: a search names hundreds of fields
-    for name in _NEW:
-        if document.get(name, ...) is None:
-            del document[name]
-    document.update(document.pop(_UNKNOWN))
-    return document
+    """The members of a record as they are written."""
+    return dict(vars(record))  # no copies of what is in them: a search names hundreds of fields
 
 
 def encoded(record: JobRecord | FieldRecord) -> str:
@@ -333,15 +318,11 @@ def encoded(record: JobRecord | FieldRecord) -> str:
     return json.dumps(document_of(record), separators=(",", ":"))
 
 
-def decoded(kind: type[_Record], name: str, text: bytes | str, format_: object = None) -> _Record:
-    """The record of this name in a document. Raises UnreadableRecordError.
-
-    ``format_``: of the document, as it is written; None for what was written before there were formats.
-    """
-    if format_ is not None:
-        _check_format(name, format_)
+def decoded(kind: type[_Record], name: str, text: bytes | str, format_: object = FORMAT) -> _Record:
+    """The record of this name in a document of this format, as it is written. Raises UnreadableRecordError."""
+    _check_format(name, format_)
     try:
-        document = json.loads(text, parse_constant=_refuse)
+        json.loads(text, parse_constant=_refuse)
         record: _Record = _READERS[kind].validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
@@ -349,8 +330,6 @@ def decoded(kind: type[_Record], name: str, text: bytes | str, format_: object =
         raise UnreadableRecordError(name, f"{where or 'it'}: {first['type']}") from error
     except (ValueError, RecursionError) as error:
         raise UnreadableRecordError(name, "it is not JSON") from error
-    unknown = {member: document[member] for member in document.keys() - _MEMBERS[kind]}
-    record = replace(record, unknown_members=unknown)
     _check(record, name)
     return record
 
@@ -359,7 +338,7 @@ def check_json_format(name: str, document: object) -> dict[str, Any]:
     """A document whose format is one of its members. Raises UnreadableRecordError unless this release can read it."""
     if not isinstance(document, dict):
         raise UnreadableRecordError(name, "it is not an object")
-    _check_format(name, document.get("format", FORMAT))
+    _check_format(name, document.get("format"))
     return document
 
 
@@ -367,8 +346,9 @@ def _check_format(name: str, value: object) -> None:
     text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
     if not (text.isascii() and text.isdigit() and len(text) < 10):
         raise UnreadableRecordError(name, "its format is no number")
-    if int(text) > FORMAT:
-        raise UnreadableRecordError(name, f"it has format {text}, this release reads {FORMAT}", newer=True)
+    if int(text) != FORMAT:
+        message = f"it has format {text}, this release reads {FORMAT}"
+        raise UnreadableRecordError(name, message, newer=int(text) > FORMAT)
 
 
 def _refuse(constant: str) -> None:

@@ -20,7 +20,7 @@ _MOVES: dict[str, frozenset[str]] = {
 _TOLD_BY_RESULT = frozenset({"verdict", "object_found"})
 _CHANGEABLE_IN_JOB = _TOLD_BY_RESULT | {"status", "phase", "progress", "engine", "error", "inputs", "worker"}
 _IN_REPORT = frozenset({VIEWS, DRAWINGS})
-"""What is changed by itself and stands in a field's report: the release before knows no such members of a record."""
+"""What is changed by itself and stands in a field's report."""
 _CHANGEABLE_IN_FIELD = _IN_REPORT | {"state", "label", "description", "report", "error", "bytes", "symmetry"}
 
 
@@ -103,7 +103,6 @@ def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
         attempt=record.attempt + 1,
         requeues=requeues,
         more_webhooks=record.more_webhooks,
-        unknown_members=record.unknown_members,
     )
 
 
@@ -171,7 +170,7 @@ def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldR
     if record.state != "rejected":
         return None
     again = replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)
-    return replace(again, library=record.library, unknown_members=record.unknown_members)
+    return replace(again, library=record.library)
 
 
 def reimported_field(
@@ -181,7 +180,7 @@ def reimported_field(
     _require_attempt(record, known.attempt)
     if record.state == "validating" or record.description != known.description:
         raise StaleAttemptError("the field has changed")
-    again = FieldRecord(
+    return FieldRecord(
         sha256=record.sha256,
         state="validating",
         bytes=record.bytes,
@@ -193,7 +192,6 @@ def reimported_field(
         attempt=record.attempt + 1,
         library=record.library,
     )
-    return replace(again, unknown_members=record.unknown_members)
 
 
 def restored_field(record: FieldRecord, before: FieldRecord, attempt: int, now: float) -> FieldRecord:

@@ -256,10 +256,6 @@ def claim_storage(redis: Redis, storage_id: str, adopt: str | None = None) -> No
 
 
 def _known(redis: Redis) -> str | None:
-    """Whose Redis it is. The release before noted it beside the run of the server whose journal was read."""
+    """Whose Redis it is."""
     noted: Any = redis.get(STORAGE_KEY)
-    if noted is not None:
-        return text(noted)
-    generation: Any = redis.get(GENERATION_KEY)
-    storage_id = "" if generation is None else text(generation).partition(":")[0]
-    return storage_id if storage_id not in ("", _READING) else None
+    return None if noted is None else text(noted)
