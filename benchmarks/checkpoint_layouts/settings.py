@@ -9,7 +9,7 @@ from typing import Any
 
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
-FAMILIES = ("sdfstudio", "nerfstudio", "instant_nsr_pl", "neuralangelo", "torch_ngp", "torch_ngp_tcnn")
+FAMILIES = ("sdfstudio", "nerfstudio", "instant_nsr_pl", "neuralangelo")
 _MAX_NUMBERS = 6_000_000
 
 
@@ -33,12 +33,11 @@ class Settings:
     grid_radius: float
     open_levels: int
     steps: int
-    has_biases: bool = True
 
     @property
     def input_width(self) -> int:
         """Columns of the first layer."""
-        return (3 + 6 * self.degree if self.has_biases else 0) + self.grid.width
+        return 3 + 6 * self.degree + self.grid.width
 
     @property
     def outputs(self) -> int:
@@ -55,19 +54,17 @@ def random_settings(family: str, rng: random.Random, steps: int = 80) -> Setting
 
 
 def _draw(family: str, rng: random.Random, steps: int) -> Settings | None:
-    tcnn_network = family == "torch_ngp_tcnn"
     grid, said = _grid(family, rng)
     if grid is None or grid.entries * grid.features_per_level > _MAX_NUMBERS or grid.width > 160:
         return None
     studio = family in ("sdfstudio", "nerfstudio")
-    plain = family.startswith("torch_ngp")
     deep = family == "sdfstudio" and rng.random() < 0.2
-    hidden = rng.choice((64, 128)) if not plain else rng.choice((32, 64))
+    hidden = rng.choice((64, 128))
     degree = rng.choice((6, 6, 6, 4, 8, 10)) if studio else 0
     open_levels = grid.levels
     if family in ("instant_nsr_pl", "neuralangelo") and rng.random() < 0.4:
         open_levels = rng.randint(min(4, grid.levels), grid.levels)
-    trained = plain or rng.random() > 1 / 6
+    trained = rng.random() > 1 / 6
     if deep and hidden <= 3 + 6 * degree + grid.width:
         return None
     radius = rng.choice((1.0, 1.5)) if family == "instant_nsr_pl" else 1.0
@@ -76,7 +73,7 @@ def _draw(family: str, rng: random.Random, steps: int) -> Settings | None:
         grid=grid,
         written={"hash": said} | ({"positional_encoding": {"degree": degree}} if studio else {}),
         hidden=hidden,
-        hidden_layers=8 if deep else rng.choice((1, 2, 3) if tcnn_network else (1, 2)),
+        hidden_layers=8 if deep else rng.choice((1, 2)),
         degree=degree,
         uses_sines=studio and rng.random() < 0.8,
         two_pi=family == "nerfstudio",
@@ -84,8 +81,7 @@ def _draw(family: str, rng: random.Random, steps: int) -> Settings | None:
         radius=radius,
         grid_radius=2.0 if family in ("sdfstudio", "nerfstudio", "neuralangelo") else radius,
         open_levels=open_levels,
-        steps=(3 * steps if plain else steps) if trained else 0,
-        has_biases=not plain,
+        steps=steps if trained else 0,
     )
 
 
@@ -96,16 +92,14 @@ def _grid(family: str, rng: random.Random) -> tuple[HashGridConfig | None, dict[
     if family == "neuralangelo":
         base, top = 2 ** rng.randint(3, 6), 2 ** rng.randint(8, 12)
     growth = round(rng.uniform(1.2, 2.0), rng.choice((2, 3, 4)))
-    by_growth = family in ("instant_nsr_pl", "torch_ngp_tcnn") and rng.random() < 0.6
+    by_growth = family == "instant_nsr_pl" and rng.random() < 0.6
     features, log2_size = rng.choice((1, 2, 2, 4, 8)), rng.randint(10, 19)
-    if family == "torch_ngp_tcnn" and levels * features not in (8, 16, 32, 64, 128):
-        return None, {}
     said: dict[str, Any] = {
         "levels": levels,
         "features_per_level": features,
         "log2_table_size": log2_size,
         "base_resolution": base,
-        "interpolation": rng.choice(("linear", "smoothstep")) if not family.startswith("torch_ngp") else "linear",
+        "interpolation": rng.choice(("linear", "smoothstep")),
     }
     if by_growth:
         said["per_level_scale"] = growth
@@ -117,7 +111,4 @@ def _grid(family: str, rng: random.Random) -> tuple[HashGridConfig | None, dict[
     if base * growth ** (levels - 1) > 20_000:
         return None, {}
     grid = HashGridConfig(levels, features, log2_size, base, growth, interpolation=said["interpolation"])
-    if family == "torch_ngp":
-        nodes = tuple(math.ceil(base * growth**level) + 1 for level in range(levels))
-        grid = HashGridConfig(levels, features, log2_size, base, growth, nodes, interpolation="linear")
     return grid, said

@@ -12,14 +12,13 @@ from torch import Tensor
 from benchmarks.checkpoint_layouts.settings import Settings
 from benchmarks.checkpoint_layouts.shapes import random_shape
 from regnf_core.fields.color_head import PositionalEncoding
-from regnf_core.fields.grid_mlp import GridMlpFunction
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
 from regnf_core.schema.kinds import SKIP_LAYER
 
 _BATCH = 1024
 _INITIAL = 1e-4
-"""tiny-cuda-nn and torch-ngp begin with features between -1e-4 and 1e-4."""
+"""tiny-cuda-nn begins with features between -1e-4 and 1e-4."""
 
 
 @dataclass
@@ -38,7 +37,7 @@ def train(settings: Settings, seed: int) -> Trained:
     shape = random_shape(generator)
     if settings.steps == 0:
         return field
-    layers = [*field.weights, *(field.biases if settings.has_biases else [])]
+    layers = [*field.weights, *field.biases]
     for tensor in (field.table, *layers):
         tensor.requires_grad_(True)
     groups = [{"params": [field.table], "lr": 1e-2}, {"params": layers, "lr": 2e-3}]
@@ -59,11 +58,8 @@ def train(settings: Settings, seed: int) -> Trained:
     return field
 
 
-def function_of(settings: Settings, field: Trained) -> NeusFactoFunction | GridMlpFunction:
+def function_of(settings: Settings, field: Trained) -> NeusFactoFunction:
     """The function that the trainer of ``settings`` evaluates."""
-    if not settings.has_biases:
-        mlp = GeometryMlp(field.weights, field.biases, None, "relu")
-        return GridMlpFunction(HashEncoding(settings.grid, field.table), mlp, settings.grid_radius)
     sines = PositionalEncoding(settings.degree, 2.0 * math.pi if settings.two_pi else 1.0)
     mask = _fed_columns(settings)
     weights = [field.weights[0] * mask, *field.weights[1:]]
@@ -91,7 +87,7 @@ def _fed_columns(settings: Settings) -> Tensor:
 
 
 def _initial(settings: Settings, generator: torch.Generator) -> Trained:
-    """Geometric initialization (Atzmon and Lipman 2020), a sphere; plain networks begin as torch's layers do."""
+    """Geometric initialization (Atzmon and Lipman 2020), a sphere."""
     widths = [settings.input_width, *[settings.hidden] * settings.hidden_layers, settings.outputs]
     weights, biases = [], []
     for layer, (columns, rows) in enumerate(itertools.pairwise(widths)):
@@ -100,9 +96,7 @@ def _initial(settings: Settings, generator: torch.Generator) -> Trained:
         weight = torch.randn(rows, columns, generator=generator) * (2.0 / rows) ** 0.5
         bias = torch.zeros(rows)
         last = layer == len(widths) - 2
-        if not settings.has_biases:
-            weight *= (rows / columns) ** 0.5
-        elif last:
+        if last:
             weight = (torch.pi / columns) ** 0.5 + 1e-4 * torch.randn(rows, columns, generator=generator)
             bias -= 0.5 * settings.radius
         elif layer == 0:

@@ -11,9 +11,6 @@ from torch import Tensor
 from benchmarks.checkpoint_layouts.settings import Settings
 from benchmarks.checkpoint_layouts.training import Trained
 
-_PADDING = 16
-"""tiny-cuda-nn's fused network takes and gives this many columns, or a multiple."""
-
 
 def write(path: Path, settings: Settings, field: Trained) -> None:
     """The checkpoint of ``field`` at ``path``."""
@@ -55,24 +52,6 @@ def _neuralangelo(settings: Settings, field: Trained) -> dict[str, Any]:
     return {"model": {f"module.neural_sdf.{n}": v for n, v in state.items()}, "iteration": iteration, "epoch": 1}
 
 
-def _torch_ngp(settings: Settings, field: Trained) -> dict[str, Any]:
-    sizes = torch.tensor([0, *settings.grid.level_entries()])
-    model = {"encoder.embeddings": field.table, "encoder.offsets": sizes.cumsum(0).int()}
-    model |= {f"backbone.{i}.weight": weight for i, weight in enumerate(field.weights)}
-    return {"epoch": 20, "model": model}
-
-
-def _torch_ngp_tcnn(_: Settings, field: Trained) -> dict[str, Any]:
-    """Every matrix padded to whole sixteens; the padding of the input is fed ones, so it holds zeros here."""
-    parts = []
-    for weight in field.weights:
-        rows, columns = (-(-size // _PADDING) * _PADDING for size in weight.shape)
-        padded = torch.zeros(rows, columns)
-        padded[: weight.shape[0], : weight.shape[1]] = weight
-        parts.append(padded.reshape(-1))
-    return {"epoch": 20, "model": {"encoder.params": field.table.reshape(-1), "backbone.params": torch.cat(parts)}}
-
-
 def _normalized(field: Trained, names: list[str]) -> dict[str, Tensor]:
     state = {}
     for name, weight, bias in zip(names, field.weights, field.biases, strict=True):
@@ -87,6 +66,4 @@ _WRITERS = {
     "nerfstudio": _studio,
     "instant_nsr_pl": _instant,
     "neuralangelo": _neuralangelo,
-    "torch_ngp": _torch_ngp,
-    "torch_ngp_tcnn": _torch_ngp_tcnn,
 }

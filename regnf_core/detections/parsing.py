@@ -6,11 +6,9 @@
      + "rotation_quaternion_xyzw" | "rotation_quaternion_wxyz"
     {"center": .., "extent": .., "R": ..}                    Open3D's OrientedBoundingBox
     {"min_bound": .., "max_bound": ..}                       Open3D's AxisAlignedBoundingBox
-    {"translation": .., "size": .., "rotation": ..}          nuScenes
 
-What does not say enough is refused: a bare list of four numbers as `rotation` may have either order. nuScenes' form is
-known by its three names; its size is width, length, height (the length lies along the box's x, the width along y, the
-height along z) and its rotation is w, x, y, z.
+Points and sizes may be objects {"x":, "y":, "z":}, as ROS has them. What does not say enough is refused: a bare list of
+four numbers as `rotation` may have either order. Other names are refused with what to write.
 """
 
 from __future__ import annotations
@@ -30,13 +28,10 @@ from regnf_core.rotations import IDENTITY, Quaternion, determinant, orthonormali
 
 CANONICAL = {
     "center": "center",
-    "centre": "center",
     "size": "size",
     "extent": "size",  # Open3D
-    "extents": "size",  # trimesh
     "rotation": "rotation",
     "R": "rotation",  # Open3D
-    "rotation_matrix": "rotation",
     "rotation_quaternion_xyzw": "rotation_quaternion_xyzw",
     "rotation_quaternion_wxyz": "rotation_quaternion_wxyz",
     "min": "min",
@@ -53,30 +48,6 @@ ROTATIONS = ("rotation", "rotation_quaternion_xyzw", "rotation_quaternion_wxyz")
 OPEN3D_NAMES = frozenset({"extent", "R", "min_bound", "max_bound"})
 OPEN3D_EXTRA = frozenset({"class_name", "color", "version_major", "version_minor"})
 """Members of Open3D's documents that say nothing about the box."""
-
-NUSCENES_NAMES = frozenset({"translation", "size", "rotation"})
-"""Together they name nuScenes' form."""
-NUSCENES_LABELS = ("detection_name", "tracking_name", "category_name")
-NUSCENES_SCORES = ("detection_score", "tracking_score")
-NUSCENES_EXTRA = frozenset(
-    {
-        "token",
-        "sample_token",
-        "instance_token",
-        "visibility_token",
-        "attribute_tokens",
-        "attribute_name",
-        "tracking_id",
-        "velocity",
-        "ego_translation",
-        "num_pts",
-        "num_lidar_pts",
-        "num_radar_pts",
-        "prev",
-        "next",
-    }
-)
-"""Members of nuScenes' records that say nothing about the box."""
 
 _ORDER = (
     "Say the order of the quaternion: `rotation_quaternion_xyzw` (ROS, SciPy) or `rotation_quaternion_wxyz` (Eigen's "
@@ -114,8 +85,10 @@ INSTEAD = {
     "upper": "Did you mean `max`?",
     "position": "Did you mean `center`?",
     "location": "Did you mean `center`?",
-    "translation": "Did you mean `center`? nuScenes' form has `translation`, `size` [width, length, height] and "
-    "`rotation` [w, x, y, z], all three.",
+    "translation": "Did you mean `center`? A box of nuScenes has `size` [width, length, height] and "
+    "`rotation` [w, x, y, z]: write `size`: [length, width, height] and `rotation_quaternion_wxyz`.",
+    "extents": "Did you mean `size`?",
+    "rotation_matrix": "Did you mean `rotation`?",
     "class": "Did you mean `label`?",
     "name": "Did you mean `label`?",
     "category": "Did you mean `label`?",
@@ -227,15 +200,14 @@ def _ambiguous(name: str | None, entries: Sequence[Any]) -> InvalidDetectionErro
 def _summary(entry: Any) -> str:
     if not isinstance(entry, Mapping):
         return shown(entry)
-    label = next((entry[key] for key in ("label", "detection_name", "class", "name") if key in entry), None)
-    score = next((entry[key] for key in ("score", "detection_score", "confidence") if key in entry), None)
+    label = next((entry[key] for key in ("label", "class", "name") if key in entry), None)
+    score = next((entry[key] for key in ("score", "confidence") if key in entry), None)
     words = [shown(value) for value in (label, score) if isinstance(value, str | int | float)]
     return " ".join(words) or "a box"
 
 
 _MAX_LABEL = 200
 _LABEL = re.compile(LABEL_PATTERN)
-_LABELED = frozenset({"label", "score"})
 
 
 def parse_detection(values: Any, index: int | None = None) -> Detection:
@@ -248,8 +220,6 @@ def parse_detection(values: Any, index: int | None = None) -> Detection:
         return _by_corners(values[0], values[1], (0,), (1,), {})
     if not isinstance(values, Mapping):
         raise fault((), f"is {shown(values)}, expected an object with a box", FORMS)
-    if values.keys() >= NUSCENES_NAMES:
-        return _nuscenes(values)
     return _by_members(*_members(values))
 
 
@@ -271,10 +241,12 @@ def _members(values: Mapping[Any, Any]) -> tuple[dict[str, Any], dict[str, str]]
     extra = OPEN3D_EXTRA if values.keys() & OPEN3D_NAMES else frozenset()
     found: dict[str, Any] = {}
     written: dict[str, str] = {}
+    unknown = [name for name in values if name not in CANONICAL and name not in extra]
+    if unknown:
+        name = min(unknown, key=lambda name: name not in INSTEAD)  # the one that says what is meant
+        raise fault((str(name),), "is not a member of a detection", INSTEAD.get(name) or _meant(name))
     for name, value in values.items():
         member = CANONICAL.get(name)
-        if member is None and name not in extra:
-            raise fault((str(name),), "is not a member of a detection", INSTEAD.get(name) or _meant(name))
         if member in found:
             raise fault((name,), f"says the same as `{written[member]}`", "Leave one of the two out.")
         if member is not None:
@@ -326,22 +298,6 @@ def _by_corners(low: Any, high: Any, low_place: Place, high_place: Place, found:
     center = tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
     size = tuple(b - a for a, b in zip(lower, upper, strict=True))
     return Detection(center, size, IDENTITY, **_labels(found))  # type: ignore[arg-type]  # of three, as the corners are
-
-
-def _nuscenes(values: Mapping[Any, Any]) -> Detection:
-    known = NUSCENES_NAMES | NUSCENES_EXTRA | _LABELED | {*NUSCENES_LABELS, *NUSCENES_SCORES}
-    for name in values:
-        if name not in known:
-            raise fault((str(name),), "is not a member of a nuScenes box", suggestion(str(name), known) or FORMS)
-    width, length, height = edges(values["size"], ("size",))
-    label = next((values[name] for name in ("label", *NUSCENES_LABELS) if name in values), None)
-    score = next((values[name] for name in NUSCENES_SCORES if name in values), None)
-    return Detection(
-        point(values["translation"], ("translation",)),
-        (length, width, height),
-        read_quaternion(values["rotation"], ("rotation",), "wxyz"),
-        **_labels({"label": label, "score": values.get("score", None if score == -1 else score)}),
-    )
 
 
 def _labels(found: Mapping[str, Any]) -> dict[str, Any]:

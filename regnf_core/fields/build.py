@@ -13,11 +13,9 @@ from torch import Tensor
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.fields.color_head import build_color_head
 from regnf_core.fields.composite import TransformedField
-from regnf_core.fields.grid_mlp import BoxExtension, build_grid_mlp, build_grid_network
 from regnf_core.fields.mlp import build_mlp
 from regnf_core.fields.neural_points import build_neural_points
 from regnf_core.fields.neus_facto import build_neus_facto
-from regnf_core.fields.neus_facto_function import GeometryMlp
 from regnf_core.fields.observation import (
     ColorFunction,
     Observation,
@@ -30,7 +28,7 @@ from regnf_core.fields.observation import (
     stored_observation,
 )
 from regnf_core.fields.onnx.graph import build_onnx
-from regnf_core.fields.user_fields import FunctionField
+from regnf_core.fields.user_fields import BoxExtension, FunctionField
 from regnf_core.fields.voxel_blocks import (
     build_voxel_blocks,
     corner_offsets,
@@ -41,9 +39,6 @@ from regnf_core.fields.voxel_blocks import (
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.description import OBSERVATION, VALUES, FieldDescription, NetworkColor, split_color
 from regnf_core.schema.kinds import (
-    FeatureVolumesDescription,
-    GridMlpDescription,
-    GridNetworkDescription,
     MeshDescription,
     MlpDescription,
     NeuralPointsDescription,
@@ -51,73 +46,8 @@ from regnf_core.schema.kinds import (
     OnnxDescription,
     VoxelBlocksDescription,
     VoxelGridDescription,
-    count_volumes,
 )
 from regnf_core.schema.safe_format import read_header
-
-# Volumes of features from coarse to fine, summed and decoded: NGLOD's fields (Takikawa et al. 2021).
-
-
-@dataclass(frozen=True)
-class FeatureVolumesFunction:
-    """[x, sum of the volumes' features at x] -> ReLU network. Points are taken to be within [-1, 1]^3.
-
-    volumes[i]: (N, N, N, C), float32 or float16, first axis x; the first and last nodes lie on the cube's faces.
-    """
-
-    volumes: tuple[Tensor, ...]
-    mlp: GeometryMlp
-
-    @property
-    def device(self) -> torch.device:
-        """Where the parameters live."""
-        return self.volumes[0].device
-
-    def to(self, device: torch.device | str) -> FeatureVolumesFunction:
-        """The same function with its parameters on another device."""
-        return replace(self, volumes=tuple(v.to(device) for v in self.volumes), mlp=self.mlp.to(device))
-
-    def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3)."""
-        features = torch.stack([interpolate(*_corners(volume, points)) for volume in self.volumes]).sum(0)
-        return self.mlp(torch.cat((points, features), dim=-1))
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3), in closed form."""
-        width = self.volumes[0].shape[-1]
-        features, jacobian = points.new_zeros(len(points), width), points.new_zeros(3, len(points), width)
-        for volume in self.volumes:
-            level, derivative = interpolate_with_derivative(*_corners(volume, points))
-            features += level
-            jacobian += derivative * ((volume.shape[0] - 1) / 2.0)
-        distance, by_input = self.mlp.with_gradient(torch.cat((points, features), dim=-1))
-        return distance, by_input[:, :3] + (jacobian * by_input[:, 3:]).sum(dim=-1).T
-
-
-def build_feature_volumes(
-    description: FeatureVolumesDescription, tensors: Mapping[str, Tensor]
-) -> FunctionField[BoxExtension[FeatureVolumesFunction]]:
-    """The field of ``description`` with its parameters in ``tensors``, extended beyond the cube [-1, 1]^3.
-
-    Tensors keep their device; they must have passed :meth:`FeatureVolumesDescription.check_tensors`.
-    """
-    volumes = tuple(tensors[f"volumes.{i}"].contiguous() for i in range(count_volumes(tensors)))
-    function = FeatureVolumesFunction(volumes, GeometryMlp.from_tensors(tensors))
-    high = torch.ones(3, device=function.device)
-    bounds = torch.tensor(description.function_bounds, dtype=torch.float64)
-    return FunctionField(BoxExtension(function, -high, high, float(description.sign)), bounds)
-
-
-def _corners(volume: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The features (2, 2, 2, N, C) at the corners of the points' cells, and the weights (3, N, 1) of the upper ones."""
-    nodes = volume.shape[0]
-    position = (points + 1.0) * ((nodes - 1) / 2.0)
-    cell = position.floor().long().clamp(0, nodes - 2)
-    strides = torch.tensor([nodes * nodes, nodes, 1], device=volume.device)
-    rows = (cell * strides).sum(-1) + (corner_offsets(volume.device) * strides).sum(-1, keepdim=True)  # (8, N)
-    features = volume.view(nodes**3, -1).index_select(0, rows.view(-1)).float()
-    return features.view(2, 2, 2, len(points), -1), (position - cell).T.unsqueeze(-1)
-
 
 # A field in another unit, or with the opposite sign.
 
@@ -330,12 +260,6 @@ def _build_kind(description: FieldDescription, tensors: Mapping[str, Tensor], co
             return build_onnx(description, tensors)
         case NeuralPointsDescription():
             return build_neural_points(description, tensors)
-        case GridMlpDescription():
-            return build_grid_mlp(description, tensors)
-        case GridNetworkDescription():
-            return build_grid_network(description, tensors)
-        case FeatureVolumesDescription():
-            return build_feature_volumes(description, tensors)
         case VoxelGridDescription():
             return build_voxel_grid(description, tensors, colors.get(VALUES))
         case VoxelBlocksDescription():

@@ -176,8 +176,6 @@ class UploadDescription:
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=MOST_OF_LABEL, pattern=LABEL_PATTERN)] | None = None
-    grid_box: _Box | None = None
-    """Lowest and highest corner of what the hash grid covers, in the checkpoint's coordinates, if that is no cube."""
     use_grid: bool | None = None
     """False: the network has a hash grid's columns, but was trained without it."""
     hash: GridDescription = field(default_factory=GridDescription)

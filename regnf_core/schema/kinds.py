@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le, Len, MaxLen
 
-from regnf_core.schema.description import FORBID_UNKNOWN, Corner, FieldDescription
+from regnf_core.schema.description import FORBID_UNKNOWN, FieldDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig, PositionalEncodingDescription
 from regnf_core.schema.onnx_operators import OPERATORS, SHAPE_ONLY
 from regnf_core.schema.tensor_check import (
@@ -26,66 +26,6 @@ from regnf_core.schema.tensor_check import (
     require_names,
     require_shape,
 )
-
-# The kind ``grid_network``: position, sines, blobs and a hash grid over a box into one network.
-
-_MAX_EDGE = 1e6
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridNetworkDescription(FieldDescription):
-    """A field of the grid_network kind; see :class:`regnf_core.fields.grid_mlp.GridNetworkFunction`."""
-
-    kind: Literal["grid_network"]
-    hash: HashGridConfig
-    grid_box: tuple[Corner, Corner]
-    """Lowest and highest corner of what the grid covers."""
-    positional_encoding: PositionalEncodingDescription | None = None
-    """None: the network has no columns for sines and cosines."""
-    one_blob_bins: Annotated[int, Ge(0), Le(256)] = 0
-    """Bins an axis of the one-blob encoding of the place in the box; 0: the network has no columns for them."""
-    activation: Literal["softplus", "relu"] = "softplus"
-    skip_layer: Annotated[int, Ge(1), Le(32)] | None = None
-    """The layer that sees the network's input again."""
-
-    @property
-    def input_width(self) -> int:
-        """Columns of the network's first layer: position, sines and cosines, blobs, grid features."""
-        sines = 0 if self.positional_encoding is None else self.positional_encoding.width
-        return 3 + sines + 3 * self.one_blob_bins + self.hash.width
-
-    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
-        sound = all(0.0 < high - low <= _MAX_EDGE for low, high in zip(*self.grid_box, strict=True))
-        require(sound, f"grid_box {self.grid_box} is no box")
-        layers = count_layers(tensors)
-        require(self.skip_layer is None or self.skip_layer < layers, f"there is no layer {self.skip_layer} to skip to")
-        require_names(tensors, layer_tensor_names(layers) | {"hash_table"})
-        require_shape(tensors, "hash_table", (self.hash.entries, self.hash.features_per_level))
-        skips = {} if self.skip_layer is None else {self.skip_layer: self.input_width}
-        check_layers(tensors, self.input_width, skips)
-
-
-# The kind ``grid_mlp``: a hash grid's features alone into a small ReLU network, within a cube.
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridMlpDescription(FieldDescription):
-    """A field of the grid_mlp kind; see :class:`regnf_core.fields.grid_mlp.GridMlpFunction`."""
-
-    kind: Literal["grid_mlp"]
-    hash: HashGridConfig
-    grid_radius: Annotated[float, Gt(0), Le(1e6)] = 1.0
-    """The grid covers [-grid_radius, grid_radius]^3."""
-
-    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
-        layers = count_layers(tensors)
-        names = layer_tensor_names(layers)
-        require_names(tensors, names | {"hash_table"})
-        require_shape(tensors, "hash_table", (self.hash.entries, self.hash.features_per_level))
-        check_layers(tensors, self.hash.width)
-
 
 # The kind ``mlp``: the position, with or without its sines and cosines, into a network of plain layers.
 
@@ -274,36 +214,6 @@ def last_uses(nodes: Sequence[NodeDescription], output: str) -> list[tuple[str, 
     return found[::-1]
 
 
-# The kind ``feature_volumes``: volumes of features from coarse to fine, their sum into a small network.
-
-_MAX_VOLUMES = 16
-
-
-@dataclass(frozen=True, kw_only=True)
-class FeatureVolumesDescription(FieldDescription):
-    """A field of the feature_volumes kind; see :class:`regnf_core.fields.build.FeatureVolumesFunction`."""
-
-    kind: Literal["feature_volumes"]
-
-    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
-        volumes = count_volumes(tensors)
-        require(1 <= volumes <= _MAX_VOLUMES, f"the field has {volumes} volumes, expected 1 to {_MAX_VOLUMES}")
-        names = layer_tensor_names(count_layers(tensors))
-        require_names(tensors, names | {f"volumes.{i}" for i in range(volumes)})
-        features = tensors["volumes.0"].shape[-1] if tensors["volumes.0"].shape else 0
-        for i in range(volumes):
-            shape = tensors[f"volumes.{i}"].shape
-            require(len(shape) == 4 and shape[0] >= 2, f"volumes.{i} has shape {shape}, expected a cube of features")
-            require_shape(tensors, f"volumes.{i}", (shape[0], shape[0], shape[0], features))
-        check_layers(tensors, 3 + features)
-
-
-def count_volumes(names: Mapping[str, object]) -> int:
-    """How many volumes there are."""
-    return sum(name.startswith("volumes.") for name in names)
-
-
 # The kind ``mesh``: the exact distance to triangles.
 
 
@@ -431,9 +341,6 @@ KINDS: dict[str, type[FieldDescription]] = {
     "mesh": MeshDescription,
     "onnx": OnnxDescription,
     "neural_points": NeuralPointsDescription,
-    "grid_mlp": GridMlpDescription,
-    "grid_network": GridNetworkDescription,
-    "feature_volumes": FeatureVolumesDescription,
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,
 }

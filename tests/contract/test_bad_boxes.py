@@ -94,11 +94,9 @@ LOW, HIGH = [-0.375, -0.1875, 0.1875], [0.125, 0.0625, 0.3125]
 @pytest.mark.parametrize(
     "box",
     [
-        {"centre": CENTER, "extent": SIZE},
         {"center": CENTER, "extent": SIZE, "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"min_bound": LOW, "max_bound": HIGH},
         [LOW, HIGH],
-        {"translation": CENTER, "size": [0.25, 0.5, 0.125], "rotation": [1, 0, 0, 0]},
         {"center": dict(zip("xyz", CENTER, strict=True)), "size": dict(zip("xyz", SIZE, strict=True))},
         {"center": CENTER, "size": SIZE, "rotation_quaternion_wxyz": [-2, 0, 0, 0]},
     ],

@@ -9,11 +9,9 @@ import numpy as np
 
 from benchmarks.trainer_runs.run import WrittenRun
 from benchmarks.trainer_runs.trainers import (
-    co_slam,
     deepsdf,
     implicit,
     instant_nsr_pl,
-    monosdf,
     nerfstudio,
     neuralangelo,
     neus,
@@ -33,6 +31,4 @@ TRAINERS: dict[str, Writer] = {
     "deepsdf": deepsdf.write_deepsdf,
     "volsdf": implicit.write_volsdf,
     "idr": implicit.write_idr,
-    "monosdf": monosdf.write_monosdf,
-    "co_slam": co_slam.write_co_slam,
 }

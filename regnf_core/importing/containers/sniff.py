@@ -8,7 +8,7 @@ import struct
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
-MESH_FORMATS = ("dae", "glb", "gltf", "obj", "off", "pcd", "ply", "stl", "xyz")
+MESH_FORMATS = ("glb", "gltf", "obj", "pcd", "ply", "stl", "xyz")
 
 _OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
@@ -39,10 +39,6 @@ def sniff_mesh(head: bytes) -> str | None:
     text = head.lstrip(_BLANK)
     if re.match(rb"ply[ \t]*[\r\n]", text):
         return "ply"
-    if _OFF.match(text):
-        return "off"
-    if b"<COLLADA" in text and text.startswith(b"<"):
-        return "dae"
     if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS):
         return "gltf"
     if _is_pcd(text):
@@ -171,6 +167,7 @@ _SHAPES = (
     *((b"# vtk DataFile", "a VTK file"), (b"<VTKFile", "a VTK file"), (b"#VRML", "a VRML scene")),
     *((b"<X3D", "an X3D scene"), (b"<amf", "an AMF model"), (b"<robot", "a URDF robot, which names its meshes")),
     *((b"<sdf", "a Gazebo model, which names its meshes"), (b"<mujoco", "a MuJoCo model, which names its meshes")),
+    (b"<COLLADA", "a COLLADA scene"),
     *((b"# Octomap", "an OctoMap"), (b"#binvox", "a binvox grid"), (b"NRRD000", "an NRRD volume")),
 )
 """Shapes in formats that are not read: how they begin, white space between words being one blank, and what they are. A
@@ -217,6 +214,8 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head) in _KERAS_MEMBERS:
         return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays by numpy.savez"
+    if _OFF.match(head.lstrip(_BLANK)):
+        return "FORMAT_NOT_SUPPORTED", "an OFF mesh; export it as .glb, .ply, .obj or .stl"
     begin = b" ".join(head[:_SHAPE_WITHIN].lstrip(_BLANK).lower().split())
     for magic, what in _SHAPES:
         if begin.startswith(magic.lower()) or (begin.startswith(b"<") and magic[:1] == b"<" and magic.lower() in begin):

@@ -7,19 +7,15 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families import (
-    co_slam,
     deepsdf,
     deepsdf_blocks,
     instant_nsr_pl,
-    isdf,
     neuralangelo,
     neus,
-    nglod,
     pin_slam,
     plain_network,
     sdfstudio,
     siren,
-    torch_ngp,
     unsupported,
 )
 from regnf_core.importing.families.converted import ConvertedField
@@ -41,10 +37,6 @@ FAMILIES: tuple[Family, ...] = (
     deepsdf_blocks.convert,
     siren.convert,
     pin_slam.convert,
-    torch_ngp.convert,
-    nglod.convert,
-    isdf.convert,
-    co_slam.convert,
     unsupported.refuse,
     plain_network.convert,
 )

@@ -27,8 +27,6 @@ from regnf_core.importing.families.layers import (
     state_under,
     strip_prefix,
 )
-from regnf_core.importing.families.monosdf_grid import FAMILY as MONOSDF
-from regnf_core.importing.families.monosdf_grid import convert_grid
 from regnf_core.importing.families.network import (
     BETA,
     FORM_ENTRIES,
@@ -98,23 +96,14 @@ def convert_implicit(
     if not strip_prefix(state, "lin0."):
         return None
     if strip_prefix(state, "encoding."):
-        family, converted = MONOSDF, _with_grid(state, source, overrides)
-    else:
-        density = bool(state_under(checkpoint, "density."))
-        family = overrides.family if overrides.family in _IMPLICIT_FAMILIES else "volsdf" if density else "idr"
-        require_family(overrides, family)
-        converted = _converted(state, source, overrides, family, _IMPLICIT.removesuffix("."), ())
+        message = "MonoSDF's network with a hash grid is not supported: extract its mesh, and give that"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    density = bool(state_under(checkpoint, "density."))
+    family = overrides.family if overrides.family in _IMPLICIT_FAMILIES else "volsdf" if density else "idr"
+    require_family(overrides, family)
+    converted = _converted(state, source, overrides, family, _IMPLICIT.removesuffix("."), ())
     colors = state_under(checkpoint, _RENDERING) and overrides.color.keep is not False
     return without_color(converted, [_RENDERING] if colors else [], family)
-
-
-def _with_grid(state: dict[str, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField:
-    if "encoding.offsets" not in state:
-        message = "MonoSDF's network with another grid than its own kernel's; extract its mesh, and give that"
-        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
-    names = _names(state)
-    layers = read_layers(state, names, source, column=overrides.output_column or 0)
-    return convert_grid(state, layers, skips_of(layers, names), source, overrides)
 
 
 def _names(state: dict[str, Any]) -> list[str]:

@@ -25,12 +25,11 @@ class _Known:
 
 
 _KNOWN = (
-    _Known(
-        "torch-ngp's radiance fields, which have no distances",
-        "train its SDF, or extract a mesh",
-        ("model",),
-        ("encoder.",),
-    ),
+    _Known("torch-ngp's", _MESH, ("model",), ("encoder.",)),
+    _Known("torch-ngp's", _MESH, (), ("encoder.", "backbone.")),
+    _Known("Co-SLAM's", "give the mesh that it writes to the run's folder", ("model",), ("decoder.sdf_net.",)),
+    _Known("iSDF's", _MESH, ("model_state_dict",), ("in_layer.", "out_alpha.")),
+    _Known("NGLOD's", _MESH, (), ("features.0.fm", "louts.")),
     _Known(
         "SHINE-Mapping's, an octree whose tables are pickled as an object, and its scale in the settings",
         "give the mesh that it writes to the run's folder mesh",

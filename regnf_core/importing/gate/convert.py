@@ -52,7 +52,7 @@ _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
 _PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
 """Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
-_THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz", "off"}
+_THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz"}
 """May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 

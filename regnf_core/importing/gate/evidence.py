@@ -19,7 +19,6 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
-from regnf_core.fields.grid_mlp import BoxExtension, GridMlpFunction
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.fields.observation import SdfField
 from regnf_core.fields.user_fields import FunctionField
@@ -100,17 +99,10 @@ def norm_misfit(gradient: Tensor) -> Tensor:
 def parts_of_gradient(field: SdfField, points: Tensor) -> PartsOfGradient | None:
     """The parts at points (N, 3) within the cube that the grid covers; None without a grid."""
     function = field.function if isinstance(field, FunctionField) else None
-    if isinstance(function, BoxExtension):
-        points = torch.minimum(torch.maximum(points, function.low), function.high)
-        function = function.function
-    if isinstance(function, NeusFactoFunction):
-        encoding = function.hash_encoding
-    elif isinstance(function, GridMlpFunction):
-        encoding = function.encoding
-    else:
-        return None
+    encoding = function.hash_encoding if isinstance(function, NeusFactoFunction) else None
     if encoding is None:
         return None
+    assert isinstance(function, NeusFactoFunction)
     chunks = [function.gradient_by_level(chunk) for chunk in torch.split(points, _CHUNK)]
     distance, rest, levels = zip(*chunks, strict=True)
     parts = torch.cat(distance), torch.cat(rest), torch.cat(levels, dim=1)

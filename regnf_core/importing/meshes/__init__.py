@@ -5,19 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from regnf_core.importing.meshes.dae import read_dae
 from regnf_core.importing.meshes.glb import read_glb, read_gltf
 from regnf_core.importing.meshes.ply import read_ply
 from regnf_core.importing.meshes.point_files import read_pcd, read_xyz
-from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, read_obj, read_off, read_stl
+from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, read_obj, read_stl
 
-CLOUD_FORMATS = ("ply", "pcd", "xyz", "off")
+CLOUD_FORMATS = ("ply", "pcd", "xyz")
 """Formats that may hold points alone."""
 _IN_PARTS: dict[str, Callable[[memoryview, Siblings], Geometry]] = {"glb": read_glb, "gltf": read_gltf}
 _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
-    "dae": read_dae,
     "obj": read_obj,
-    "off": read_off,
     "pcd": read_pcd,
     "ply": read_ply,
     "stl": read_stl,

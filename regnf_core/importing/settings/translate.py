@@ -19,12 +19,10 @@ from regnf_core.importing.settings.facts import Facts
 from regnf_core.importing.settings.keys import Keys, malformed
 from regnf_core.importing.settings.said import Said
 from regnf_core.importing.settings.trainers import (
-    co_slam,
     deepsdf,
     fusion,
     implicit_network,
     instant_nsr_pl,
-    isdf,
     neuralangelo,
     neus,
     pin_slam,
@@ -103,8 +101,6 @@ TRAINERS = (
     Trainer(lambda _: "IDR, VolSDF or MonoSDF", implicit_network),
     Trainer(lambda _: "DeepSDF", deepsdf),
     Trainer(lambda _: "PIN-SLAM", pin_slam),
-    Trainer(lambda _: "iSDF", isdf),
-    Trainer(lambda _: "Co-SLAM", co_slam),
     Trainer(lambda _: "a network of sines", sines),
     Trainer(lambda _: "a map of truncated distances", fusion),
 )

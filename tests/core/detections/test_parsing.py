@@ -31,7 +31,6 @@ TURNED = OrientedBox(torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 5, 6]), torch
         np.array([[0, 0, 0], [1, 2, 3]]),
         {"min_bound": [0, 0, 0], "max_bound": [1, 2, 3], "class_name": "AxisAlignedBoundingBox"},
         {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 2, "z": 3}},
-        {"centre": [0.5, 1.0, 1.5], "extents": [1, 2, 3]},
         {"center": np.array([0.5, 1.0, 1.5]), "extent": torch.tensor([1, 2, 3])},
         {"center": {"x": 0.5, "y": 1, "z": 1.5}, "size": {"x": 1, "y": 2, "z": 3}},
         {"center": [0.5, 1.0, 1.5], "size": [1, 2, 3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
@@ -47,7 +46,7 @@ def test_forms_of_an_axis_aligned_box(values: Any) -> None:
     [
         {"rotation": QUARTER},
         {"R": QUARTER},
-        {"rotation_matrix": np.array(QUARTER)},
+        {"R": np.array(QUARTER)},
         {"rotation_quaternion_xyzw": [0, 0, HALF, HALF]},
         {"rotation_quaternion_xyzw": [0, 0, -7, -7]},
         {"rotation_quaternion_wxyz": [HALF, 0, 0, HALF]},
@@ -58,24 +57,6 @@ def test_forms_of_an_axis_aligned_box(values: Any) -> None:
 def test_forms_of_a_rotation(rotation: dict[str, Any]) -> None:
     box = OrientedBox.from_dict({"center": [1, 2, 3], "size": [4, 5, 6]} | rotation)
     torch.testing.assert_close(box.corners(), TURNED.corners(), atol=2e-3, rtol=0)
-
-
-def test_a_box_of_nuscenes() -> None:
-    """Its size is width, length, height, along y, x and z of the box; its quaternion begins with w."""
-    record = {
-        "sample_token": "a",
-        "translation": [1, 2, 3],
-        "size": [5, 4, 6],
-        "rotation": [HALF, 0, 0, HALF],
-        "velocity": [0, 0],
-        "detection_name": "car",
-        "detection_score": 0.5,
-        "attribute_name": "vehicle.moving",
-    }
-    box = OrientedBox.from_dict(record)
-    torch.testing.assert_close(box.corners(), TURNED.corners())
-    assert (box.label, box.score) == ("car", 0.5)
-    assert parse_detection(record | {"detection_score": -1}).score is None  # what nuScenes writes for true boxes
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -93,7 +74,7 @@ def test_every_rotation_matrix_is_read_as_it_is(seed: int) -> None:
     [
         ({}, ("center",), "detection.center is missing", '{"min": [x, y, z]'),
         ({"center": [0, 0, 0]}, ("size",), "detection.size is missing: `center` is there", "min"),
-        ({"centre": [0, 0, 0]}, ("size",), "`centre` is there", "min"),
+        ({"extent": [1, 1, 1]}, ("center",), "`extent` is there", "min"),
         ({"min": [0, 0, 0]}, ("max",), "detection.max is missing", "max"),
         ("box.json", (), 'is the text "box.json"', "min"),
         (None, (), "is null", "min"),
@@ -111,10 +92,13 @@ def test_every_rotation_matrix_is_read_as_it_is(seed: int) -> None:
         (UNIT | {"yaw": 0.3}, ("yaw",), "detection.yaw", "sin(a/2)"),
         ({"center": [0, 0, 0], "half_extents": [1, 1, 1]}, ("half_extents",), "", "twice"),
         ({"center": [0, 0, 0], "dimensions": [1, 1, 1]}, ("dimensions",), "", "`size`"),
-        ({"translation": [0, 0, 0], "size": [1, 1, 1]}, ("translation",), "", "all three"),
+        ({"token": "a", "translation": [0, 0, 0], "size": [1, 1, 1]}, ("translation",), "", "[length, width, height]"),
         (UNIT | {"zzzz": 1}, ("zzzz",), "detection.zzzz", "docs/api.md"),
         (UNIT | {"color": 1}, ("color",), "detection.color", ""),
-        (UNIT | {"centre": [0, 0, 0]}, ("centre",), "says the same as `center`", "Leave one"),
+        (UNIT | {"extent": [0, 0, 0]}, ("extent",), "says the same as `size`", "Leave one"),
+        ({"centre": [0, 0, 0], "size": [1, 1, 1]}, ("centre",), "", "Did you mean `center`?"),
+        ({"center": [0, 0, 0], "extents": [1, 1, 1]}, ("extents",), "", "Did you mean `size`?"),
+        (UNIT | {"rotation_matrix": QUARTER}, ("rotation_matrix",), "", "Did you mean `rotation`?"),
         (UNIT | {"min": [0, 0, 0], "max": [1, 1, 1]}, ("center",), "corners too", "Leave one"),
         (UNIT | {"R": QUARTER, "rotation_quaternion_xyzw": [0, 0, 0, 1]}, ("rotation_quaternion_xyzw",), "`R`", ""),
         (UNIT | {"rotation": [0, 0, 0, 1]}, ("rotation",), "[0, 0, 0, 1]", "`rotation_quaternion_xyzw`: [0, 0, 0, 1]"),

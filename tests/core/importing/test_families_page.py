@@ -45,7 +45,7 @@ def test_a_family_is_one_module_and_one_row(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_kind_is_a_description_and_an_evaluator(monkeypatch: pytest.MonkeyPatch) -> None:
-    described = example("regnf_core/schema/kinds/spheres.py", monkeypatch)
+    described = example("regnf_core/schema/spheres.py", monkeypatch)
     evaluator = example("regnf_core/fields/spheres.py", monkeypatch)
     description = described.SpheresDescription(kind="spheres", bounds=((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
     spheres = np.array([[0.0, 0.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.25]], np.float32)

@@ -74,7 +74,6 @@ def test_a_network_that_is_a_distance_tells_its_form(tmp_path: Path) -> None:
         ("neus", {"input_scale": 1.0, "output_column": 300}, "SETTINGS_CONTRADICT_TENSORS"),
         ("idr, volsdf", {"positional_encoding": {"degree": 20}}, "SETTINGS_CONTRADICT_TENSORS"),
         ("siren", {"activation_scale": 30.0, "output_column": 1}, "SETTINGS_CONTRADICT_TENSORS"),
-        ("isdf", {"positional_encoding": {"degree": 20}}, "SETTINGS_CONTRADICT_TENSORS"),
         ("plain_network", {"positional_encoding": {"degree": 20}}, "SETTINGS_CONTRADICT_TENSORS"),
         ("neus", {"level_mask": 3}, "INVALID_DESCRIPTION"),
         ("siren", {"activation": "relu", "activation_scale": 3.0}, "INVALID_DESCRIPTION"),

@@ -22,7 +22,12 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "NICE-SLAM": ({"c": {"grid_fine": ONE}, "decoder_state_dict": {"a": ONE}}, "NICE-SLAM"),
     "NeRF": ({"global_step": 1, "network_fn_state_dict": {"pts_linears.0.weight": ONE}}, "NeRF"),
     "torch-ngp's radiance field": ({"model": {"encoder.embeddings": ONE, "sigma_net.0.weight": ONE}}, "torch-ngp"),
-    "MonoSDF with another grid": (
+    "torch-ngp's distances": ({"model": {"encoder.embeddings": ONE, "backbone.0.weight": ONE}}, "torch-ngp"),
+    "torch-ngp's distances, the tensors alone": ({"encoder.params": ONE, "backbone.params": ONE}, "torch-ngp"),
+    "Co-SLAM": ({"model": {"decoder.sdf_net.model.0.weight": ONE}}, "Co-SLAM"),
+    "iSDF": ({"model_state_dict": {"in_layer.0.weight": ONE, "out_alpha.weight": ONE}}, "iSDF"),
+    "NGLOD": ({"features.0.fm": ONE, "louts.0.0.weight": ONE}, "NGLOD"),
+    "MonoSDF with a grid": (
         {
             "model_state_dict": {
                 "module.implicit_network.encoding.params": ONE,

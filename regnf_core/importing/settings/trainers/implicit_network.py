@@ -6,7 +6,6 @@ from regnf_core.importing.families.layers import contradiction
 from regnf_core.importing.settings.documents import Documents, mappings
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.trainers.monosdf_grid import grid_of_monosdf
 from regnf_core.importing.settings.trainers.skips import agree_on_skips
 
 _NETWORK = "model.implicit_network"
@@ -19,15 +18,13 @@ def main_file(documents: Documents) -> Keys | None:
 
 
 def translate(keys: Keys, said: Said) -> None:
-    """Fill ``said``. Raises FieldFormatError: SETTINGS_MALFORMED, SETTINGS_CONTRADICT_TENSORS, FAMILY_NOT_SUPPORTED."""
+    """Fill ``said``. Raises FieldFormatError: SETTINGS_MALFORMED, SETTINGS_CONTRADICT_TENSORS."""
     network = keys.below(_NETWORK)
     if network.whole("d_in") not in (None, 3):
         said.refuse(network, "d_in")
     said.put("positional_encoding.degree", network.whole("multires"), network, "multires")
     if network.flag("inside_outside"):  # begun as a room: positive in the free space that it encloses
         said.put("sign", 1, network, "inside_outside")
-    if network.has("use_grid_feature") or keys.flag("model.Grid_MLP"):
-        grid_of_monosdf(network, said)
     dims, prefix = network.wholes("dims"), "implicit_network.lin"
     layers = said.facts.count(prefix, ".bias")
     if dims is not None and layers:

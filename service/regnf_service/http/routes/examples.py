@@ -34,7 +34,7 @@ REGISTER_EXAMPLES: dict[str, Any] = {
         },
     },
     "open3d": {
-        "summary": "A box as Open3D has it; `centre`, `extents` and `rotation` are taken too",
+        "summary": "A box as Open3D has it",
         "value": {
             "scene": SCENE,
             "object": OBJECT,

@@ -74,23 +74,20 @@ def _one_of_each(*groups: tuple[str, ...]) -> ConfigDict:
 
 
 class CenteredBox(_Labeled):
-    """A box by center, full edge lengths and rotation, which is the identity when left out. `centre`, `extent`,
-    `extents`, `R` and `rotation_matrix` are other names: Open3D's OrientedBoundingBox is taken as it is."""
+    """A box by center, full edge lengths and rotation, which is the identity when left out. Open3D's
+    OrientedBoundingBox, with `extent` and `R`, is taken as it is."""
 
-    model_config = _one_of_each(("center", "centre"), ("size", "extent", "extents"))
+    model_config = _one_of_each(("center",), ("size", "extent"))
 
     center: _Point | _Nothing = None
-    centre: _Point | _Nothing = None
     size: _Size | _Nothing = None
     extent: _Size | _Nothing = None
-    extents: _Size | _Nothing = None
     rotation_quaternion_xyzw: _Four | Quaternion | _Nothing = None
     rotation_quaternion_wxyz: _Four | Quaternion | _Nothing = None
     rotation: _Rotation | _Nothing = Field(
         None, description="Box axes to scene axes. Four bare numbers are refused: they do not say their order."
     )
     R: _Rotation | _Nothing = None
-    rotation_matrix: _Rotation | _Nothing = None
     color: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
     class_name: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
     version_major: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
@@ -112,23 +109,6 @@ class CornerBox(_Labeled):
     version_minor: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
 
 
-def _nuscenes_extra(schema: dict[str, Any]) -> None:
-    for name in ("translation", "size", "rotation"):
-        schema["properties"][name].pop("title", None)
-
-
-class NuScenesBox(_Labeled):
-    """A box as nuScenes writes it, known by `translation`, `size` and `rotation` together. `size` is width (along the
-    box's y), length (along x), height (along z); `rotation` is w, x, y, z. Further members of its records are
-    ignored."""
-
-    model_config = ConfigDict(extra="ignore", json_schema_extra=_nuscenes_extra)
-
-    translation: _Point
-    size: _Size
-    rotation: _Four | Quaternion
-
-
 _Corners = Annotated[
     list[_Point],
     Field(min_length=2, max_length=2, description="Lowest and highest corner of an axis-aligned box."),
@@ -145,6 +125,6 @@ def _read(value: Any) -> ParsedDetection:
 
 Detection = Annotated[
     ParsedDetection,
-    PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | NuScenesBox | _Corners),
+    PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | _Corners),
     PlainSerializer(ParsedDetection.canonical, return_type=dict[str, Any]),
 ]

@@ -13,11 +13,8 @@ import trimesh
 
 from tests.core.importing import (
     onnx_models,
-    test_isdf,
-    test_nglod,
     test_nvblox,
     test_pin_slam,
-    test_torch_ngp,
     test_voxel_block_grid,
 )
 from tests.core.importing import small_families as small
@@ -58,7 +55,6 @@ def _mesh_files() -> dict[str, bytes]:
     around = test_point_clouds.directions(150)
     files = {kind: _bytes(ball.export(file_type=kind)) for kind in ("ply", "stl", "stl_ascii", "obj", "glb")}
     files["ply_ascii"] = _bytes(ball.export(file_type="ply", encoding="ascii"))
-    files |= {"off": mesh_files.off(), "off_binary": mesh_files.off_binary(colors=1), "dae": mesh_files.dae()}
     document, parts = mesh_files.glb_parts()
     for name, data in parts.items():
         document = document.replace(name.encode(), b"data:;base64," + base64.b64encode(data))
@@ -81,9 +77,7 @@ def _models() -> dict[str, bytes]:
 
 def _checkpoints() -> dict[str, bytes]:
     """Of other trainers, in the container of today."""
-    files = {"pin_slam": _saved(test_pin_slam.floor()), "isdf": _saved(test_isdf.checkpoint())}
-    files["nglod"] = _saved(test_nglod.checkpoint())
-    files["torch_ngp"] = _saved(test_torch_ngp.tcnn_checkpoint())
+    files = {"pin_slam": _saved(test_pin_slam.floor())}
     for make in (small.neus, small.siren, small.deepsdf, small.instant_nsr_pl):
         files[make.__name__] = _saved(make().checkpoint)
     rng = np.random.default_rng(4)

@@ -55,41 +55,6 @@ def strips_ply(binary: bool = False) -> bytes:
     return (header + text + " ".join(map(str, [len(strips), *strips])) + "\n").encode()
 
 
-def off(magic: str = "OFF", extra: str = "") -> bytes:
-    """BALL as text; ``extra`` stands behind each vertex."""
-    lines = [magic, "# a ball", f"{len(BALL.vertices)} {len(BALL.faces)} 0"]
-    lines += [f"{x!r} {y!r} {z!r}{extra}" for x, y, z in BALL.vertices.tolist()]
-    return "\n".join([*lines, *(f"3 {a} {b} {c} 255 0 0" for a, b, c in BALL.faces.tolist())]).encode()
-
-
-def off_binary(colors: int = 0) -> bytes:
-    rows = b"".join(
-        struct.pack(">5i", 3, *face, colors) + struct.pack(f">{colors}f", *[1.0] * colors) for face in FACES
-    )
-    counts = struct.pack(">3i", len(BALL.vertices), len(FACES), 0)
-    return b"OFF BINARY\n" + counts + bytes(BALL.vertices.astype(">f4").tobytes()) + rows
-
-
-def dae(body: str = "", nodes: str = '<node id="n"><instance_geometry url="#g"/></node>', head: str = "") -> bytes:
-    """BALL as COLLADA; ``body`` replaces its list of triangles, ``nodes`` its scene."""
-    places = " ".join(repr(value) for value in BALL.vertices.reshape(-1).tolist())
-    corners = " ".join(f"{i} 0" for face in FACES for i in face)
-    body = body or (
-        f'<triangles count="{len(FACES)}"><input semantic="VERTEX" source="#v" offset="0"/>'
-        f'<input semantic="NORMAL" source="#n" offset="1"/><p>{corners}</p></triangles>'
-    )
-    return f"""<?xml version="1.0" encoding="utf-8"?>{head}
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
-<library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="a" count="{3 * len(BALL.vertices)}">{places}</float_array>
-<technique_common><accessor source="#a" count="{len(BALL.vertices)}" stride="3"/></technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>{body}</mesh></geometry></library_geometries>
-<library_nodes><node id="shared"><instance_geometry url="#g"/></node></library_nodes>
-<library_visual_scenes><visual_scene id="s">{nodes}</visual_scene></library_visual_scenes>
-<scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()
-
-
 def pcd(points: npt.NDArray[np.float64], normals: npt.NDArray[np.float64] | None, data: str) -> bytes:
     names = "x y z" + (" normal_x normal_y normal_z curvature" if normals is not None else "")
     columns = points if normals is None else np.hstack([points, normals, np.zeros((len(points), 1))])

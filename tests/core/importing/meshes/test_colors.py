@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from regnf_core.fields.build import build_field
 from regnf_core.fields.observation import has_color
 from regnf_core.schema.safe_format import parse_description
-from tests.core.importing.meshes.mesh_files import BALL, FACES, converted, off
+from tests.core.importing.meshes.mesh_files import BALL, FACES, converted
 
 PAINT = np.random.default_rng(3).integers(0, 256, (len(BALL.vertices), 3))
 """R, G, B of the ball's vertices, up to 255."""
@@ -46,20 +45,6 @@ def obj(top: float) -> bytes:
     return "\n".join([*rows, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in FACES)]).encode()
 
 
-def coff(top: float) -> bytes:
-    lines = off("COFF").decode().splitlines()
-    for i, color in enumerate(PAINT):
-        shown = color.tolist() if top > 1.0 else (color / 255.0).tolist()
-        lines[3 + i] += " " + " ".join(map(repr, shown)) + " 255"
-    return "\n".join(lines).encode()
-
-
-def coff_binary() -> bytes:
-    rows = np.column_stack((BALL.vertices, PAINT / 255.0, np.ones(len(PAINT)))).astype(">f4").tobytes()
-    faces = b"".join(struct.pack(">5i", 3, *face, 0) for face in FACES)
-    return b"COFF BINARY\n" + struct.pack(">3i", len(PAINT), len(FACES), 0) + rows + faces
-
-
 def field_of(data: bytes, **said: Any) -> Any:
     made = converted(data, **said)
     tensors = {name: torch.from_numpy(np.array(array)) for name, array in made.tensors.items()}
@@ -79,9 +64,6 @@ FILES = {
     "binary ply": bytes(painted().export(file_type="ply")),
     "obj": obj(1.0),
     "obj up to 255": obj(255.0),
-    "off": coff(255.0),
-    "off of floats": coff(1.0),
-    "binary off": coff_binary(),
 }
 
 
@@ -122,8 +104,6 @@ def test_between_vertices_and_off_the_surface_the_closest_point_counts() -> None
 @pytest.mark.parametrize(
     "data",
     [
-        off(),
-        off("COFF", " 1 2"),  # too few numbers
         ply().replace(b"property uchar blue", b"property uchar violet"),
         b"\n".join([line[: line.rfind(b" ")] if line.startswith(b"v") else line for line in obj(1.0).splitlines()]),
     ],

@@ -48,11 +48,6 @@ def ply(shift: tuple[float, float, float], form: str) -> bytes:
     return header + at(shift).astype("<f8").tobytes() + faces.tobytes()
 
 
-def off(shift: tuple[float, float, float]) -> bytes:
-    lines = ["OFF", f"{len(BALL.vertices)} {len(BALL.faces)} 0", *(" ".join(map(repr, r)) for r in at(shift).tolist())]
-    return "\n".join([*lines, *(f"3 {a} {b} {c}" for a, b, c in BALL.faces.tolist())]).encode()
-
-
 def glb(shift: tuple[float, float, float]) -> bytes:
     scene = trimesh.Scene()
     scene.add_geometry(BALL, transform=trimesh.transformations.translation_matrix(shift))
@@ -75,8 +70,8 @@ def distances(folder: Path, name: str, data: bytes, shift: tuple[float, float, f
 @pytest.mark.parametrize("shift", [UTM, ECEF, NEARBY], ids=["utm", "ecef", "60 km"])
 @pytest.mark.parametrize(
     "write",
-    [obj, off, glb, lambda s: ply(s, "ascii"), lambda s: ply(s, "binary_little_endian")],
-    ids=["obj", "off", "glb", "ply text", "ply"],
+    [obj, glb, lambda s: ply(s, "ascii"), lambda s: ply(s, "binary_little_endian")],
+    ids=["obj", "glb", "ply text", "ply"],
 )
 def test_a_mesh_keeps_its_digits(write, shift: tuple[float, float, float], tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     here = distances(tmp_path, "here", write((0.0, 0.0, 0.0)), (0.0, 0.0, 0.0))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tests.core.importing.networks import slow_network as slow
 from tests.core.importing.networks.shapes import random_shape
-from tests.core.importing.networks.trained import Decoder, Implicit, OffAxis, Plain, Sines, split
+from tests.core.importing.networks.trained import Decoder, Implicit, Plain, Sines, split
 from tests.core.importing.networks.training import in_ball, in_cube, train
 
 Array = NDArray[np.float64]
@@ -152,23 +152,6 @@ def siren(rng: np.random.Generator, steps: int) -> Case:
     )
 
 
-def isdf(rng: np.random.Generator, steps: int) -> Case:
-    degree, blocks = int(rng.integers(1, 6)), int(rng.integers(0, 3))
-    usual = rng.random() < 0.6
-    scales = (0.05937489, 0.14) if usual else (float(rng.uniform(0.04, 1.0)), float(rng.uniform(0.1, 0.5)))
-    network = OffAxis(rng, degree, blocks, 40, scales)
-    _trained(network, rng, steps, ball=False, rate=2e-2)  # small factors: it has far to go
-    state = _numbers(network.state_dict())
-    bounds = [[-1.0] * 3, [1.0] * 3]
-    return Case(
-        {"step": 9, "model_state_dict": state, "loss": 0.1},
-        {"input_scale": scales[0], "output_scale": scales[1], "bounds": bounds},
-        {"bounds": bounds},
-        lambda x: slow.isdf(state, x, degree, blocks, scales),
-        f"degree {degree}, {blocks} blocks, scales {scales[0]:.3g}, {scales[1]:.3g}",
-    )
-
-
 def plain(rng: np.random.Generator, steps: int) -> Case:
     name = str(rng.choice(list(slow.ACTIVATIONS)))
     scale = {"softplus": float(rng.choice([1.0, 10.0, 100.0])), "sine": 30.0, "leaky_relu": 0.1}.get(name)
@@ -203,6 +186,5 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {
     "igr": igr,
     "deepsdf": deepsdf,
     "siren": siren,
-    "isdf": isdf,
     "plain_network": plain,
 }

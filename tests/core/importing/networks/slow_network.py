@@ -91,20 +91,6 @@ def siren(state: State, x: Array, omega: float, first: float | None = None) -> f
     return float(linear(state, f"net.net.{count - 1}.0", h)[0])
 
 
-def isdf(state: State, x: Array, degree: int, blocks: int, scales: tuple[float, float]) -> float:
-    directions = np.array(ICOSAHEDRON)
-    y = scales[0] * x
-    angles = [2.0**k * float(y @ direction) for direction in directions for k in range(degree)]
-    given = np.concatenate((y, np.sin(angles), np.cos(angles)))
-    h = ACTIVATIONS["softplus"](linear(state, "in_layer.0", given), 100.0)
-    for i in range(blocks):
-        h = ACTIVATIONS["softplus"](linear(state, f"mid1.{i}.0", h), 100.0)
-    h = ACTIVATIONS["softplus"](linear(state, "cat_layer.0", np.concatenate((h, given))), 100.0)
-    for i in range(blocks):
-        h = ACTIVATIONS["softplus"](linear(state, f"mid2.{i}.0", h), 100.0)
-    return float(scales[1] * linear(state, "out_alpha", h)[0])
-
-
 def plain(
     state: State, x: Array, degree: int, activation: str, scale: float, skip: int | None, factor: float, tanh: bool
 ) -> float:

@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tests.core.importing.networks.slow_network import ICOSAHEDRON
-
 State = OrderedDict[str, Tensor]
 
 
@@ -131,36 +129,6 @@ class Sines(nn.Module):
         for i in range(1, self.count - 1):
             h = torch.sin(self.omega * self.net[i](h))
         value: Tensor = self.net[self.count - 1](h)[:, 0]
-        return value
-
-
-class OffAxis(nn.Module):
-    """iSDF's: sines along 21 directions, softplus, the input again in the middle."""
-
-    def __init__(
-        self, rng: np.random.Generator, degree: int, blocks: int, hidden: int, scales: tuple[float, float]
-    ) -> None:
-        super().__init__()
-        torch.manual_seed(int(rng.integers(1 << 30)))
-        self.degree, self.scales = degree, scales
-        width = 3 + 42 * degree
-
-        def block(columns: int) -> nn.Sequential:
-            return nn.Sequential(nn.Linear(columns, hidden), nn.Softplus(beta=100))
-
-        self.in_layer, self.cat_layer = block(width), block(hidden + width)
-        self.mid1 = nn.Sequential(*(block(hidden) for _ in range(blocks)))
-        self.mid2 = nn.Sequential(*(block(hidden) for _ in range(blocks)))
-        self.out_alpha = nn.Linear(hidden, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        y = self.scales[0] * x
-        lengths = y @ torch.tensor(ICOSAHEDRON, dtype=torch.float32).T
-        angles = (lengths[..., None] * 2.0 ** torch.arange(self.degree)).flatten(1)
-        given = torch.cat((y, angles.sin(), angles.cos()), dim=-1)
-        h = self.mid1(self.in_layer(given))
-        h = self.mid2(self.cat_layer(torch.cat((h, given), dim=-1)))
-        value: Tensor = self.scales[1] * self.out_alpha(h)[:, 0]
         return value
 
 

@@ -60,25 +60,6 @@ def test_implicit_networks(name: str, width: int, sphere: float, where: str) -> 
     assert found.values == {"positional_encoding": {"degree": 6}, "bounds": [[-sphere] * 3, [sphere] * 3]}
 
 
-def test_a_grid_of_monosdf_s_without_a_table() -> None:
-    text = "model { Grid_MLP = True\n implicit_network { dims = [256, 256], multires = 6, use_grid_feature = True } }"
-    shapes = linear("implicit_network.lin", [256, 256, 257], [71, 256, 256])
-    assert_refused(lambda: translated({"dtu_grids_3views.conf": text}, facts(shapes)), "SETTINGS_CONTRADICT_TENSORS")
-    plain = translated({"dtu_mlp_3views.conf": text.replace("feature = True", "feature = False")}, facts(shapes))
-    assert plain.values == {"positional_encoding": {"degree": 6}}
-
-
-@pytest.mark.parametrize(("rows", "is_default"), [(6_098_108, True), (6_098_120, True), (5_000_000, False)])
-def test_defaults_of_monosdf_s_grid_count_where_they_give_the_table(rows: int, is_default: bool) -> None:
-    text = "model { implicit_network { multires = 6, use_grid_feature = True, divide_factor = 1.1 } }"
-    said = translated({"a.conf": text}, facts({"implicit_network.encoding.embeddings": (rows, 2)})).values["hash"]
-    assert said["radius"] == 1.1
-    assert ("top_resolution" in said) is is_default
-    text = text.replace("1.1", "1.1, level_dim = 4")
-    said = translated({"a.conf": text}, facts({"implicit_network.encoding.embeddings": (rows, 2)})).values["hash"]
-    assert said == {"radius": 1.1, "features_per_level": 4}
-
-
 DEEPSDF = linear("model_state_dict.module.lin", [512] * 3 + [253] + [512] * 4 + [1], [259] + [512] * 8)
 
 

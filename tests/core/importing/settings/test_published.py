@@ -6,25 +6,14 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from tests.core.importing.archives import assert_refused
 from tests.core.importing.settings.translating import facts, translated
 
-MONOSDF_GRID = {
-    "levels": 16,
-    "features_per_level": 2,
-    "log2_table_size": 19,
-    "base_resolution": 16,
-    "top_resolution": 2048,
-}
-"""Its files leave the layout out: these are the trainer's defaults."""
-MONOSDF_ROWS = sum(min(1 << 19, (math.ceil(16 * 128 ** (level / 15)) + 1) ** 3) for level in range(16))
 _PUBLISHED = json.loads((Path(__file__).parent / "published_configurations.json").read_text())
 
 
@@ -59,13 +48,7 @@ def test_implicit_networks(name: str, values: dict[str, Any]) -> None:
         expected["bounds"] = [[-sphere] * 3, [sphere] * 3]
     if network.get("inside_outside"):
         expected["sign"] = 1  # a room, as it should be
-    if "use_grid_feature" in network:
-        expected |= {
-            "use_grid": network["use_grid_feature"],
-            "hash": MONOSDF_GRID | {"radius": network["divide_factor"]},
-        }
-    known = facts({"implicit_network.encoding.embeddings": (MONOSDF_ROWS, 2)} if "use_grid_feature" in network else {})
-    assert translated({name: text}, known).values == expected
+    assert translated({name: text}, facts({})).values == expected
 
 
 @pytest.mark.parametrize(("name", "values"), configurations("deepsdf"))
@@ -102,28 +85,7 @@ def test_neuralangelo(name: str, values: dict[str, Any]) -> None:
     assert (said["hash"]["features_per_level"], said["hash"]["log2_table_size"]) == (grid["dim"], grid["dict_size"])
 
 
-@pytest.mark.parametrize(("name", "values"), configurations("isdf"))
-def test_isdf(name: str, values: dict[str, Any]) -> None:
-    said = translated({"config.json": json.dumps({"dataset": {"format": name}, "model": values})}).values
-    scales = {"input_scale": values["embedding"]["scale_input"], "output_scale": values["scale_output"]}
-    assert said == {"family": "isdf", **scales}
-    values = values | {"embedding": values["embedding"] | {"gauss_embed": 1}}
-    assert_refused(lambda: translated({"config.json": json.dumps({"model": values})}), "FAMILY_NOT_SUPPORTED")
-
-
 @pytest.mark.parametrize(("name", "values"), configurations("pin_slam"))
 def test_pin_slam(name: str, values: dict[str, Any]) -> None:
     """Its map holds what the function needs; without the map there is nothing to compare."""
     assert translated({name: yaml.safe_dump({"setting": {"name": "a"}, **values})}).values == {"family": "pin_slam"}
-
-
-@pytest.mark.parametrize(("name", "values"), configurations("co_slam"))
-def test_co_slam(name: str, values: dict[str, Any]) -> None:
-    """Each scene's file with that of its dataset, as the trainer writes them to a run's config.json."""
-    said = translated({"config.json": json.dumps(values)}).values
-    bound, grid = values["mapping"]["bound"], values["grid"]
-    assert said["grid_box"] == [[low for low, _ in bound], [high for _, high in bound]]
-    assert said["truncation"] == values["training"]["trunc"] * values["data"]["sc_factor"]
-    cells = max(high - low for low, high in bound) / grid["voxel_sdf"]
-    assert abs(said["hash"]["top_resolution"] - cells + 0.5) <= 0.5 + 1e-6
-    assert said["hash"]["log2_table_size"] == grid["hash_size"]
