@@ -31,9 +31,9 @@ def serve(
     Example: **regnf serve --port 8080**
     """
     require("service")
-    from regnf_cli.doctor import read_settings
     from regnf_cli.supervisor import Supervisor
     from regnf_state.logs import configure_logging
+    from regnf_state.settings import read_settings
 
     settings = read_settings(host=host, port=port, state_dir=state_dir, workers=workers)
     if settings.workers:

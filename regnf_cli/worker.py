@@ -27,10 +27,10 @@ def worker(
     from redis.exceptions import ConnectionError as RedisConnectionError
     from redis.exceptions import TimeoutError as RedisTimeoutError
 
-    from regnf_cli.doctor import check_redis_url, read_settings
     from regnf_cli.embedded_redis import StartError
     from regnf_state.journal.journal import StorageMismatchError
     from regnf_state.redis.client import NoRedisError
+    from regnf_state.settings import check_redis_url, read_settings
     from regnf_worker.main import PreloadError, run_worker
 
     if redis_url is not None:

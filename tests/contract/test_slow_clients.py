@@ -28,7 +28,7 @@ def hurried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     folder = tmp_path_factory.mktemp("hurried")
-    with live_service(folder, with_worker=False, metrics_port=port, **LIMITS) as started:
+    with live_service(folder, with_worker=False, metrics_address=f"127.0.0.1:{port}", **LIMITS) as started:
         started.metrics_port = port  # type: ignore[attr-defined]
         yield started
 

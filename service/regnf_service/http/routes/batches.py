@@ -112,7 +112,7 @@ async def _read(request: Request, services: Services, intake: Intake, pace: Pace
 
 def _answer(services: Services, batch: Batch, prefix: str, status: int = 200) -> JSONResponse:
     """The batch; 200 in place of ``status`` where none of its jobs waits or runs."""
-    document = document_of(batch, state_of(services, batch), services.settings.retention_s, prefix)
+    document = document_of(batch, state_of(services, batch), services.settings.job_retention_s, prefix)
     status = status if document["status"] == "running" else 200
     return JSONResponse(document, status_code=status, headers={"Cache-Control": "no-cache"})
 
@@ -133,7 +133,7 @@ def list_batches(
 ) -> Response:
     """A page may be short and not be the last: go on while there is a `next_page_token`."""
     page = services.batches.page(caller, limit, decode_token(page_token))
-    documents = [summary_of(one, services.settings.retention_s, prefix) for one in page.records]
+    documents = [summary_of(one, services.settings.job_retention_s, prefix) for one in page.records]
     return JSONResponse({"batches": documents, "next_page_token": encode_token(page.rest)})
 
 

@@ -65,7 +65,7 @@ def _answer(services: Services, seen: _Seen, prefix: str, status: int) -> JSONRe
     headers = {"ETag": _etag(seen), "Cache-Control": "no-cache"}
     if record.status in ACTIVE:
         headers["Retry-After"] = _RETRY_AFTER_S
-    document = job_document(record, position, services.settings.retention_s, prefix, deliveries)
+    document = job_document(record, position, services.settings.job_retention_s, prefix, deliveries)
     return JSONResponse(document, status_code=status, headers=headers)
 
 
@@ -100,7 +100,7 @@ def list_jobs(
     if wants_page(request.scope):
         return page("lists.html")
     found = services.records.list_jobs(status, limit, decode_token(page_token), caller)
-    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in found.records]
+    documents = [job_document(record, None, services.settings.job_retention_s, prefix) for record in found.records]
     document = {"jobs": documents, "next_page_token": encode_token(found.rest)}
     return JSONResponse(document, headers={"Vary": "Accept"})
 
