@@ -227,7 +227,7 @@ def test_streams_at_once(worlds: Callable[..., World]) -> None:
     job_id = world.submit()
     services = world.app.state.services
     with services.streams.held("anonymous"):
-        assert_refused(world.client.get(f"/jobs/{job_id}/events"), 429, "TOO_MANY_STREAMS")
+        assert_refused(world.client.get(f"/jobs/{job_id}/events"), 429, "TOO_MANY_REQUESTS_AT_ONCE")
     world.succeed(job_id)
     for _ in range(2):
         assert world.client.get(f"/jobs/{job_id}/events").status_code == 200

@@ -86,7 +86,7 @@ def test_a_trickled_upload_is_cut_off(hurried: Live, head: bytes) -> None:
     """Each byte comes well before the server would call it a stall."""
     with hurried.connect() as connection:
         connection.sendall(head + b"Host: localhost\r\nContent-Length: 4000000\r\n\r\n" + field_bytes("trickled"))
-        assert b"UPLOAD_STALLED" in ended_while_trickling(connection, b"\0")
+        assert b"REQUEST_STALLED" in ended_while_trickling(connection, b"\0")
 
 
 def test_a_body_that_nobody_reads_is_cut_off(hurried: Live) -> None:

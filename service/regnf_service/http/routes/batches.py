@@ -59,9 +59,8 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "MALFORMED_JSON",
             "REQUEST_TOO_LARGE",
             "TOO_MANY_PAIRS",
-            "BATCH_EMPTY",
             "UPLOAD_INCOMPLETE",
-            "UPLOAD_STALLED",
+            "REQUEST_STALLED",
             "TOO_MANY_UPLOADS",
             "QUOTA_ACTIVE_JOBS",
             "QUOTA_BATCHES",
@@ -121,7 +120,7 @@ def _answer(services: Services, batch: Batch, prefix: str, status: int = 200) ->
     "/batches",
     summary="Batches, those posted last first",
     response_model=BatchPage,
-    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+    responses=refusals("INVALID_QUERY"),
 )
 @blocking
 def list_batches(

@@ -81,7 +81,7 @@ def _etag(seen: _Seen) -> str:
     "/jobs",
     summary="Jobs, newest first",
     response_model=JobPage,
-    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY")},
 )
 @blocking
 def list_jobs(
@@ -169,7 +169,7 @@ def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response: 
             "content": {sse.MEDIA_TYPE: {"schema": _EVENT}},
         },
         204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
-        **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_STREAMS"),
+        **refusals("INVALID_HEADER", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_REQUESTS_AT_ONCE"),
     },
 )
 async def job_events(
@@ -185,7 +185,7 @@ async def job_events(
     try:
         waiting = await in_thread(services.records.events, id, last_event_id)
     except ValueError as error:
-        raise Problem("INVALID_EVENT_ID") from error
+        raise Problem("INVALID_HEADER", "`Last-Event-ID` is not the id of an event of this service.") from error
     if last_event_id is not None and record.status not in ACTIVE and not waiting:
         return Response(status_code=204)
     return sse.EventStream(services.streams, caller, sse.event_stream(services, id, last_event_id))
