@@ -18,7 +18,7 @@ OF_STATE = frozenset(
         "LIBRARY_TOO_LARGE",
         "EDIT_POSE_REJECTED",  # which jobs there are
         "IDEMPOTENCY_KEY_REUSED",  # what was asked before
-        "INVALID_PAGE_TOKEN",  # which pages there are
+        "INVALID_QUERY",  # which pages there are
         "WEBHOOK_NOT_ALLOWED",  # the operator's settings
         "OPTIONS_TOO_COSTLY",
         "RENDER_TOO_LARGE",

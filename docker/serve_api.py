@@ -10,13 +10,14 @@ import sys
 
 from regnf_cli import api_process
 from regnf_cli.embedded_redis import StartError, open_socket
-from regnf_state.settings import Settings
+from regnf_core.errors import InvalidInputError
+from regnf_state.settings import read_settings
 
 
 def main() -> int:
     try:
-        listener = open_socket(Settings())
-    except StartError as error:
+        listener = open_socket(read_settings())
+    except (InvalidInputError, StartError) as error:
         sys.stderr.write(f"{error.reason}: {error}\n")
         return 2
     api_process.main(listener.detach())

@@ -32,8 +32,8 @@ RUN groupadd --system --gid 10001 regnf \
     && install --directory --owner regnf --group regnf --mode 0750 /var/lib/regnf
 COPY --from=build /opt/regnf /opt/regnf
 COPY docker/serve_api.py /opt/regnf/serve_api.py
-# A container's loopback is of no use to anyone outside it. Listening elsewhere needs REGNF_API_TOKENS, REGNF_PUBLISH on
-# the host's loopback, or REGNF_ALLOW_UNAUTHENTICATED=true where something else keeps strangers out.
+# A container's loopback is of no use to anyone outside it. Listening elsewhere needs REGNF_BEHIND_PROXY=true, and
+# REGNF_API_TOKENS, REGNF_PUBLISH on the host's loopback, or REGNF_ALLOW_UNAUTHENTICATED=true.
 ENV PATH=/opt/regnf/bin:$PATH \
     HOME=/tmp \
     PYTHONUNBUFFERED=1 \

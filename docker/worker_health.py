@@ -13,9 +13,10 @@ from typing import Any
 from redis import Redis, RedisError
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
+from regnf_core.errors import InvalidInputError
 from regnf_state.queue import QUEUE_NAME
 from regnf_state.redis.client import NoRedisError, redis_address
-from regnf_state.settings import Settings
+from regnf_state.settings import read_settings
 
 _TIMEOUT_S = 5.0
 
@@ -33,8 +34,8 @@ def is_alive(redis: Redis, hostname: str) -> bool:
 
 def main() -> int:
     try:
-        url = redis_address(Settings())
-    except NoRedisError as error:
+        url = redis_address(read_settings())
+    except (InvalidInputError, NoRedisError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     try:

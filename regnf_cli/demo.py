@@ -44,7 +44,9 @@ def running_service(state_dir: Path, checkout: Path | None = None, **settings: o
     """
     state_dir.mkdir(parents=True, exist_ok=True)
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("REGNF_", "PYTHONPATH"))}
-    environment |= {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
+    from regnf_state.settings import variables
+
+    environment |= variables(**settings)
     python = sys.executable if checkout is None else str(checkout / ".venv" / "bin" / "python")
     command = [python, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(state_dir)]
     with (state_dir / "serve.log").open("w") as log:

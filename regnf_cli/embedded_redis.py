@@ -16,13 +16,13 @@ from regnf_core.errors import RegnfError
 from regnf_service.http.hosts import HostsError, allowed_hosts, cors_origins
 from regnf_service.tokens import TokensError, read_callers
 from regnf_service.webhooks.targets import AllowList, read_secrets
-from regnf_state.settings import Settings
+from regnf_state.settings import Settings, is_loopback
 
 # Why a service or a worker could not be started.
 
 
 class StartError(RegnfError):
-    """Reasons: STATE_DIR_IN_USE, STATE_DIR_UNUSABLE, ADDRESS_UNAVAILABLE, UNAUTHENTICATED_PUBLIC_BIND,
+    """Reasons: STATE_DIR_IN_USE, STATE_DIR_UNUSABLE, ADDRESS_UNAVAILABLE, UNAUTHENTICATED_PUBLIC_BIND, PROXY_MISSING,
     TOKENS_UNUSABLE, EMBEDDED_REDIS_MISSING, SERVICE_START_FAILED, REDIS_URL_MISSING, REDIS_UNAVAILABLE,
     STORAGE_MISMATCH."""
 
@@ -84,11 +84,8 @@ def answers(url: str) -> bool:
 # The socket that the service listens on: opened by the supervisor, so that it outlives an API process that dies.
 
 _BACKLOG = 2048
-_TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list or one a line in REGNF_API_TOKENS_FILE."
-_SECRETS_HINT = (
-    "Write entries as CALLER:whsec_BASE64, in REGNF_WEBHOOK_SECRETS as a JSON list or one a line in "
-    "REGNF_WEBHOOK_SECRETS_FILE."
-)
+_TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list, or one a line in a file: @/its/path."
+_SECRETS_HINT = "Write REGNF_WEBHOOK_SECRETS as a JSON list of CALLER:whsec_BASE64, or one a line in a file: @/path."
 _WEBHOOK_HOSTS_HINT = 'Write REGNF_WEBHOOK_HOSTS as a JSON list, for example ["hooks.example.org", "10.0.0.5:9000"].'
 _HOSTS_HINT = (
     'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"], and'
@@ -100,7 +97,8 @@ logger = logging.getLogger(__name__)
 def check_access(settings: Settings) -> None:
     """Raises StartError for what would let strangers in, and for callers that cannot be read.
 
-    UNAUTHENTICATED_PUBLIC_BIND: others can reach the address while no token is asked for. TOKENS_UNUSABLE and
+    PROXY_MISSING: others can reach the address, and no proxy is said to stand before it.
+    UNAUTHENTICATED_PUBLIC_BIND: others can reach the service while no token is asked for. TOKENS_UNUSABLE and
     ALLOWED_HOSTS_UNUSABLE: see there.
     """
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
@@ -109,12 +107,19 @@ def check_access(settings: Settings) -> None:
             reason="UNAUTHENTICATED_PUBLIC_BIND",
             hint="Set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind a proxy that authenticates.",
         )
+    if not is_loopback(settings.host) and not settings.behind_proxy:
+        raise StartError(
+            f"{settings.host} can be reached by others, and the service bears no slow or hostile connections",
+            reason="PROXY_MISSING",
+            hint="Listen on 127.0.0.1 with a proxy before it (deploy/helm/regnf/proxy), or, where one keeps others from"
+            " this address, set REGNF_BEHIND_PROXY=true.",
+        )
     try:
-        read_callers(settings.api_tokens, settings.api_tokens_file)
+        read_callers(settings.api_tokens)
     except TokensError as error:
         raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
     try:
-        read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
+        read_secrets(settings.webhook_secrets)
     except TokensError as error:
         raise StartError(str(error), reason=error.reason, hint=_SECRETS_HINT) from error
     try:
@@ -160,7 +165,7 @@ def _address_hint(error: OSError, settings: Settings) -> str:
         return f"Another program uses port {settings.port}: stop it, or give --port 0 for a free one."
     if error.errno == errno.EACCES:
         return "Ports below 1024 need privileges: give --port 8080."
-    return "Give an address of this machine with --host: 127.0.0.1 for this machine alone, 0.0.0.0 for all networks."
+    return "Give an address of this machine with --host: 127.0.0.1 for this machine alone."
 
 
 def address_of(listener: socket.socket) -> str:

@@ -31,9 +31,9 @@ def serve(
     Example: **regnf serve --port 8080**
     """
     require("service")
-    from regnf_cli.doctor import read_settings
     from regnf_cli.supervisor import Supervisor
     from regnf_state.logs import configure_logging
+    from regnf_state.settings import read_settings
 
     settings = read_settings(host=host, port=port, state_dir=state_dir, workers=workers)
     if settings.workers:
@@ -62,10 +62,10 @@ def worker(
     from redis.exceptions import ConnectionError as RedisConnectionError
     from redis.exceptions import TimeoutError as RedisTimeoutError
 
-    from regnf_cli.doctor import check_redis_url, read_settings
     from regnf_cli.embedded_redis import StartError
     from regnf_state.journal.journal import StorageMismatchError
     from regnf_state.redis.client import NoRedisError
+    from regnf_state.settings import check_redis_url, read_settings
     from regnf_worker.main import PreloadError, run_worker
 
     if redis_url is not None:

@@ -26,7 +26,7 @@ from redis.exceptions import RedisError
 
 from regnf_cli.embedded_redis import StartError, address_of, answers, open_socket, server_command
 from regnf_state.journal.journal import StorageMismatchError, claim_storage
-from regnf_state.settings import SECRETS, Settings
+from regnf_state.settings import SECRETS, Settings, variables
 from regnf_state.stores import open_stores
 
 # One process that the supervisor keeps running.
@@ -307,15 +307,16 @@ class Supervisor:
         return url
 
     def _start_rest(self, redis_url: str, listener: socket.socket) -> None:
-        environment = os.environ | {
-            "REGNF_REDIS_URL": redis_url,
-            "REGNF_STATE_DIR": str(self._settings.state_dir),
-            "REGNF_HOST": self._settings.host,
-            "REGNF_PORT": str(listener.getsockname()[1]),
-            "REGNF_WORKERS": str(self._settings.workers),
-        }
-        if self._settings.demo_dir is not None:
-            environment["REGNF_DEMO_DIR"] = str(self._settings.demo_dir)
+        settings, port = self._settings, listener.getsockname()[1]
+        told = variables(
+            redis_url=redis_url,
+            state_dir=settings.state_dir,
+            host=settings.host,
+            port=port,
+            workers=settings.workers,
+            **({"demo_dir": settings.demo_dir} if settings.demo_dir is not None else {}),
+        )
+        environment = os.environ | told
         descriptor = listener.fileno()
         api = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
         self._api = Child("api", api, environment, passed=[descriptor])

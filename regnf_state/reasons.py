@@ -23,7 +23,7 @@ class Reason:
 REASONS: dict[str, Reason] = {
     # the request as such
     "MALFORMED_REQUEST": Reason(400, "Malformed request", "The request's head or the framing of its body is no HTTP."),
-    "REQUEST_STALLED": Reason(408, "Request stalled", "The request's head did not arrive in time. Send it at once."),
+    "REQUEST_STALLED": Reason(408, "Request stalled", "The head or the body did not arrive in time. Nothing was kept."),
     "HEADERS_TOO_LARGE": Reason(431, "Headers too large", "The request's head has too many lines or too many bytes."),
     "TOO_MANY_CONNECTIONS": Reason(
         503, "Too many connections", "The service, or your address, has the maximum number of connections. Close some."
@@ -36,9 +36,7 @@ REASONS: dict[str, Reason] = {
         "Invalid query",
         "`errors` names the parameters that are unknown, given twice, of the wrong type or out of range.",
     ),
-    "INVALID_PAGE_TOKEN": Reason(400, "Invalid page token", "Use `next_page_token` of the page before, unchanged."),
     "INVALID_HEADER": Reason(400, "Invalid header", "A request header does not follow its grammar or its limits."),
-    "INVALID_EVENT_ID": Reason(400, "Invalid event id", "`Last-Event-ID` is not the id of an event of this service."),
     "UNAUTHENTICATED": Reason(401, "Authentication required", "Send `Authorization: Bearer` with a valid token."),
     "HOST_NOT_ALLOWED": Reason(
         421,
@@ -78,15 +76,11 @@ REASONS: dict[str, Reason] = {
     "MALFORMED_MULTIPART": Reason(400, "Malformed multipart body", "The parts or their headers cannot be read."),
     "MISSING_PART": Reason(400, "Missing part", "A part that this address needs is not there."),
     "UNKNOWN_PART": Reason(400, "Unknown part", "The body has a part that this address does not know."),
-    "DUPLICATE_PART": Reason(400, "Duplicate part", "Two parts bear the same name."),
     # uploads
     "INVALID_DIGEST": Reason(400, "Invalid digest", "A SHA-256 is 64 lower-case hexadecimal digits."),
     "DIGEST_MISMATCH": Reason(400, "Digest mismatch", "The bytes that arrived are not the bytes that were announced."),
     "UPLOAD_EMPTY": Reason(400, "Empty upload", "The upload has no bytes."),
     "UPLOAD_INCOMPLETE": Reason(400, "Incomplete upload", "The body ended before its declared length."),
-    "UPLOAD_STALLED": Reason(
-        408, "Upload stalled", "The body sent nothing, or too little, for too long. Nothing was kept."
-    ),
     "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
     "UPLOAD_OFFSET_MISMATCH": Reason(
         409,
@@ -123,9 +117,6 @@ REASONS: dict[str, Reason] = {
         "No picture",
         "Only fields that are `ready` have a picture, and not all of them do. With `Retry-After` it is still to be "
         "made. Of a rejected field, candidates have one while its upload is kept.",
-    ),
-    "DEMO_NOT_FOUND": Reason(
-        404, "No demo", "This service offers no demo: `regnf serve` does. Upload fields of your own."
     ),
     "FIELD_MESH_NOT_FOUND": Reason(
         404,
@@ -172,9 +163,6 @@ REASONS: dict[str, Reason] = {
         "The request names more entries than one search takes. Name fewer, or a tag that fewer have.",
     ),
     # registration requests
-    "INVALID_IDEMPOTENCY_KEY": Reason(
-        400, "Invalid idempotency key", "The key is empty, longer than 255 characters, or not printable ASCII."
-    ),
     "IDEMPOTENCY_KEY_REUSED": Reason(
         422, "Idempotency key reused", "The key came with another request within the last 24 hours. Use a new one."
     ),
@@ -205,7 +193,6 @@ REASONS: dict[str, Reason] = {
     "DETECTION_OUTSIDE_SCENE": Reason(
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."
     ),
-    "INVALID_WEBHOOK": Reason(422, "Invalid webhook", 'Send `{"url": ...}`, a URL of 8 to 2000 characters.'),
     "WEBHOOK_NOT_ALLOWED": Reason(
         422, "Webhook not allowed", "The service does not allow its host, or has no secret of yours to sign with."
     ),
@@ -269,9 +256,6 @@ REASONS: dict[str, Reason] = {
     # jobs
     "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
     "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),
-    "TOO_MANY_STREAMS": Reason(
-        429, "Too many streams at once", "You have the maximum number of open streams. Close one."
-    ),
     "JOB_NOT_READY": Reason(409, "Job not finished", "The job has no result yet. Retry after `Retry-After`."),
     "JOB_DISMISSED": Reason(409, "Job was dismissed", "The job was cancelled. Post the request again to run it."),
     "JOB_FAILED": Reason(409, "Job has failed", "The job ended without a result. `error` is its own problem."),
@@ -286,11 +270,9 @@ REASONS: dict[str, Reason] = {
     "RANGE_NOT_SATISFIABLE": Reason(416, "Range not satisfiable", "The range begins past the artifact's end."),
     # batches
     "BATCH_NOT_FOUND": Reason(404, "No such batch", "The id is unknown, or the batch is gone. Post its lines again."),
-    "BATCH_EMPTY": Reason(422, "Batch without pairs", "The body has no line. Send one request a line."),
     "TOO_MANY_PAIRS": Reason(
         413, "Too many pairs", "The batch has more lines than the service takes. Send them as several batches."
     ),
-    "LINE_TOO_LARGE": Reason(413, "Line too large", "A line of a batch may have 65,536 bytes."),
     "QUOTA_BATCHES": Reason(
         429, "Quota of batches used up", "You have the maximum number of batches, and none has ended. Wait for one."
     ),

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
-from pydantic import BeforeValidator, Field, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict, SettingsError
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.texts import TextError, decode_text
 
 MIB = 1024 * 1024
 _RATE_BEYOND_LOOPBACK = 20.0
@@ -24,6 +29,20 @@ def _default_state_dir() -> Path:
 
 SECRETS = frozenset({"REGNF_API_TOKENS", "REGNF_WEBHOOK_SECRETS"})
 """Variables that only the API's process needs to see."""
+_PREFIX = "REGNF_"
+_FIXED_VARIABLE = "REGNF_TEST_FIXED"
+"""A JSON object of values of ``Fixed``, for tests and measurements that start processes."""
+_RENAMED = {
+    "REGNF_API_TOKENS_FILE": "REGNF_API_TOKENS=@/path/of/the/file",
+    "REGNF_WEBHOOK_SECRETS_FILE": "REGNF_WEBHOOK_SECRETS=@/path/of/the/file",
+    "REGNF_REDIS_PASSWORD_FILE": "REGNF_REDIS_PASSWORD=@/path/of/the/file",
+    "REGNF_METRICS_HOST": "REGNF_METRICS_ADDRESS=host:port",
+    "REGNF_METRICS_PORT": "REGNF_METRICS_ADDRESS=host:port",
+    "REGNF_RATE_LIMIT_PER_S": "REGNF_QUOTA_CALLS_PER_S",
+    "REGNF_RETENTION_S": "REGNF_JOB_RETENTION_S",
+    "REGNF_UNUSED_FIELD_RETENTION_S": "REGNF_FIELD_RETENTION_S",
+    "REGNF_STORAGE_CAP_BYTES": "REGNF_MAX_STORED_BYTES",
+}
 
 
 def is_loopback(host: str) -> bool:
@@ -34,52 +53,47 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-class Settings(BaseSettings):
-    """Every setting has a default that works on one machine; each is REGNF_<NAME> in the environment."""
+def variables(**settings: object) -> dict[str, str]:
+    """The environment that gives a process these settings, and these values of ``Fixed``."""
+    fixed = {name: value for name, value in settings.items() if name in Fixed.model_fields}
+    told = {f"{_PREFIX}{name.upper()}": str(value) for name, value in settings.items() if name not in fixed}
+    return told | ({_FIXED_VARIABLE: json.dumps(fixed)} if fixed else {})
 
-    model_config = SettingsConfigDict(env_prefix="REGNF_", frozen=True, extra="ignore", hide_input_in_errors=True)
 
-    host: str = "127.0.0.1"
-    port: int = Field(default=8080, ge=0, le=65535)
-    """0 asks the system for a free port; the address is printed once it listens."""
-    state_dir: Path = Field(default_factory=_default_state_dir)
-    """Blobs, the embedded Redis' files and temporary uploads live under it."""
-    demo_dir: Path | None = None
-    """Where the demo's files lie, which the home page offers. `regnf serve` sets it; unset: no demo."""
-    redis_url: str | None = Field(default=None, repr=False)
-    """Unset: `regnf serve` starts a private server of its own."""
-    queue_key: Annotated[Annotated[str, Field(min_length=16)] | None, BeforeValidator(lambda given: given or None)] = (
-        Field(default=None, repr=False)
-    )
-    """Signs what the queue in Redis holds; the same for front ends and workers. What is not signed never runs."""
-    redis_password_file: Path | None = None
-    """A file with Redis' password, in place of one in the address."""
-    workers: int = Field(default=1, ge=0, le=64)
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where registrations run; auto: on the GPU if torch can use one."""
-    threads: int | None = Field(default=None, ge=1, le=256)
-    """Threads of each job's process; unset: cores / workers."""
-    preload: bool = sys.platform.startswith("linux")
-    """Workers load the engine once and for all jobs: each begins sooner, and an idle worker holds more memory.
+def _secret(given: object) -> object:
+    """A secret, or `@` and the path of a file that holds it. Empty: none. Raises ValueError."""
+    if not isinstance(given, str) or not given.startswith("@"):
+        return given or None
+    try:
+        text = decode_text(Path(given[1:]).read_bytes()).strip()
+    except OSError as error:
+        raise ValueError(f"the file {given[1:]} cannot be read: {error.strerror}") from error
+    except TextError as error:
+        raise ValueError(f"the file {given[1:]} is {error}") from error
+    if not text:
+        raise ValueError(f"the file {given[1:]} is empty")
+    return text
 
-    Elsewhere it is not known whether what is loaded starts threads, which a fork leaves behind.
-    """
-    api_tokens: frozenset[str] = Field(default=frozenset(), repr=False)
-    """JSON list of `name:token`, or of tokens. Empty: no token needed, which is allowed on loopback only."""
-    api_tokens_file: Path | None = None
-    """More of them, one a line."""
-    publish: str | None = None
-    """In a container: where its port is published on the host, as compose takes it, `address:port`."""
-    allowed_hosts: frozenset[str] = frozenset()
-    """JSON list of the names under which the service is called: `host`, `host:port`, `*.domain`; `*`: any.
 
-    Loopback's names and the address that a connection arrives on need not be listed.
-    """
-    cors_origins: frozenset[str] = frozenset()
-    """JSON list of other sites whose pages may call this service: `https://name[:port]`. Empty: none."""
-    allow_unauthenticated: bool = False
-    """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
-    max_upload_bytes: int = Field(default=4096 * MIB, ge=1)
+def _entries(given: object) -> object:
+    """Secrets as a JSON list, or `@` and the path of a file with one a line, # before a comment. Raises ValueError."""
+    if not isinstance(given, str):
+        return given
+    if not given.startswith("@"):
+        try:
+            return json.loads(given or "[]")
+        except ValueError:
+            raise ValueError("no JSON list, and no @ with the path of a file") from None
+    lines = [line.strip() for line in str(_secret(given)).splitlines()]
+    entries = [line for line in lines if line and not line.startswith("#")]
+    if not entries:
+        raise ValueError(f"the file {given[1:]} holds no entry")
+    return entries
+
+
+class Fixed(BaseModel):
+    """What no variable sets: nobody needs other values. Only tests and measurements give them."""
+
     max_request_bytes: int = Field(default=1 * MIB, ge=1024)
     """Largest JSON body."""
     upload_stall_s: float = Field(default=30.0, gt=0)
@@ -91,16 +105,13 @@ class Settings(BaseSettings):
     max_connections: int = Field(default=4096, ge=1)
     """Less where the system allows fewer open files. Beyond it the connections that wait for their clients go."""
     max_connections_per_address: int | None = Field(default=None, ge=1)
-    """Unset: half of all. Behind a proxy every caller has the proxy's address."""
-    max_queued_jobs: int = Field(default=1000, ge=1)
-    rate_limit_per_s: float | None = Field(default=None, ge=0)
-    """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""
+    """None: half of all; behind a proxy, which is one address, all."""
     rate_limit_burst: int = Field(default=100, ge=1)
     """Calls that a caller may make at once after a pause."""
     write_limit_per_s: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     """Requests a second of each caller that are no reads, in one process; 0: any.
 
-    Unset: any on loopback without tokens, 10 elsewhere.
+    None: any on loopback without tokens, 10 elsewhere.
     """
     write_limit_burst: int = Field(default=200, ge=1)
     """Such requests that a caller may send at once after a pause."""
@@ -108,38 +119,107 @@ class Settings(BaseSettings):
     """Requests of each caller that are in progress in one process; without tokens, of each address."""
     max_uploads_per_caller: int = Field(default=64, ge=2)
     max_streams_per_caller: int = Field(default=100, ge=1)
-    quota_active_jobs: int | None = Field(default=None, ge=1)
-    """Jobs of each caller that wait or run. Unset: with tokens, as many as are left free for others."""
     max_imports_per_caller: int = Field(default=64, ge=1)
     """Imports of each caller that wait or run."""
-    quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
-    """What each caller's imports and jobs may cost the workers in an hour."""
     quota_batches: int = Field(default=100, ge=1)
     """Of each caller; beyond this the one goes that was posted first of those that have ended."""
     max_batch_pairs: int = Field(default=1000, ge=1)
     max_batch_bytes: int = Field(default=8 * MIB, ge=1024)
     """Largest body of a batch."""
-    caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
-    """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""
     worker_reserve_s: float = Field(default=300.0, ge=0, le=86400)
     """How long after a caller's last request or result other callers leave one worker free for it; 0: they do not."""
     job_niceness: int = Field(default=10, ge=0, le=19)
     """The most by which jobs and imports of callers above their share give way at the processor; 0: they do not."""
-    quota_finished_jobs: int = Field(default=10_000, ge=1)
-    """Of each caller; beyond this its oldest finished jobs go before their time."""
     max_finished_jobs: int = Field(default=50_000, ge=1)
     """Of all callers; beyond this the oldest ones of the caller that has most go."""
     redis_reserve: float = Field(default=0.1, ge=0, le=0.5)
     """Share of Redis' memory that new jobs and fields must leave free."""
+    heartbeat_s: float = Field(default=5.0, gt=0)
+    lost_after_s: float = Field(default=90.0, gt=0)
+    """A running job whose heartbeat is older than this is lost."""
+    keep_originals_s: int = Field(default=6 * 3600, ge=60)
+    """How long an upload stays after its import, where ``keep_originals`` says that it does."""
+    keep_originals_bytes: int = Field(default=8192 * MIB, ge=0)
+    """Of each caller; beyond this the oldest go."""
+    keep_pieces_s: int = Field(default=24 * 3600, ge=60)
+    """How long an upload that came in pieces waits for the next one."""
+    keep_pieces_bytes: int = Field(default=8192 * MIB, ge=0)
+    """Of each caller's unfinished uploads; beyond this the oldest go."""
+
+
+class Settings(Fixed, BaseSettings):
+    """Every setting has a default that works on one machine; each is REGNF_<NAME> in the environment.
+
+    `quota_*` is of each caller, `max_*` of all together, `job_*` of one registration, `import_*` of one import. Secrets
+    are given as they are, or as `@` and the path of a file.
+    """
+
+    model_config = SettingsConfigDict(env_prefix=_PREFIX, frozen=True, extra="ignore", hide_input_in_errors=True)
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8080, ge=0, le=65535)
+    """0 asks the system for a free port; the address is printed once it listens."""
+    state_dir: Path = Field(default_factory=_default_state_dir)
+    """Blobs, the embedded Redis' files and temporary uploads live under it."""
+    demo_dir: Path | None = None
+    """Where the demo's files lie, which the home page offers. `regnf serve` sets it; unset: no demo."""
+    redis_url: str | None = Field(default=None, repr=False)
+    """Unset: `regnf serve` starts a private server of its own."""
+    queue_key: Annotated[Annotated[str, Field(min_length=16)] | None, BeforeValidator(_secret)] = Field(
+        default=None, repr=False
+    )
+    """Signs what the queue in Redis holds; the same for front ends and workers. What is not signed never runs."""
+    redis_password: Annotated[str | None, BeforeValidator(_secret)] = Field(default=None, repr=False)
+    """In place of one in the address."""
+    workers: int = Field(default=1, ge=0, le=64)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where registrations run; auto: on the GPU if torch can use one."""
+    threads: int | None = Field(default=None, ge=1, le=256)
+    """Threads of each job's process; unset: cores / workers."""
+    preload: bool = sys.platform.startswith("linux")
+    """Workers load the engine once and for all jobs: each begins sooner, and an idle worker holds more memory.
+
+    Elsewhere it is not known whether what is loaded starts threads, which a fork leaves behind.
+    """
+    api_tokens: Annotated[frozenset[str], NoDecode, BeforeValidator(_entries)] = Field(default=frozenset(), repr=False)
+    """JSON list of `name:token`, or of tokens. Empty: no token needed, which is allowed on loopback only."""
+    publish: str | None = None
+    """In a container: where its port is published on the host, as compose takes it, `address:port`."""
+    allowed_hosts: frozenset[str] = frozenset()
+    """JSON list of the names under which the service is called: `host`, `host:port`, `*.domain`; `*`: any.
+
+    Loopback's names and the address that a connection arrives on need not be listed.
+    """
+    behind_proxy: bool = False
+    """A proxy stands before the service: it ends TLS, cuts off slow clients and limits connections.
+
+    Only then may ``host`` be an address that others can reach.
+    """
+    cors_origins: frozenset[str] = frozenset()
+    """JSON list of other sites whose pages may call this service: `https://name[:port]`. Empty: none."""
+    allow_unauthenticated: bool = False
+    """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
+    max_upload_bytes: int = Field(default=4096 * MIB, ge=1)
+    max_queued_jobs: int = Field(default=1000, ge=1)
+    quota_calls_per_s: float | None = Field(default=None, ge=0)
+    """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""
+    quota_active_jobs: int | None = Field(default=None, ge=1)
+    """Jobs of each caller that wait or run. Unset: with tokens, as many as are left free for others."""
+    quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
+    """What each caller's imports and jobs may cost the workers in an hour."""
+    caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
+    """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""
+    quota_finished_jobs: int = Field(default=10_000, ge=1)
+    """Of each caller; beyond this its oldest finished jobs go before their time."""
     quota_fields: int | None = Field(default=10_000, ge=1)
     quota_stored_bytes: int | None = Field(default=None, ge=1)
     """Of each caller's uploads; what the service makes of them is not counted."""
     webhook_hosts: frozenset[str] = frozenset()
     """JSON list of the hosts that messages about jobs may go to: `host`, `host:port`, `http://host:port`."""
-    webhook_secrets: frozenset[str] = Field(default=frozenset(), repr=False)
+    webhook_secrets: Annotated[frozenset[str], NoDecode, BeforeValidator(_entries)] = Field(
+        default=frozenset(), repr=False
+    )
     """JSON list of `caller:whsec_<base64>`."""
-    webhook_secrets_file: Path | None = None
-    """More of them, one a line."""
     job_timeout_s: int = Field(default=900, ge=1)
     job_memory_bytes: int | None = Field(default=None, ge=512 * MIB)
     """Of each registration's process, beyond what its worker holds. Unset: three quarters of what the machine or its
@@ -149,27 +229,16 @@ class Settings(BaseSettings):
     import_timeout_s: int = Field(default=120, ge=1)
     import_work_s: float = Field(default=60.0, gt=0)
     import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)
-    heartbeat_s: float = Field(default=5.0, gt=0)
-    lost_after_s: float = Field(default=90.0, gt=0)
-    """A running job whose heartbeat is older than this is lost."""
     shutdown_grace_s: float = Field(default=5.0, ge=0)
     """How long a worker that is told to stop lets its job go on before it gives the job back to the queue."""
-    retention_s: int = Field(default=7 * 24 * 3600, ge=60)
+    job_retention_s: int = Field(default=7 * 24 * 3600, ge=60)
     """How long finished jobs and their artifacts are kept."""
-    unused_field_retention_s: int | None = Field(default=None, ge=60)
+    field_retention_s: int | None = Field(default=None, ge=60)
     """How long a field is kept after its last use by a job. Unset: until it is deleted."""
     keep_originals: Literal["none", "questions", "all"] = "questions"
     """Which uploads stay for a while after their import, so that they can be imported anew with another description:
     those that were rejected with a question, or those of ready fields too."""
-    keep_originals_s: int = Field(default=6 * 3600, ge=60)
-    """How long."""
-    keep_originals_bytes: int = Field(default=8192 * MIB, ge=0)
-    """Of each caller; beyond this the oldest go."""
-    keep_pieces_s: int = Field(default=24 * 3600, ge=60)
-    """How long an upload that came in pieces waits for the next one."""
-    keep_pieces_bytes: int = Field(default=8192 * MIB, ge=0)
-    """Of each caller's unfinished uploads; beyond this the oldest go."""
-    storage_cap_bytes: int | None = Field(default=None, ge=1)
+    max_stored_bytes: int | None = Field(default=None, ge=1)
     """Of all that is stored. Beyond this the oldest finished jobs, unused fields, batches and unfinished uploads go."""
     storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")
     """An object store for several machines; unset: a folder below state_dir."""
@@ -177,11 +246,27 @@ class Settings(BaseSettings):
     """Id of the storage that shall have this Redis from now on, in place of the one whose records it holds."""
     field_cache_bytes: int = Field(default=16384 * MIB, ge=0)
     """With an object store: how much of it a worker's machine keeps copies of, beside those in use."""
-
-    metrics_host: str = "127.0.0.1"
-    metrics_port: int | None = Field(default=None, ge=0, le=65535)
-    """Where Prometheus finds `/metrics`, a port of its own without tokens; unset: nowhere."""
+    metrics_address: str | None = Field(default=None, pattern=r"^\S+:[0-9]{1,5}$")
+    """`host:port` where Prometheus finds `/metrics`, without tokens; unset: nowhere."""
     log_format: Literal["text", "json"] = "text"
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],  # noqa: ARG003 -- the base class passes all five
+        init_settings: Any,
+        env_settings: Any,
+        dotenv_settings: Any,  # noqa: ARG003
+        file_secret_settings: Any,  # noqa: ARG003
+    ) -> Any:
+        """What is given in Python, then the environment, which sets nothing of ``Fixed``."""
+
+        def environment() -> dict[str, Any]:
+            _refuse_old_names(os.environ)
+            fixed: dict[str, Any] = json.loads(os.environ.get(_FIXED_VARIABLE, "{}"))
+            return {**env_settings(), **fixed}
+
+        return init_settings, environment
 
     @model_validator(mode="before")
     @classmethod
@@ -194,7 +279,7 @@ class Settings(BaseSettings):
     @property
     def needs_token(self) -> bool:
         """Whether callers must name themselves."""
-        return bool(self.api_tokens) or self.api_tokens_file is not None
+        return bool(self.api_tokens)
 
     @property
     def published_on_loopback(self) -> bool:
@@ -204,13 +289,13 @@ class Settings(BaseSettings):
     @property
     def is_private(self) -> bool:
         """Whether only this machine can reach the service."""
-        return self.published_on_loopback if self.publish else is_loopback(self.host)
+        return self.published_on_loopback if self.publish else is_loopback(self.host) and not self.behind_proxy
 
     @property
     def calls_per_s(self) -> float:
         """The rate that holds; 0: none."""
-        if self.rate_limit_per_s is not None:
-            return self.rate_limit_per_s
+        if self.quota_calls_per_s is not None:
+            return self.quota_calls_per_s
         return 0.0 if self.is_private else _RATE_BEYOND_LOOPBACK
 
     @property
@@ -232,3 +317,42 @@ class Settings(BaseSettings):
     @property
     def field_cache_dir(self) -> Path:
         return self.state_dir / "field-cache"
+
+
+def _refuse_old_names(environment: Mapping[str, str]) -> None:
+    """Raises SettingsError for a variable of an earlier version: what it says would be passed over in silence."""
+    for name in environment:
+        if name in _RENAMED:
+            raise SettingsError(f"{name} has another name: did you mean {_RENAMED[name]}?")
+        if name.startswith(_PREFIX) and name.removeprefix(_PREFIX).lower() in Fixed.model_fields:
+            raise SettingsError(f"{name} is gone: the value is fixed")
+
+
+_HINT = "Correct the environment variable, or unset it to use the default."
+_REDIS_SCHEMES = ("redis", "rediss", "unix")
+
+
+def read_settings(**given: Any) -> Settings:
+    """The settings; what is None is read from REGNF_* in the environment.
+
+    Raises InvalidInputError (INVALID_SETTINGS) naming the first faulty setting, never its value: it may be a token.
+    """
+    try:
+        settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        message = f"{_PREFIX}{where.upper()}: {first['msg'].removeprefix('Value error, ')}"
+        raise InvalidInputError(message, reason="INVALID_SETTINGS", hint=_HINT) from error
+    except SettingsError as error:
+        raise InvalidInputError(str(error), reason="INVALID_SETTINGS", hint=_HINT) from error
+    if settings.redis_url is not None:
+        check_redis_url(settings.redis_url, "REGNF_REDIS_URL")
+    return settings
+
+
+def check_redis_url(url: str, name: str) -> None:
+    """Raises InvalidInputError (INVALID_SETTINGS) naming the setting, never its value: it may hold a password."""
+    if urlsplit(url).scheme not in _REDIS_SCHEMES:
+        message = f"{name}: no address of a Redis, expected redis://, rediss:// or unix://"
+        raise InvalidInputError(message, reason="INVALID_SETTINGS", hint="Write for example redis://127.0.0.1:6379/0.")

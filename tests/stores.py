@@ -153,5 +153,5 @@ def private_stores() -> Iterator[TestStores]:
 
 def services_over(redis: Redis, settings: Settings) -> Services:
     """What the routes of a service are given."""
-    stores = stores_over(redis, settings.blob_dir, settings.retention_s)
+    stores = stores_over(redis, settings.blob_dir, settings.job_retention_s)
     return Services(settings, redis, stores.records, stores.blobs, stores.queue, webhooks_of(settings, redis))

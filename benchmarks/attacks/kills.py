@@ -27,7 +27,7 @@ from benchmarks.service_load.small_fields import SmallPair, write_small_pair
 from tests.processes import children_of, descendants_of
 
 _CLIENTS = 4
-_SETTINGS: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 8.0, "rate_limit_per_s": 0}
+_SETTINGS: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 8.0, "quota_calls_per_s": 0}
 
 
 def attack_by_kills(folder: Path, kills: int, seed: int) -> Outcome:

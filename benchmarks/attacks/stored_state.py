@@ -31,7 +31,7 @@ def attack_stored_state(folder: Path, inputs: int, seed: int) -> Outcome:
     After each batch Redis gets back what it held before, so that every batch meets a sound service.
     """
     outcome, trap = Outcome(), folder / "trap"
-    settings: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 5.0, "rate_limit_per_s": 0}
+    settings: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 5.0, "quota_calls_per_s": 0}
     with running_house(folder, workers=1, **settings) as house, connect(house.redis.url) as redis:
         pair = write_small_pair(folder)
         with Client(house.address) as service:

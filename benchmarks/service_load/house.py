@@ -18,6 +18,7 @@ from redis import Redis
 
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import JobQueue
+from regnf_state.settings import variables
 from tests.processes import children_of
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import eventually
@@ -157,7 +158,7 @@ class House:
         plain = {key: value for key, value in os.environ.items() if not key.startswith("REGNF_")}
         usual = {"redis_url": self.redis.url, "state_dir": self.folder / "state", "device": "cpu"}
         chosen = usual | self.settings
-        environment = plain | {f"REGNF_{key.upper()}": str(value) for key, value in chosen.items()}
+        environment = plain | variables(**chosen)
         with (self.folder / f"{name}.log").open("ab") as log:
             return subprocess.Popen(
                 [self.release.interpreter, "-m", *module],

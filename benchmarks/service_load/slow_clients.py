@@ -103,7 +103,7 @@ async def everybody(port: int, path: str, until: float, seen: Seen) -> None:
 
 def measure(folder: Path, slow: int, seconds: float) -> tuple[Seen, float]:
     """What was seen, and when the slow connections began."""
-    with running_house(folder, 1, _HONEST, threads=1, api_tokens=_TOKENS, rate_limit_per_s=0) as house:
+    with running_house(folder, 1, _HONEST, threads=1, api_tokens=_TOKENS, quota_calls_per_s=0) as house:
         seen, port = Seen(), house.listener.getsockname()[1]
         with Client(house.address, _HONEST) as remote:
             request = {**write_small_pair(folder).upload(remote), "options": _OPTIONS}

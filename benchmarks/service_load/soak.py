@@ -37,7 +37,7 @@ _SETTINGS: dict[str, object] = {
     "threads": 1,
     "heartbeat_s": 1.0,
     "lost_after_s": 10.0,
-    "retention_s": 120,
+    "job_retention_s": 120,
     "preload": True,
 }
 

@@ -5,7 +5,6 @@ The API has a client of its own, whose calls end sooner: regnf_state.redis.bound
 
 from __future__ import annotations
 
-from pathlib import Path
 from urllib.parse import quote, urlsplit, urlunsplit
 
 from redis import Redis
@@ -14,7 +13,6 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 from redis.retry import Retry
 
-from regnf_core.texts import TextError, decode_text
 from regnf_state.settings import Settings
 
 SOCKET_TIMEOUT_S = 10.0
@@ -40,7 +38,7 @@ def connect(url: str, *, retries: int = RETRIES, socket_timeout_s: float = SOCKE
     )
 
 
-# Where Redis is, with the password from a file, so that it is in no environment and in no process' arguments.
+# Where Redis is.
 
 
 class NoRedisError(RuntimeError):
@@ -49,31 +47,13 @@ class NoRedisError(RuntimeError):
     reason = "REDIS_URL_MISSING"
 
 
-class RedisPasswordError(NoRedisError):
-    """The file of the password cannot be read."""
-
-    reason = "REDIS_PASSWORD_UNREADABLE"
-
-
 def redis_address(settings: Settings) -> str:
-    """The address to connect to. Raises NoRedisError, RedisPasswordError."""
+    """The address to connect to. Raises NoRedisError."""
     if settings.redis_url is None:
         raise NoRedisError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
-    if settings.redis_password_file is None:
+    if settings.redis_password is None:
         return settings.redis_url
-    return _with_password(settings.redis_url, _password(settings.redis_password_file))
-
-
-def _password(file: Path) -> str:
-    try:
-        password = decode_text(file.read_bytes()).strip()
-    except OSError as error:
-        raise RedisPasswordError(f"the file {file} cannot be read: {error.strerror}") from error
-    except TextError as error:
-        raise RedisPasswordError(f"the file {file} is {error}") from error
-    if not password:
-        raise RedisPasswordError(f"the file {file} is empty")
-    return password
+    return _with_password(settings.redis_url, settings.redis_password)
 
 
 def _with_password(url: str, password: str) -> str:

@@ -294,13 +294,14 @@ _LONGEST_S = 15.0
 
 
 @contextmanager
-def served(registry: CollectorRegistry, hosts: AllowedHosts, host: str, port: int | None) -> Iterator[None]:
-    """Answer scrapes while the context lasts; no port: not at all."""
-    if port is None:
+def served(registry: CollectorRegistry, hosts: AllowedHosts, address: str | None) -> Iterator[None]:
+    """Answer scrapes at `host:port` while the context lasts; no address: not at all."""
+    if address is None:
         yield
         return
     handler = type("_Handler", (_Handler,), {"registry": registry, "hosts": hosts})
-    server = _Server((host, port), handler)
+    host, _, port = address.rpartition(":")
+    server = _Server((host.strip("[]"), int(port)), handler)
     thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
     thread.start()
     try:

@@ -99,7 +99,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
             deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
         )
         at = services.settings
-        scrapes = served(metrics.registry, allowed_hosts(at), at.metrics_host, at.metrics_port)
+        scrapes = served(metrics.registry, allowed_hosts(at), at.metrics_address)
         with scrapes, stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
@@ -159,7 +159,7 @@ def create_app(
     Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable, HostsError likewise.
     """
     settings = settings or Settings()
-    callers = read_callers(settings.api_tokens, settings.api_tokens_file)
+    callers = read_callers(settings.api_tokens)
     stores = stores or open_stores(settings, retries=None, storage_wait_s=_STORAGE_WAIT_S)
     if limiter is None and settings.calls_per_s:
         limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
@@ -241,7 +241,8 @@ class GuardedServer(uvicorn.Server):
 
     def __init__(self, settings: Settings) -> None:
         share = shared_out(raise_limit(), settings.max_connections)
-        of_address = min(settings.max_connections_per_address or max(1, share.connections // 2), share.connections)
+        half = share.connections if settings.behind_proxy else max(1, share.connections // 2)
+        of_address = min(settings.max_connections_per_address or half, share.connections)
         self._connections = Connections(share.connections, of_address, _MOST_UNREAD)
         clock = ClientClock(settings.header_timeout_s, settings.upload_stall_s, settings.min_bytes_per_s)
         self._settings = settings

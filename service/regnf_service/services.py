@@ -256,7 +256,7 @@ class Services:
     @cached_property
     def streams(self) -> Slots:
         """Event streams that are being read."""
-        return Slots(self.settings.max_streams_per_caller, "TOO_MANY_STREAMS")
+        return Slots(self.settings.max_streams_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
 
     @cached_property
     def job_watch(self) -> JobWatch:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
-from regnf_core.texts import TextError, decode_text
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
 
 Callers = Mapping[bytes, str]
@@ -15,32 +13,21 @@ Callers = Mapping[bytes, str]
 
 
 class TokensError(ValueError):
-    """The tokens cannot be told apart, or a file of them cannot be read. The text names no token."""
+    """The tokens cannot be told apart. The text names no token."""
 
     reason = "TOKENS_UNUSABLE"
 
 
-def read_callers(entries: Iterable[str], file: Path | None) -> Callers:
-    """The callers of all entries, those of the file included. Raises TokensError."""
+def read_callers(entries: Iterable[str]) -> Callers:
+    """The callers of all entries. Raises TokensError."""
     callers: dict[bytes, str] = {}
-    for entry in (*entries, *(read_lines(file) if file is not None else ())):
+    for entry in entries:
         name, token = split_entry(entry)
         digest = _digest(token)
         name = name or f"token-{digest.hex()[:8]}"
         if callers.setdefault(digest, name) != name:
             raise TokensError(f"the callers {callers[digest]} and {name} have the same token")
     return callers
-
-
-def read_lines(file: Path) -> list[str]:
-    """The entries of a file: one a line; empty lines and those that begin with # are left out. Raises TokensError."""
-    try:
-        lines = [line.strip() for line in decode_text(file.read_bytes()).splitlines()]
-    except OSError as error:
-        raise TokensError(f"the file {file} cannot be read: {error.strerror}") from error
-    except TextError as error:
-        raise TokensError(f"the file {file} is {error}") from error
-    return [line for line in lines if line and not line.startswith("#")]
 
 
 def split_entry(entry: str) -> tuple[str | None, str]:

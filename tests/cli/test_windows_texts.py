@@ -21,9 +21,8 @@ from regnf_core.importing.observing.reading import read_matrices, read_tum
 from regnf_core.importing.run.opened import SettingsFile
 from regnf_core.importing.settings.documents import read_documents
 from regnf_core.texts import TextError, decode_text
-from regnf_service.tokens import TokensError, read_callers
 from regnf_state.redis.client import redis_address
-from regnf_state.settings import Settings
+from regnf_state.settings import Settings, read_settings
 from tests.cli.conftest import DATA, Run
 
 ENCODINGS = {
@@ -109,9 +108,12 @@ def test_poses_with_decimal_commas(separator: str, end: str) -> None:
 def test_files_of_tokens_and_passwords(encode: Encode, tmp_path: Path) -> None:
     file, password = tmp_path / "tokens", tmp_path / "password"
     file.write_bytes(encode("# für alle\nrobot:0123456789abcdef\nother:fedcba9876543210\n"))
-    assert sorted(read_callers([], file).values()) == ["other", "robot"]
+    assert sorted(read_settings(api_tokens=f"@{file}").api_tokens) == [
+        "other:fedcba9876543210",
+        "robot:0123456789abcdef",
+    ]
     password.write_bytes(encode("geheim\n"))
-    settings = Settings(redis_url="redis://host:6379/0", redis_password_file=password)
+    settings = Settings(redis_url="redis://host:6379/0", redis_password=f"@{password}")
     assert redis_address(settings) == "redis://:geheim@host:6379/0"
 
 
@@ -224,7 +226,7 @@ def test_every_reader_says_which_byte_it_was(tmp_path: Path) -> None:
         (InvalidInputError, lambda: read_detection(file)),
         (FieldFormatError, lambda: read_documents((SettingsFile("a.yml", memoryview(file.read_bytes())),))),
         (FieldFormatError, lambda: read_tum("poses.txt", file.read_bytes())),
-        (TokensError, lambda: read_callers([], file)),
+        (InvalidInputError, lambda: read_settings(api_tokens=f"@{file}")),
     ):
         with pytest.raises(kind, match=said):
             read()

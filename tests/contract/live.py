@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import httpx
 
+from regnf_state.settings import variables
 from tests.listing import files_below
 from tests.redis_server import private_redis
 
@@ -73,7 +74,7 @@ def live_service(folder: Path, with_worker: bool = True, **settings: object) -> 
     with private_redis() as redis_url, socket.create_server(("127.0.0.1", 0)) as listener:
         plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         usual = {"redis_url": redis_url, "state_dir": folder, "max_upload_bytes": MAX_UPLOAD, "device": "cpu"}
-        environment = plain | {f"REGNF_{name.upper()}": str(value) for name, value in (usual | settings).items()}
+        environment = plain | variables(**usual | settings)
         command = ["regnf_cli.api_process", str(listener.fileno())]
         with _process(folder, "api", command, environment, listener.fileno()) as api:
             if not with_worker:

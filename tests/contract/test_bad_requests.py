@@ -283,7 +283,7 @@ def test_compressed_bodies_are_refused(world: World) -> None:
 @pytest.mark.parametrize("key", ["", "k" * 256, "a\tb", "schl\u00fcssel".encode()])
 def test_idempotency_keys(world: World, key: Any) -> None:
     answer = world.client.post("/register", json=world.valid_request(), headers={"Idempotency-Key": key})
-    assert_refused(answer, 400, "INVALID_IDEMPOTENCY_KEY")
+    assert_refused(answer, 400, "INVALID_HEADER")
 
 
 def test_unknown_and_rejected_fields(world: World) -> None:
@@ -312,7 +312,7 @@ def test_limits_beyond_reason(world: World, limit: str) -> None:
 )
 def test_forged_page_tokens(world: World, token: str) -> None:
     for path in ("/jobs", "/fields"):
-        assert_refused(world.client.get(path, params={"page_token": token}), 400, "INVALID_PAGE_TOKEN")
+        assert_refused(world.client.get(path, params={"page_token": token}), 400, "INVALID_QUERY")
 
 
 @pytest.mark.parametrize("status", ["done", "", "accepted,running"])

@@ -171,7 +171,7 @@ def raw_call(app: Any, messages: list[dict[str, Any]], headers: list[tuple[bytes
 def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any, any_redis: Any) -> None:
     slow = make_world(tmp_path, any_redis, upload_stall_s=0.05)
     status, problem = raw_call(slow.app, [{"type": "http.request", "body": GOOD[:100], "more_body": True}])
-    assert (status, problem["reason"]) == (408, "UPLOAD_STALLED")
+    assert (status, problem["reason"]) == (408, "REQUEST_STALLED")
     assert slow.blobs.blobs == {}
     slow.client.close()
 

@@ -82,7 +82,7 @@ def test_bad_lines_refuse_nothing_else(world: World) -> None:
         (2, "MALFORMED_JSON"),
         (3, "INVALID_REQUEST"),
         (4, "INVALID_REQUEST"),
-        (6, "LINE_TOO_LARGE"),
+        (6, "REQUEST_TOO_LARGE"),
         (8, "INVALID_REQUEST"),
         (9, "LIBRARY_ENTRY_NOT_FOUND"),
         (10, "DETECTION_OUTSIDE_SCENE"),
@@ -171,8 +171,8 @@ def test_the_same_lines_are_the_same_batch(world: World) -> None:
 @pytest.mark.parametrize(
     ("content", "headers", "status", "reason"),
     [
-        (b"", NDJSON, 422, "BATCH_EMPTY"),
-        (b"\n \n", NDJSON, 422, "BATCH_EMPTY"),
+        (b"", NDJSON, 422, "INVALID_REQUEST"),
+        (b"\n \n", NDJSON, 422, "INVALID_REQUEST"),
         (b"{}", {"Content-Type": "application/json"}, 415, "UNSUPPORTED_MEDIA_TYPE"),
         (b"{}", NDJSON | {"Content-Encoding": "gzip"}, 415, "UNSUPPORTED_MEDIA_TYPE"),
         (b"{}\n" * 6, NDJSON, 413, "TOO_MANY_PAIRS"),

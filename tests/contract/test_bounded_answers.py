@@ -247,7 +247,9 @@ def test_the_bytes_that_nobody_reads_have_a_bound_at_every_moment() -> None:
 def unread(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with live_service(tmp_path_factory.mktemp("unread"), with_worker=False, metrics_port=port) as started:
+    with live_service(
+        tmp_path_factory.mktemp("unread"), with_worker=False, metrics_address=f"127.0.0.1:{port}"
+    ) as started:
         started.metrics_port = port  # type: ignore[attr-defined]
         yield started
 

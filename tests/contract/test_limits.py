@@ -72,7 +72,7 @@ def test_one_callers_haste_is_not_anothers(tmp_path: Path, redis_url: str) -> No
     [("127.0.0.1", None, 0), ("localhost", None, 0), ("0.0.0.0", None, 20), ("127.0.0.1", 5, 5), ("0.0.0.0", 0, 0)],
 )
 def test_without_a_word_there_is_no_rate_on_loopback(host: str, given: float | None, rate: float) -> None:
-    assert Settings(host=host, rate_limit_per_s=given).calls_per_s == rate
+    assert Settings(host=host, quota_calls_per_s=given).calls_per_s == rate
 
 
 # quotas
@@ -227,7 +227,7 @@ def test_streams_at_once(worlds: Callable[..., World]) -> None:
     job_id = world.submit()
     services = world.app.state.services
     with services.streams.held("anonymous"):
-        assert_refused(world.client.get(f"/jobs/{job_id}/events"), 429, "TOO_MANY_STREAMS")
+        assert_refused(world.client.get(f"/jobs/{job_id}/events"), 429, "TOO_MANY_REQUESTS_AT_ONCE")
     world.succeed(job_id)
     for _ in range(2):
         assert world.client.get(f"/jobs/{job_id}/events").status_code == 200

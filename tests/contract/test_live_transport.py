@@ -86,7 +86,7 @@ def test_a_body_shorter_than_declared(live: Live) -> None:
     with live.connect() as connection:
         connection.sendall(head_of("PUT", f"/fields/{sha256(data)}", Content_Length=len(data) + 10) + data)
         status, text = answer_of(connection)
-    assert (status, b"UPLOAD_STALLED" in text) == (408, True)
+    assert (status, b"REQUEST_STALLED" in text) == (408, True)
 
 
 def test_a_body_longer_than_declared_is_cut_where_it_was_declared_to_end(live: Live) -> None:
@@ -107,7 +107,7 @@ def test_a_client_that_stalls_hears_408(live: Live) -> None:
     with live.connect() as connection:
         connection.sendall(head_of("POST", "/fields", Content_Length=len(data)) + data[:100])
         status, text = answer_of(connection)
-    assert (status, b"UPLOAD_STALLED" in text) == (408, True)
+    assert (status, b"REQUEST_STALLED" in text) == (408, True)
 
 
 def test_a_client_that_asks_first_is_spared_the_upload(live: Live) -> None:

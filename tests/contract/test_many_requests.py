@@ -144,4 +144,4 @@ def test_slow_uploads_make_room_for_another_of_the_same_address(narrow: Live) ->
         assert honest.delete(f"/fields/{sha256(data)}").status_code == 204
         told = [text for text in map(at_hand, slow) if text]
     assert len(told) == 1
-    assert b"UPLOAD_STALLED" in told[0]
+    assert b"REQUEST_STALLED" in told[0]

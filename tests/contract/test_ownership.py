@@ -25,8 +25,8 @@ ALICE, BOB = {"Authorization": "Bearer alices-token"}, {"Authorization": "Bearer
 def shared(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
     """A service of two callers; its client is alice's."""
     file = tmp_path / "tokens"
-    file.write_text("# who may call\n\nbob:bobs-token\nbob:bobs-next-token\n")
-    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"alice:alices-token"}), api_tokens_file=file)
+    file.write_text("# who may call\n\nalice:alices-token\nbob:bobs-token\nbob:bobs-next-token\n")
+    made = make_world(tmp_path, any_redis, api_tokens=f"@{file}")
     made.client.headers.update(ALICE)
     with made.client:
         yield made

@@ -88,7 +88,7 @@ def test_demo(worlds: Callable[..., World], tmp_path: Path) -> None:
     for name in ("mix-room.safetensors", "armchair.safetensors"):
         (tmp_path / name).write_bytes(name.encode())
     world = worlds(demo_dir=tmp_path)
-    assert_refused(world.client.get("/demo"), 404, "DEMO_NOT_FOUND")  # not complete
+    assert_refused(world.client.get("/demo"), 404, "NOT_FOUND")  # not complete
     (tmp_path / "detection.json").write_text(json.dumps(box))
     (tmp_path / "secret").write_bytes(b"no part of it")
     demo = world.client.get("/v1/demo").json()
@@ -99,5 +99,5 @@ def test_demo(worlds: Callable[..., World], tmp_path: Path) -> None:
 
 
 def test_service_without_a_demo(world: World) -> None:
-    assert_refused(world.client.get("/demo"), 404, "DEMO_NOT_FOUND")
-    assert_refused(world.client.get("/demo/armchair.safetensors"), 404, "DEMO_NOT_FOUND")
+    assert_refused(world.client.get("/demo"), 404, "NOT_FOUND")
+    assert_refused(world.client.get("/demo/armchair.safetensors"), 404, "NOT_FOUND")

@@ -28,7 +28,7 @@ def hurried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     folder = tmp_path_factory.mktemp("hurried")
-    with live_service(folder, with_worker=False, metrics_port=port, **LIMITS) as started:
+    with live_service(folder, with_worker=False, metrics_address=f"127.0.0.1:{port}", **LIMITS) as started:
         started.metrics_port = port  # type: ignore[attr-defined]
         yield started
 
@@ -86,7 +86,7 @@ def test_a_trickled_upload_is_cut_off(hurried: Live, head: bytes) -> None:
     """Each byte comes well before the server would call it a stall."""
     with hurried.connect() as connection:
         connection.sendall(head + b"Host: localhost\r\nContent-Length: 4000000\r\n\r\n" + field_bytes("trickled"))
-        assert b"UPLOAD_STALLED" in ended_while_trickling(connection, b"\0")
+        assert b"REQUEST_STALLED" in ended_while_trickling(connection, b"\0")
 
 
 def test_a_body_that_nobody_reads_is_cut_off(hurried: Live) -> None:

@@ -36,11 +36,11 @@ def told(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
         ({"url": "https://elsewhere.example.org/"}, "WEBHOOK_NOT_ALLOWED"),
         ({"url": "http://169.254.169.254/latest"}, "WEBHOOK_NOT_ALLOWED"),
         ({"url": "https://[::1"}, "WEBHOOK_NOT_ALLOWED"),
-        ({"url": 1}, "INVALID_WEBHOOK"),
-        ({"url": "https://hooks.example.org/" + "a" * 2000}, "INVALID_WEBHOOK"),
-        ({}, "INVALID_WEBHOOK"),
-        ({"url": URL, "secret": "x"}, "INVALID_WEBHOOK"),
-        (URL, "INVALID_WEBHOOK"),
+        ({"url": 1}, "INVALID_REQUEST"),
+        ({"url": "https://hooks.example.org/" + "a" * 2000}, "INVALID_REQUEST"),
+        ({}, "INVALID_REQUEST"),
+        ({"url": URL, "secret": "x"}, "INVALID_REQUEST"),
+        (URL, "INVALID_REQUEST"),
     ],
 )
 @pytest.mark.parametrize("query", ["", "?dry_run=true"])

@@ -25,7 +25,7 @@ FULL = ["auth.existingSecret=callers", "redis.existingSecret=redis", "autoscalin
         "worker.device=cuda",
         "webhooks.hosts={hooks.example.org,http://10.0.0.1:80}", "webhooks.existingSecret=hooks",
         "api.ingress.enabled=true", "api.ingress.host=regnf.example.org", "api.ingress.tlsSecret=tls",
-        "settings.REGNF_RETENTION_S=3600"]  # fmt: skip
+        "settings.REGNF_JOB_RETENTION_S=3600"]  # fmt: skip
 
 SERVICE_DOMAINS = ("", ".lab", ".lab.svc", ".lab.svc.cluster.local")
 
@@ -69,17 +69,28 @@ def test_every_pod_is_hardened(rendered: dict[tuple[str, str], dict[str, Any]]) 
         assert pod["securityContext"]["runAsUser"] > 0
         assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
         assert pod["automountServiceAccountToken"] is False
-        (container,) = pod["containers"]
-        assert container["securityContext"] == {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        }
-        assert "memory" in container["resources"]["limits"]
-        assert {"startupProbe", "livenessProbe"} <= container.keys()
-        mounted = {mount["name"] for mount in container["volumeMounts"]}
-        assert "tmp" in mounted
-        assert mounted - {volume["name"] for volume in pod["volumes"]} <= {"data"}
+        for container in pod["containers"]:
+            assert container["securityContext"] == {
+                "allowPrivilegeEscalation": False,
+                "readOnlyRootFilesystem": True,
+                "capabilities": {"drop": ["ALL"]},
+            }
+            assert "memory" in container["resources"]["limits"]
+            assert {"startupProbe", "livenessProbe"} <= container.keys()
+            mounted = {mount["name"] for mount in container["volumeMounts"]}
+            assert "tmp" in mounted
+            assert mounted - {volume["name"] for volume in pod["volumes"]} <= {"data"}
+
+
+def test_strangers_reach_the_proxy_alone(rendered: dict[tuple[str, str], dict[str, Any]]) -> None:
+    """The configuration is the compose file's; `api` in it is the pod's own loopback."""
+    pod = pods(rendered)["demo-api"]
+    (proxy,) = [one for one in pod["containers"] if one["name"] == "proxy"]
+    (http,) = rendered["Service", "demo-api"]["spec"]["ports"]
+    assert proxy["ports"] == [{"name": http["targetPort"], "containerPort": 8000}]
+    assert rendered["ConfigMap", "demo-proxy"]["data"].keys() == {"nginx.conf", "start.sh"}
+    assert pod["hostAliases"] == [{"ip": "127.0.0.1", "hostnames": ["api"]}]
+    assert environment(pod)["REGNF_BEHIND_PROXY"] == "true"
 
 
 def test_every_variable_is_a_setting_and_no_secret_is_a_value(
@@ -88,8 +99,9 @@ def test_every_variable_is_a_setting_and_no_secret_is_a_value(
     for name in ("demo-api", "demo-worker"):
         told = environment(pods(rendered)[name])
         assert told.keys() <= SETTINGS
-        assert not told.keys() & {"REGNF_API_TOKENS", "REGNF_WEBHOOK_SECRETS"}
-    assert "REGNF_API_TOKENS_FILE" not in environment(pods(rendered)["demo-worker"])
+        secrets = {name: told[name] for name in ("REGNF_API_TOKENS", "REGNF_WEBHOOK_SECRETS") if name in told}
+        assert all(value.startswith("@/") for value in secrets.values())
+        assert not (secrets and name == "demo-worker")
 
 
 def test_labels_find_their_pods(rendered: dict[tuple[str, str], dict[str, Any]]) -> None:
@@ -106,7 +118,8 @@ def test_labels_find_their_pods(rendered: dict[tuple[str, str], dict[str, Any]])
 
 
 def test_ports_lead_somewhere(rendered: dict[tuple[str, str], dict[str, Any]]) -> None:
-    ports = {port["name"] for pod in pods(rendered).values() for port in pod["containers"][0].get("ports", [])}
+    containers = [container for pod in pods(rendered).values() for container in pod["containers"]]
+    ports = {port["name"] for container in containers for port in container.get("ports", [])}
     asked = [{port["targetPort"] for port in one["spec"]["ports"]} for (kind, _), one in rendered.items()
              if kind == "Service"]  # fmt: skip
     assert asked
@@ -146,10 +159,10 @@ def test_full_uses_what_is_there() -> None:
     assert told["REGNF_REDIS_URL"] == {"secretKeyRef": {"name": "redis", "key": "url"}}
     assert told["REGNF_STORAGE_URL"] == "s3://bucket/regnf"
     assert json.loads(told["REGNF_WEBHOOK_HOSTS"]) == ["hooks.example.org", "http://10.0.0.1:80"]
-    assert told["REGNF_RETENTION_S"] == "3600"
+    assert told["REGNF_JOB_RETENTION_S"] == "3600"
     mounts = {one["mountPath"]: one["name"] for one in api["containers"][0]["volumeMounts"]}
-    assert told["REGNF_API_TOKENS_FILE"].rpartition("/")[0] in mounts
-    assert told["REGNF_WEBHOOK_SECRETS_FILE"].rpartition("/")[0] in mounts
+    assert told["REGNF_API_TOKENS"][1:].rpartition("/")[0] in mounts
+    assert told["REGNF_WEBHOOK_SECRETS"][1:].rpartition("/")[0] in mounts
     assert worker["containers"][0]["envFrom"] == [{"secretRef": {"name": "keys"}}]
     assert worker["containers"][0]["resources"]["limits"] == {"memory": "12Gi", "nvidia.com/gpu": 1}
     assert environment(worker)["REGNF_DEVICE"] == "cuda"

@@ -14,9 +14,11 @@ import yaml
 from regnf_state.settings import Settings
 from tests.docker.files import COMPOSE, DOCKERFILES, ROOT, compose, services
 
-every_service = pytest.mark.parametrize("name", ["redis", "api", "worker", "worker-gpu", "prometheus", "grafana"])
+every_service = pytest.mark.parametrize(
+    "name", ["redis", "api", "proxy", "worker", "worker-gpu", "prometheus", "grafana"]
+)
 # Read by the compose file itself, not by the program.
-COMPOSE_ONLY = {"REGNF_PUBLISH"}
+COMPOSE_ONLY = {"REGNF_PUBLISH", "REGNF_TLS_DIR"}
 
 
 def settings_names() -> set[str]:
@@ -35,6 +37,7 @@ def test_holds_exactly_these_services() -> None:
     assert profiles == {
         "redis": None,
         "api": None,
+        "proxy": None,
         "worker": ["cpu"],
         "worker-gpu": ["gpu"],
         "prometheus": ["observability"],
@@ -52,7 +55,7 @@ def test_the_gpu_is_for_its_own_profile() -> None:
 def test_what_watches_finds_what_it_watches() -> None:
     config = yaml.safe_load((ROOT / "deploy/prometheus/prometheus.yaml").read_text())
     (job,) = config["scrape_configs"]
-    port = services()["api"]["environment"]["REGNF_METRICS_PORT"]
+    port = services()["api"]["environment"]["REGNF_METRICS_ADDRESS"].rpartition(":")[2]
     assert (job["job_name"], job["dns_sd_configs"]) == ("regnf", [{"names": ["api"], "type": "A", "port": int(port)}])
     for rules in config["rule_files"]:
         assert (ROOT / "deploy/prometheus" / Path(rules).name).is_file()
@@ -103,7 +106,7 @@ def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
     service = services()[name]
     assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
     assert service["volumes"] == ["state:/var/lib/regnf", "redis:/run/redis:ro"]
-    assert service["environment"]["REGNF_REDIS_PASSWORD_FILE"] == "/run/redis/password"
+    assert service["environment"]["REGNF_REDIS_PASSWORD"] == "@/run/redis/password"
     assert service["environment"]["REGNF_STATE_DIR"] == "/var/lib/regnf"
     assert service["environment"]["REGNF_REDIS_URL"] == "redis://redis:6379/0"
 
@@ -111,15 +114,15 @@ def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
 def test_volumes_and_networks_are_declared() -> None:
     document = compose()
     used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
-    used = {name for name in used if not name.startswith(".")}
+    used = {name for name in used if not name.startswith((".", "$"))}
     assert used == set(document["volumes"])
     assert {network for service in services().values() for network in service["networks"]} == set(document["networks"])
 
 
-def test_only_the_api_can_be_reached_and_only_from_this_machine() -> None:
+def test_only_the_proxy_can_be_reached_and_only_from_this_machine() -> None:
     published = {name: service["ports"] for name, service in services().items() if "ports" in service}
     assert published == {
-        "api": ["${REGNF_PUBLISH:-127.0.0.1:8080}:8080"],
+        "proxy": ["${REGNF_PUBLISH:-127.0.0.1:8080}:8000"],
         "grafana": ["${GRAFANA_PUBLISH:-127.0.0.1:3000}:3000"],
     }
     assert compose()["networks"]["inside"] == {"internal": True}
@@ -149,7 +152,7 @@ def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch)
     for name in ("api", "worker"):
         for variable, value in services()[name]["environment"].items():
             default = re.fullmatch(r"\$\{\w+:-(.*)\}", value)
-            monkeypatch.setenv(variable, default[1] if default else value)
+            monkeypatch.setenv(variable, default[1] if default else value.removeprefix("@"))
     settings = Settings()
     assert settings.api_tokens == frozenset()
     assert settings.allow_unauthenticated is False

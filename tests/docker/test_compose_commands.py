@@ -26,7 +26,7 @@ def settings_of(service: Service, monkeypatch: pytest.MonkeyPatch) -> Settings:
     for name in [name for name in os.environ if name.startswith("REGNF_")]:
         monkeypatch.delenv(name)
     for name, value in service["environment"].items():
-        monkeypatch.setenv(name, value)
+        monkeypatch.setenv(name, value.replace("@/run/redis/password", "password"))  # the file is in a volume
     return Settings()
 
 
@@ -65,17 +65,17 @@ def test_grafana_is_given_a_password(command: ComposeCommand) -> None:
 
 @pytest.mark.parametrize("publish", ["0.0.0.0:8080", "8080", "192.0.2.1:8080"])
 def test_published_to_others_it_does_not_start_without_tokens(publish: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    api = render(COMPOSE, {"REGNF_PUBLISH": publish}, ["cpu"])["api"]
-    assert api["ports"] == [f"{publish}:8080"]
+    services = render(COMPOSE, {"REGNF_PUBLISH": publish}, ["cpu"])
+    assert services["proxy"]["ports"] == [f"{publish}:8000"]
     with pytest.raises(StartError) as caught:
-        check_access(settings_of(api, monkeypatch))
+        check_access(settings_of(services["api"], monkeypatch))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
 
 
 def test_the_front_end_knows_where_its_port_is_published() -> None:
     for variables in ({}, {"REGNF_PUBLISH": "127.0.0.1:9000"}):
-        api = render(COMPOSE, variables)["api"]
-        assert api["ports"] == [f"{api['environment']['REGNF_PUBLISH']}:8080"]
+        services = render(COMPOSE, variables)
+        assert services["proxy"]["ports"] == [f"{services['api']['environment']['REGNF_PUBLISH']}:8000"]
 
 
 @pytest.mark.parametrize(("password", "status"), [("", 1), ("a-password", 0)])

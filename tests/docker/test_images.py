@@ -42,7 +42,9 @@ def test_pip_is_configured_as_on_this_machine(tmp_path: Path) -> None:
 
 def test_every_command_is_run_or_said_not_to_be() -> None:
     plans = [(command, *plan_of(command)) for command in documented_commands(ROOT)]
-    assert {tuple(left_out) for _, _, left_out in plans} == {(), ("worker-gpu",), ("prometheus", "grafana")}
+    assert {tuple(left_out) for _, _, left_out in plans} == {
+        ("proxy",), ("proxy", "worker-gpu"), ("proxy", "prometheus", "grafana"),
+    }  # fmt: skip
     assert {plan.workers for _, plan, _ in plans if plan} == {1, 4}
     for command, plan, left_out in plans:
         assert (plan is None) == (left_out == ["worker-gpu"]), command.text

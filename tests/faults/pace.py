@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 
+from regnf_state.settings import variables
+
 VARIABLE = "REGNF_TEST_PACE"
 REQUEST_TIMEOUT_S = 0.7
 """Of a request to the object store, in the short version."""
@@ -23,9 +25,7 @@ class Pace:
 
 
 _WHOLE = Pace(whole=True, settings={VARIABLE: "whole"})
-_SHORT = Pace(
-    whole=False, settings={"REGNF_HEARTBEAT_S": "0.2", "REGNF_LOST_AFTER_S": "2.4", "REGNF_SHUTDOWN_GRACE_S": "0.5"}
-)
+_SHORT = Pace(whole=False, settings=variables(heartbeat_s=0.2, lost_after_s=2.4, shutdown_grace_s=0.5))
 
 
 def pace() -> Pace:

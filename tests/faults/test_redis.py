@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from regnf_state.settings import variables
 from tests.faults.house import DEADLINE_S, House
 from tests.faults.promise import check_promise, fault
 from tests.faults.proxy import Proxy
@@ -153,7 +154,7 @@ def test_redis_frozen(house: House) -> None:
 def test_redis_100_ms_away(far_house: House, network: Proxy) -> None:
     """Each of eight jobs takes some six seconds longer, and nothing else changes."""
     house = far_house
-    house.environment["REGNF_HEARTBEAT_S"] = "1"
+    house.environment |= variables(heartbeat_s=1, lost_after_s=2.4)
     house.start_both()
     before = house.submit()
     check_promise(house, [before])

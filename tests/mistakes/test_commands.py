@@ -45,14 +45,16 @@ CASES = [
     Case("port out of range", "USAGE", 2, "--port", "65535", "regnf serve " + HELP, ["serve", "--port", "70000"]),
     Case("state folder a file", "STATE_DIR_UNUSABLE", 3, "box.json", "cannot keep state", "--state-dir", ["serve", "--state-dir", "box.json"]),
     Case("open to others without tokens", "UNAUTHENTICATED_PUBLIC_BIND", 3, "0.0.0.0", "no token is configured", "Set REGNF_API_TOKENS", ["serve", "--state-dir", "state", "--host", "0.0.0.0"]),
+    Case("open to others without a proxy", "PROXY_MISSING", 3, "0.0.0.0", "slow or hostile connections", "REGNF_BEHIND_PROXY=true", ["serve", "--state-dir", "tokens", "--host", "0.0.0.0"]),
     Case("address of another machine", "ADDRESS_UNAVAILABLE", 3, "192.0.2.1", "cannot listen", "--host", ["serve", "--state-dir", "state", "--host", "192.0.2.1"]),
 ]  # fmt: skip
 
 
 @parametrized(CASES)
 def test_a_wrong_command(case: Case, run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if "192.0.2.1" in case.how:
+    if case.reason in ("ADDRESS_UNAVAILABLE", "PROXY_MISSING"):
         monkeypatch.setenv("REGNF_API_TOKENS", '["robot:0123456789abcdef0123456789abcdef"]')
+        monkeypatch.setenv("REGNF_BEHIND_PROXY", str(case.reason == "ADDRESS_UNAVAILABLE"))
     outcome = run(*case.how)
     assert outcome.code == case.code, outcome.stderr
     assert case.reason in outcome.stderr

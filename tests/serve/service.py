@@ -13,6 +13,7 @@ import httpx
 
 from regnf_cli.embedded_redis import StartError
 from regnf_cli.supervisor import StateLock
+from regnf_state.settings import variables
 from tests.processes import alive, command_of, descendants_of
 from tests.worker.bench import eventually
 
@@ -74,7 +75,7 @@ class Service:
 
 def environment(**settings: object) -> dict[str, str]:
     plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
-    return plain | {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
+    return plain | variables(**settings)
 
 
 def command(state_dir: Path, *arguments: str) -> list[str]:

@@ -52,7 +52,7 @@ def test_what_is_loopback(host: str, expected: bool) -> None:
     ],
 )
 def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: str, private: bool) -> None:
-    settings = Settings(host="0.0.0.0", publish=publish)
+    settings = Settings(host="0.0.0.0", publish=publish, behind_proxy=True)
     assert settings.is_private is private
     assert settings.calls_per_s == (0 if private else 20)
     if private:
@@ -61,7 +61,20 @@ def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: s
     with pytest.raises(StartError, match=f"^{re.escape(publish)} can be reached by others") as caught:
         check_access(settings)
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
-    check_access(Settings(host="0.0.0.0", publish=publish, api_tokens=frozenset({"lab:a-long-random-string"})))
+    check_access(settings.model_copy(update={"api_tokens": frozenset({"lab:a-long-random-string"})}))
+
+
+def test_beyond_loopback_a_proxy_stands_before_it() -> None:
+    """And behind one the service is open to others, whatever its own address is."""
+    tokens = frozenset({"lab:a-long-random-string"})
+    with pytest.raises(StartError, match=r"^0\.0\.0\.0 can be reached by others") as caught:
+        check_access(Settings(host="0.0.0.0", api_tokens=tokens))
+    assert caught.value.reason == "PROXY_MISSING"
+    assert "REGNF_BEHIND_PROXY" in str(caught.value.hint)
+    with pytest.raises(StartError) as caught:
+        check_access(Settings(behind_proxy=True))
+    assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
+    check_access(Settings(behind_proxy=True, api_tokens=tokens))
 
 
 def test_a_published_loopback_is_not_private() -> None:
@@ -72,13 +85,13 @@ def test_a_published_loopback_is_not_private() -> None:
 def test_addresses_to_open() -> None:
     with open_socket(Settings(port=0)) as listener:
         assert address_of(listener) == f"http://127.0.0.1:{listener.getsockname()[1]}"
-    with open_socket(Settings(port=0, host="0.0.0.0", allow_unauthenticated=True)) as listener:
+    with open_socket(Settings(port=0, host="0.0.0.0", allow_unauthenticated=True, behind_proxy=True)) as listener:
         assert address_of(listener).startswith("http://127.0.0.1:")
 
 
 def test_a_host_that_is_not_ours() -> None:
     with pytest.raises(StartError) as caught:
-        open_socket(Settings(port=0, host="192.0.2.1", allow_unauthenticated=True))
+        open_socket(Settings(port=0, host="192.0.2.1", allow_unauthenticated=True, behind_proxy=True))
     assert caught.value.reason == "ADDRESS_UNAVAILABLE"
 
 

@@ -12,17 +12,16 @@ import httpx
 from regnf_cli.demo import running_service
 from tests.processes import command_of, descendants_of
 
-TOKEN, FILED = "token-in-the-environment-1f9c", "token-in-the-file-77aa"
+TOKEN, FILED = "token-of-alice-1f9c", "token-of-bob-77aa"
 SECRET = base64.b64encode(b"a webhook secret, 26 bytes").decode()
 
 
 def test_secrets_stay_where_they_belong(tmp_path: Path) -> None:
     file = tmp_path / "tokens"
-    file.write_text(f"bob:{FILED}\n")
+    file.write_text(f"alice:{TOKEN}\nbob:{FILED}\n")
     state = tmp_path / "state"
     settings = {
-        "api_tokens": json.dumps([f"alice:{TOKEN}"]),
-        "api_tokens_file": file,
+        "api_tokens": f"@{file}",
         "webhook_secrets": json.dumps([f"alice:whsec_{SECRET}"]),
         "webhook_hosts": '["http://127.0.0.1:1"]',
         "log_format": "json",

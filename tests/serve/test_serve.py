@@ -192,10 +192,10 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
         assert "ADDRESS_UNAVAILABLE" in refused("--port", port, state_dir=tmp_path / "state")
 
 
-def test_beyond_loopback_only_with_tokens_or_on_request(tmp_path: Path) -> None:
+def test_beyond_loopback_only_behind_a_proxy_and_with_tokens_or_on_request(tmp_path: Path) -> None:
     assert "UNAUTHENTICATED_PUBLIC_BIND" in refused("--host", "0.0.0.0", state_dir=tmp_path / "state")
     for settings in ({"allow_unauthenticated": "true"}, {"api_tokens": '["0123456789abcdef0123456789abcdef"]'}):
-        with started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, **settings):
+        with started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, behind_proxy="true", **settings):
             pass
 
 

@@ -68,7 +68,7 @@ def test_by_default_fields_stay(world: World) -> None:
 
 
 def test_a_field_goes_once_nobody_has_used_it_for_long(world: World) -> None:
-    keep = {"unused_field_retention_s": 10 * DAY_S}
+    keep = {"field_retention_s": 10 * DAY_S}
     a, b, c = (world.add_field(letter) for letter in "abc")
     assert world.tidy(**keep) == Removed(), "from now on they count as unused"
     world.records.ahead_s += 8 * DAY_S
@@ -84,7 +84,7 @@ def test_what_a_live_job_needs_stays(world: World) -> None:
     a, b = world.add_field("a"), world.add_field("b")
     world.tidy()
     world.add_job("j", a, b, ended=False)
-    assert world.tidy(100 * DAY_S, unused_field_retention_s=60, storage_cap_bytes=1) == Removed()
+    assert world.tidy(100 * DAY_S, field_retention_s=60, max_stored_bytes=1) == Removed()
     assert world.fields() == {"a", "b"}
 
 
@@ -99,7 +99,7 @@ def test_a_field_that_is_asked_for_while_it_goes_comes_back(world: World, monkey
         return delete(sha256)
 
     monkeypatch.setattr(world.records, "delete_field", and_somebody_asks)
-    assert world.tidy(100 * DAY_S, unused_field_retention_s=60) == Removed()
+    assert world.tidy(100 * DAY_S, field_retention_s=60) == Removed()
     assert world.records.get_field(a) == known
     assert world.records.journal.recall_field(a) == replace(known, version=1) if known else None
     assert world.fields() == {"a"}
@@ -118,12 +118,12 @@ def test_beyond_the_cap_the_oldest_go_and_the_youngest_stay(world: World) -> Non
     world.records.ahead_s += DAY_S / 2
     world.add_job("new", b, b, size=300_000)
     world.records.ahead_s += DAY_S / 2
-    removed = world.tidy(storage_cap_bytes=450_000)
+    removed = world.tidy(max_stored_bytes=450_000)
     assert (removed.jobs, removed.fields) == (("old",), (a,))
     assert world.records.get_job("old") is None
     assert sum(map(len, (data for key, data in world.blobs.blobs.items() if not key.startswith("journal/")))) == 400_000
     world.add_job("fresh", b, b, size=300_000)
-    assert world.tidy(60.0, storage_cap_bytes=1).jobs == ("new",), "what is an hour old at most is not taken"
+    assert world.tidy(60.0, max_stored_bytes=1).jobs == ("new",), "what is an hour old at most is not taken"
 
 
 def test_folders_that_no_record_knows_go_after_a_day(world: World) -> None:
@@ -154,7 +154,7 @@ def test_nothing_goes_while_redis_has_lost_the_records(world: World) -> None:
     world.add_job("j", world.add_field("a"), world.add_field("b"), size=10)
     before = dict(world.blobs.blobs)
     world.redis.flushall()
-    assert world.tidy(100 * DAY_S, unused_field_retention_s=60, storage_cap_bytes=1) == Removed()
+    assert world.tidy(100 * DAY_S, field_retention_s=60, max_stored_bytes=1) == Removed()
     assert world.blobs.blobs == before
 
 
@@ -163,7 +163,7 @@ def test_a_leader_that_no_longer_leads_deletes_nothing(world: World) -> None:
     world.tidy()
     world.records.ahead_s += 100 * DAY_S
     keeper = Housekeeper(
-        world.records, world.blobs, world.redis, world.settings.model_copy(update={"unused_field_retention_s": 60})
+        world.records, world.blobs, world.redis, world.settings.model_copy(update={"field_retention_s": 60})
     )
     with world.lease.held() as term:
         assert term is not None
@@ -205,11 +205,11 @@ def test_pieces_and_journals_count_in_the_cap(world: World) -> None:
         os.utime(world.blobs.path_of(key), (moment, moment))
     journal = sum(entry.bytes for entry in world.blobs.entries("journal"))
     kept = {"keep_pieces_s": 100 * int(DAY_S)}
-    assert world.tidy(storage_cap_bytes=40_000 + journal, **kept) == Removed()
+    assert world.tidy(max_stored_bytes=40_000 + journal, **kept) == Removed()
     assert list(world.blobs.list("uploads")) == pieces
-    world.tidy(storage_cap_bytes=40_000 + journal - 1, **kept)
+    world.tidy(max_stored_bytes=40_000 + journal - 1, **kept)
     assert list(world.blobs.list("uploads")) == pieces[1:]
-    world.tidy(storage_cap_bytes=20_000 + journal, **kept)
+    world.tidy(max_stored_bytes=20_000 + journal, **kept)
     assert list(world.blobs.list("uploads")) == []
     assert world.records.get_job("j") is not None, "it is younger than an hour"
 
@@ -219,5 +219,5 @@ def test_batches_count_in_the_cap_and_go_before_their_time(world: World) -> None
         world.blobs.put(f"batches/anyone/{number}", b"." * 600)
         moment = world.records.now() - (3 - number) * DAY_S
         os.utime(world.blobs.path_of(f"batches/anyone/{number}"), (moment, moment))
-    world.tidy(storage_cap_bytes=1000)
+    world.tidy(max_stored_bytes=1000)
     assert list(world.blobs.list("batches")) == ["batches/anyone/2"]

@@ -162,7 +162,7 @@ def test_they_have_a_port_of_their_own(tmp_path: Path, any_redis: Redis) -> None
     probe.server_close()
     thread.join()
     hosts = AllowedHosts({"api"})
-    with served(metrics.registry, hosts, "127.0.0.1", port):
+    with served(metrics.registry, hosts, f"127.0.0.1:{port}"):
         answer = httpx.get(f"http://127.0.0.1:{port}/metrics")
         assert answer.headers["content-type"].startswith("text/plain")
         assert ("regnf_uploads_active",) in values(answer.text)
@@ -176,7 +176,7 @@ def test_they_have_a_port_of_their_own(tmp_path: Path, any_redis: Redis) -> None
             assert httpx.get(f"http://127.0.0.1:{port}/metrics", headers=headers).status_code == status
     with pytest.raises(httpx.ConnectError):
         httpx.get(f"http://127.0.0.1:{port}/metrics")
-    with served(metrics.registry, hosts, "127.0.0.1", None):
+    with served(metrics.registry, hosts, None):
         pass
 
 
@@ -184,7 +184,7 @@ def test_silent_connections_do_not_fill_the_metrics_port(tmp_path: Path, any_red
     metrics = make_world(tmp_path, any_redis).app.state.metrics
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with served(metrics.registry, AllowedHosts(()), "127.0.0.1", port), ExitStack() as stack:
+    with served(metrics.registry, AllowedHosts(()), f"127.0.0.1:{port}"), ExitStack() as stack:
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(17)]
         assert silent[-1].recv(1) == b""
         assert threading.active_count() < 40
@@ -199,7 +199,7 @@ def test_trickling_connections_do_not_keep_the_metrics_port(
         port = free.getsockname()[1]
     end = time.monotonic() + 20
     with (
-        served(metrics.registry, AllowedHosts(()), "127.0.0.1", port),
+        served(metrics.registry, AllowedHosts(()), f"127.0.0.1:{port}"),
         socket.create_connection(("127.0.0.1", port)) as trickling,
     ):
         trickling.settimeout(0.1)

@@ -105,7 +105,7 @@ def outcome(read: Callable[[Any], Any], value: Any) -> Any:
 @given(st.text(max_size=60))
 def test_other_page_tokens_are_refused_or_harmless(text: str) -> None:
     found = outcome(decode_token, text)
-    assert found == "INVALID_PAGE_TOKEN" or (isinstance(found[0], float) and isinstance(found[1], str))
+    assert found == "INVALID_QUERY" or (isinstance(found[0], float) and isinstance(found[1], str))
 
 
 @given(st.binary(max_size=200))

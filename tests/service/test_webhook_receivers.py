@@ -157,7 +157,7 @@ def test_a_receiver_that_does_not_answer_keeps_no_other_waiting(
         finish(redis, f"{hung}/x", name=f"hung{number}")
     finish(redis, receiver.address, name="own")
     finish(redis, receiver.address, name="other", owner="bob")
-    secrets = read_secrets([f"alice:{SECRET}", f"bob:{SECRET}"], None)
+    secrets = read_secrets([f"alice:{SECRET}", f"bob:{SECRET}"])
     webhooks = Webhooks(AllowList([hung, receiver.address]), secrets, RedisOutbox(redis))
 
     async def serve() -> None:

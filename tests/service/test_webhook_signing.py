@@ -26,5 +26,5 @@ NO_SECRETS = ["", SECRET, "alice:", "alice:whsec_", "alice:whsec_AAAA", f"Alice:
 @pytest.mark.parametrize("entry", NO_SECRETS)
 def test_secrets_that_are_none_are_refused_without_repeating_them(entry: str) -> None:
     with pytest.raises(TokensError) as refused:
-        read_secrets([entry], None)
+        read_secrets([entry])
     assert SECRET[6:] not in str(refused.value)

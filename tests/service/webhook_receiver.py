@@ -84,7 +84,7 @@ class OneByOne:
 
 def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> OneByOne:
     hosts = AllowList(allowed)
-    secrets = read_secrets([f"alice:{SECRET}"], None)
+    secrets = read_secrets([f"alice:{SECRET}"])
     store, outbox = RecordStore(redis), RedisOutbox(redis)
     return OneByOne(Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s))
 

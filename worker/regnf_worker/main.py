@@ -15,10 +15,11 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import RedisError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
+from regnf_core.errors import InvalidInputError
 from regnf_state.journal.journal import StorageMismatchError, claim_storage
 from regnf_state.logs import configure_logging
 from regnf_state.redis.client import WORKER_RETRIES, NoRedisError, connect, redis_address
-from regnf_state.settings import Settings
+from regnf_state.settings import Settings, read_settings
 from regnf_state.stores import open_stores
 from regnf_worker import kernel
 from regnf_worker.kernel import Scratch, give_way, share_cores
@@ -144,8 +145,8 @@ def _preload(environment: MutableMapping[str, str]) -> None:
 
 def main() -> int:
     try:
-        run_worker(Settings())
-    except (NoRedisError, PreloadError, StorageMismatchError) as error:
+        run_worker(read_settings())
+    except (InvalidInputError, NoRedisError, PreloadError, StorageMismatchError) as error:
         logger.error("%s: %s", error.reason, error)
         return 2
     except (RedisConnectionError, RedisTimeoutError) as error:

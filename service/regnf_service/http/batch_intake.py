@@ -239,9 +239,9 @@ class Intake:
             self._lines.append(line)
 
     def finish(self) -> Posting:
-        """All lines, to become jobs. Raises Problem BATCH_EMPTY."""
+        """All lines, to become jobs. Raises Problem INVALID_REQUEST."""
         if not self._lines:
-            raise Problem("BATCH_EMPTY")
+            raise Problem("INVALID_REQUEST", "The body has no line. Send one request a line.")
         return Posting(self._services, self._caller, self._identity.hexdigest()[:_ID_DIGITS], self._lines)
 
     def _read(self, text: TextLine) -> Read:
@@ -257,7 +257,7 @@ class Intake:
     def _spec(self, text: TextLine) -> BatchPair:
         """Raises Problem: what POST /register would say."""
         if text.text is None:
-            raise Problem("LINE_TOO_LARGE", f"A line may have {LINE_BYTES} bytes.")
+            raise Problem("REQUEST_TOO_LARGE", f"A line may have {LINE_BYTES} bytes.")
         spec = read_model(BatchPair, text.text)
         if spec.key is not None and self._keys.setdefault(spec.key, text.number) != text.number:
             fault = {"pointer": "/key", "detail": f"Line {self._keys[spec.key]} has the same key."}

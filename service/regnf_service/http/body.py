@@ -84,14 +84,14 @@ class Pace:
             self._limit.reschedule(asyncio.get_running_loop().time())
 
     async def next(self, request: Request) -> Message:
-        """What comes next. Raises Problem UPLOAD_STALLED when nothing comes for long, or too little."""
+        """What comes next. Raises Problem REQUEST_STALLED when nothing comes for long, or too little."""
         left = 0.0 if self._is_cut else min(self._stall_s, max(0.0, self._stall_s - self.behind_s()))
         self._since = time.monotonic()
         try:
             async with asyncio.timeout(left) as self._limit:
                 message = await request.receive()
         except TimeoutError as error:
-            raise Problem("UPLOAD_STALLED", headers=CLOSE) from error
+            raise Problem("REQUEST_STALLED", headers=CLOSE) from error
         finally:
             self._waited += time.monotonic() - self._since
             self._since = self._limit = None
@@ -123,8 +123,8 @@ def media_type(request: Request) -> str:
 async def chunks(request: Request, limit: int, pace: Pace, too_large: str = "UPLOAD_TOO_LARGE") -> AsyncIterator[bytes]:
     """The body as it arrives, at most ``limit`` bytes of it.
 
-    Raises Problem: ``too_large`` by header or by count, UPLOAD_STALLED when its ``pace`` is too slow, UPLOAD_INCOMPLETE
-    when the client leaves or the count is not what it declared.
+    Raises Problem: ``too_large`` by header or by count, REQUEST_STALLED when its ``pace`` is too slow,
+    UPLOAD_INCOMPLETE when the client leaves or the count is not what it declared.
     """
     declared = declared_length(request)
     if declared is not None and declared > limit:
@@ -376,7 +376,7 @@ async def read_parts(
     A file part that came appears in the answer too, empty. Looking for boundaries takes long where there is nearly one
     in every line, so it is done in a thread, a piece at a time.
 
-    Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, DUPLICATE_PART, REQUEST_TOO_LARGE, and what the sinks raise.
+    Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, REQUEST_TOO_LARGE, and what the sinks raise.
     """
     collector = _Collector(boundary)
     parts: dict[str, _Part] = {}
@@ -401,7 +401,7 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
     if part.name not in files and part.name not in texts:
         raise Problem("UNKNOWN_PART", f"Known parts: {', '.join([*files, *texts])}.", headers=CLOSE)
     if part.name in parts:
-        raise Problem("DUPLICATE_PART", headers=CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "Two parts bear the same name.", headers=CLOSE)
     if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):
         raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.", headers=CLOSE)
     parts[part.name] = part

@@ -43,6 +43,7 @@ async def refuse_unknown_parameters(request: Request) -> None:
 
 # Page tokens: where the look for the page before ended. They carry no secret and open nothing, so none is signed.
 
+_FORGED = "Use `next_page_token` of the page before, unchanged, as `page_token`."
 NEXT_PAGE = "For the next page's `page_token`; null on the last page. A page before the last may be short or empty."
 
 
@@ -54,17 +55,17 @@ def encode_token(rest: Position | None) -> str | None:
 
 
 def decode_token(token: str | None) -> Position | None:
-    """The position from a token. Raises Problem INVALID_PAGE_TOKEN."""
+    """The position from a token. Raises Problem INVALID_QUERY."""
     if token is None:
         return None
     try:
         value = json.loads(base64.b64decode(token + "=" * (-len(token) % 4), altchars=b"-_", validate=True))
     except (ValueError, binascii.Error, RecursionError) as error:
-        raise Problem("INVALID_PAGE_TOKEN") from error
+        raise Problem("INVALID_QUERY", _FORGED) from error
     match value:
         case [float() | int() as created, str() as name] if math.isfinite(created) and name.isascii():
             return float(created), name
-    raise Problem("INVALID_PAGE_TOKEN")
+    raise Problem("INVALID_QUERY", _FORGED)
 
 
 # Which requests a page answers and which JSON: addresses that people open in a browser have both.

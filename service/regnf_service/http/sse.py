@@ -55,7 +55,7 @@ async def event_stream(services: Services, job_id: str, after: str | None) -> As
 class EventStream(StreamingResponse):
     """A stream as one of those that a caller may read at once: held while it is sent, however that ends.
 
-    Raises Problem TOO_MANY_STREAMS before anything is sent.
+    Raises Problem TOO_MANY_REQUESTS_AT_ONCE before anything is sent.
     """
 
     def __init__(self, slots: Slots, caller: str, stream: AsyncIterator[str]) -> None:

@@ -144,9 +144,9 @@ _MAX_KEY_LENGTH = 255
 
 
 def check_idempotency_key(key: str | None) -> None:
-    """Raises Problem INVALID_IDEMPOTENCY_KEY."""
+    """Raises Problem INVALID_HEADER."""
     if key is not None and not (0 < len(key) <= _MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
-        raise Problem("INVALID_IDEMPOTENCY_KEY")
+        raise Problem("INVALID_HEADER", "`Idempotency-Key` has 1 to 255 characters of printable ASCII.")
 
 
 class FieldLookup:

@@ -106,9 +106,9 @@ class Housekeeper:
         self._records = records
         self._blobs = blobs
         self._redis = redis
-        self._keep_unused_s = settings.unused_field_retention_s
-        self._retention_s = settings.retention_s
-        self._cap = settings.storage_cap_bytes
+        self._keep_unused_s = settings.field_retention_s
+        self._retention_s = settings.job_retention_s
+        self._cap = settings.max_stored_bytes
         self._room = Room(records, blobs, redis, settings)
         self._pieces = Pieces(blobs, settings)
         self._batches = Batches(blobs)

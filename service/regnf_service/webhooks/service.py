@@ -289,7 +289,7 @@ _LAST_S = 1.0
 
 def webhooks_of(settings: Settings, redis: Redis) -> Webhooks:
     """What the settings say of webhooks. Raises TokensError."""
-    secrets = read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
+    secrets = read_secrets(settings.webhook_secrets)
     return Webhooks(AllowList(settings.webhook_hosts), secrets, RedisOutbox(redis))
 
 

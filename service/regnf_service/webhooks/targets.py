@@ -14,12 +14,11 @@ import ipaddress
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from regnf_service.problem import Problem
-from regnf_service.tokens import TokensError, read_lines
+from regnf_service.tokens import TokensError
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
 from regnf_state.records import JobRecord
 from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
@@ -112,10 +111,10 @@ Secrets = Mapping[str, Sequence[bytes]]
 """Each caller's keys. With several keys each message has a signature of each, while one key replaces another."""
 
 
-def read_secrets(entries: Iterable[str], file: Path | None) -> Secrets:
-    """The keys in entries ``caller:whsec_<base64>``, those of the file included. Raises TokensError."""
+def read_secrets(entries: Iterable[str]) -> Secrets:
+    """The keys in entries ``caller:whsec_<base64>``. Raises TokensError."""
     secrets: dict[str, list[bytes]] = {}
-    for entry in (*entries, *(read_lines(file) if file is not None else ())):
+    for entry in entries:
         caller, _, text = entry.partition(":")
         if not CALLER_NAME.fullmatch(caller):
             raise TokensError(f"an entry of a webhook secret begins with no caller's name; without tokens: {ANONYMOUS}")

@@ -59,9 +59,8 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "MALFORMED_JSON",
             "REQUEST_TOO_LARGE",
             "TOO_MANY_PAIRS",
-            "BATCH_EMPTY",
             "UPLOAD_INCOMPLETE",
-            "UPLOAD_STALLED",
+            "REQUEST_STALLED",
             "TOO_MANY_UPLOADS",
             "QUOTA_ACTIVE_JOBS",
             "QUOTA_BATCHES",
@@ -112,7 +111,7 @@ async def _read(request: Request, services: Services, intake: Intake, pace: Pace
 
 def _answer(services: Services, batch: Batch, prefix: str, status: int = 200) -> JSONResponse:
     """The batch; 200 in place of ``status`` where none of its jobs waits or runs."""
-    document = document_of(batch, state_of(services, batch), services.settings.retention_s, prefix)
+    document = document_of(batch, state_of(services, batch), services.settings.job_retention_s, prefix)
     status = status if document["status"] == "running" else 200
     return JSONResponse(document, status_code=status, headers={"Cache-Control": "no-cache"})
 
@@ -121,7 +120,7 @@ def _answer(services: Services, batch: Batch, prefix: str, status: int = 200) ->
     "/batches",
     summary="Batches, those posted last first",
     response_model=BatchPage,
-    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+    responses=refusals("INVALID_QUERY"),
 )
 @blocking
 def list_batches(
@@ -133,7 +132,7 @@ def list_batches(
 ) -> Response:
     """A page may be short and not be the last: go on while there is a `next_page_token`."""
     page = services.batches.page(caller, limit, decode_token(page_token))
-    documents = [summary_of(one, services.settings.retention_s, prefix) for one in page.records]
+    documents = [summary_of(one, services.settings.job_retention_s, prefix) for one in page.records]
     return JSONResponse({"batches": documents, "next_page_token": encode_token(page.rest)})
 
 

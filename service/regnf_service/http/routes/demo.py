@@ -19,17 +19,18 @@ from regnf_service.services import Services
 router = APIRouter(tags=["service"])
 _FIELDS = {"scene": "mix-room.safetensors", "object": "armchair.safetensors"}
 _DETECTION = "detection.json"
+_NO_DEMO = "This service offers no demo: `regnf serve` does. Upload fields of your own."
 
 
 def _folder(services: Services) -> Path:
-    """Where the files lie. Raises Problem DEMO_NOT_FOUND."""
+    """Where the files lie. Raises Problem NOT_FOUND."""
     folder = services.settings.demo_dir
     if folder is None or not all((folder / name).is_file() for name in (*_FIELDS.values(), _DETECTION)):
-        raise Problem("DEMO_NOT_FOUND")
+        raise Problem("NOT_FOUND", _NO_DEMO)
     return folder
 
 
-@router.get("/demo", summary="Fields to try", response_model=DemoDocument, responses=refusals("DEMO_NOT_FOUND"))
+@router.get("/demo", summary="Fields to try", response_model=DemoDocument, responses=refusals("NOT_FOUND"))
 @blocking
 def get_demo(services: ServicesDep, prefix: PrefixDep) -> JSONResponse:
     """The addresses of two field files, to fetch and to upload, and a detection of the object in the scene."""
@@ -48,7 +49,7 @@ def get_demo(services: ServicesDep, prefix: PrefixDep) -> JSONResponse:
     response_class=FileResponse,
     responses={
         200: {"description": "The file.", "content": {"application/octet-stream": BINARY}},
-        **refusals("DEMO_NOT_FOUND"),
+        **refusals("NOT_FOUND"),
     },
 )
 @blocking
@@ -56,5 +57,5 @@ def get_demo_file(name: str, services: ServicesDep) -> FileResponse:
     """One of the files that `GET /demo` names."""
     folder = _folder(services)
     if name not in _FIELDS.values():
-        raise Problem("DEMO_NOT_FOUND")
+        raise Problem("NOT_FOUND", _NO_DEMO)
     return FileResponse(folder / name, media_type="application/octet-stream", headers={"Cache-Control": "no-cache"})

@@ -205,7 +205,7 @@ async def _view_answer(
     "/fields",
     summary="Fields, newest first",
     response_model=FieldPage,
-    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY")},
 )
 @blocking
 def list_fields(
@@ -241,7 +241,7 @@ def list_fields(
             "INVALID_HEADER",
             "MALFORMED_JSON",
             "UPLOAD_INCOMPLETE",
-            "UPLOAD_STALLED",
+            "REQUEST_STALLED",
             "TOO_MANY_UPLOADS",
             "REQUEST_TOO_LARGE",
             "UNSUPPORTED_MEDIA_TYPE",

@@ -65,7 +65,7 @@ def _answer(services: Services, seen: _Seen, prefix: str, status: int) -> JSONRe
     headers = {"ETag": _etag(seen), "Cache-Control": "no-cache"}
     if record.status in ACTIVE:
         headers["Retry-After"] = _RETRY_AFTER_S
-    document = job_document(record, position, services.settings.retention_s, prefix, deliveries)
+    document = job_document(record, position, services.settings.job_retention_s, prefix, deliveries)
     return JSONResponse(document, status_code=status, headers=headers)
 
 
@@ -81,7 +81,7 @@ def _etag(seen: _Seen) -> str:
     "/jobs",
     summary="Jobs, newest first",
     response_model=JobPage,
-    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY")},
 )
 @blocking
 def list_jobs(
@@ -100,7 +100,7 @@ def list_jobs(
     if wants_page(request.scope):
         return page("lists.html")
     found = services.records.list_jobs(status, limit, decode_token(page_token), caller)
-    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in found.records]
+    documents = [job_document(record, None, services.settings.job_retention_s, prefix) for record in found.records]
     document = {"jobs": documents, "next_page_token": encode_token(found.rest)}
     return JSONResponse(document, headers={"Vary": "Accept"})
 
@@ -169,7 +169,7 @@ def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response: 
             "content": {sse.MEDIA_TYPE: {"schema": _EVENT}},
         },
         204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
-        **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_STREAMS"),
+        **refusals("INVALID_HEADER", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_REQUESTS_AT_ONCE"),
     },
 )
 async def job_events(
@@ -185,7 +185,7 @@ async def job_events(
     try:
         waiting = await in_thread(services.records.events, id, last_event_id)
     except ValueError as error:
-        raise Problem("INVALID_EVENT_ID") from error
+        raise Problem("INVALID_HEADER", "`Last-Event-ID` is not the id of an event of this service.") from error
     if last_event_id is not None and record.status not in ACTIVE and not waiting:
         return Response(status_code=204)
     return sse.EventStream(services.streams, caller, sse.event_stream(services, id, last_event_id))

@@ -37,7 +37,7 @@ _BODY_REFUSALS = (
     "INVALID_HEADER",
     "MALFORMED_JSON",
     "UPLOAD_INCOMPLETE",
-    "UPLOAD_STALLED",
+    "REQUEST_STALLED",
     "TOO_MANY_UPLOADS",
     "REQUEST_TOO_LARGE",
     "UNSUPPORTED_MEDIA_TYPE",
@@ -52,7 +52,7 @@ NamePath = Annotated[str, Path(description="Of the entry.", max_length=4 * MAX_N
     "/library",
     summary="The library's entries, the one added last first",
     response_model=EntryPage,
-    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY")},
 )
 @blocking
 def list_library(

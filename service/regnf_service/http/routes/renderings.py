@@ -52,7 +52,7 @@ router = APIRouter(tags=["renderings"])
             "INVALID_HEADER",
             "REQUEST_TOO_LARGE",
             "UNSUPPORTED_MEDIA_TYPE",
-            "UPLOAD_STALLED",
+            "REQUEST_STALLED",
             "TOO_MANY_UPLOADS",
             "UPLOAD_INCOMPLETE",
             "INVALID_REQUEST",

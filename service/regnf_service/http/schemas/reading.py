@@ -57,7 +57,6 @@ _REASONS = {
     "options": "INVALID_OPTIONS",
     "initial_transform": "INVALID_TRANSFORM",
     "ground_truth": "INVALID_TRANSFORM",
-    "webhook": "INVALID_WEBHOOK",
     "edits": "EDIT_INVALID",
     **dict.fromkeys(("orbit", "look_at", "poses", "transforms", "size"), "CAMERA_INVALID"),
 }
