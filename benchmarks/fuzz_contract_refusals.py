@@ -18,7 +18,6 @@ OF_STATE = frozenset(
         "LIBRARY_TOO_LARGE",
         "EDIT_POSE_REJECTED",  # which jobs there are
         "IDEMPOTENCY_KEY_REUSED",  # what was asked before
-        "INVALID_QUERY",  # which pages there are
         "WEBHOOK_NOT_ALLOWED",  # the operator's settings
         "OPTIONS_TOO_COSTLY",
         "RENDER_TOO_LARGE",
@@ -26,7 +25,9 @@ OF_STATE = frozenset(
 )
 """Reasons that depend on what the service holds, and on its settings: allowed wherever the contract documents them."""
 
+_LISTS = ("jobs", "fields", "batches", "library")
 OF_MEMBERS: Mapping[str, frozenset[str]] = {
+    **{f"GET /{name}": frozenset({"INVALID_QUERY"}) for name in _LISTS},  # a page token that no page has given
     "POST /register": frozenset(
         {
             "INVALID_DETECTION",  # min below max, a quaternion that is not zero

@@ -338,7 +338,7 @@ def check_json_format(name: str, document: object) -> dict[str, Any]:
     """A document whose format is one of its members. Raises UnreadableRecordError unless this release can read it."""
     if not isinstance(document, dict):
         raise UnreadableRecordError(name, "it is not an object")
-    _check_format(name, document.get("format"))
+    _check_format(name, document.get("format", FORMAT))
     return document
 
 

@@ -47,7 +47,7 @@ def test_every_command_is_run_or_said_not_to_be() -> None:
     }  # fmt: skip
     assert {plan.workers for _, plan, _ in plans if plan} == {1, 4}
     for command, plan, left_out in plans:
-        assert (plan is None) == (left_out == ["worker-gpu"]), command.text
+        assert (plan is None) == ("worker-gpu" in left_out), command.text
     assert len({plan.key for _, plan, _ in plans if plan}) == 3, "without tokens, with tokens, with four workers"
 
 

@@ -21,7 +21,7 @@ from regnf_state.records import FINISHED, FieldRecord, JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.queue import JobQueue
-from regnf_state.settings import Settings
+from regnf_state.settings import Settings, variables
 from regnf_worker.models import Context
 from tests.listing import below
 from tests.redis_server import private_redis
@@ -51,6 +51,8 @@ class Bench:
     redis: Redis
     folder: Path
     environment: dict[str, str]
+    given: dict[str, object]
+    """The settings that are not the usual ones."""
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start_worker(self, module: str = "tests.worker.tiny_worker", **settings: object) -> subprocess.Popen[bytes]:
@@ -63,7 +65,7 @@ class Bench:
 
     def launch_worker(self, module: str = "tests.worker.tiny_worker", **settings: object) -> subprocess.Popen[bytes]:
         """A worker process, however far it gets."""
-        environment = self.environment | {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
+        environment = self.environment | variables(**self.given | settings)
         with (self.folder / f"worker-{len(self.workers)}.log").open("wb") as log:
             worker = subprocess.Popen([sys.executable, "-m", module], env=environment, stderr=log)
         self.workers.append(worker)
@@ -118,14 +120,13 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         redis = stack.enter_context(connect(url))
         environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
-        environment |= {f"REGNF_{name.upper()}": str(value) for name, value in given.items()}
         values = Settings(**given)  # type: ignore[arg-type]
         stores = (
             RecordStore(redis),
             LocalBlobStore(values.blob_dir),
             JobQueue(redis, reserve_s=values.worker_reserve_s),
         )
-        made = Bench(Context(values, *stores), redis, folder, environment)
+        made = Bench(Context(values, *stores), redis, folder, environment, given)
         try:
             yield made
         finally:
