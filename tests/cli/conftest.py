@@ -63,7 +63,7 @@ RESULT = {
     "T_scene_object": UNIT,
     "T_object_scene": UNIT,
     "metrics": {"residual_rms": 0.5},
-    "artifacts": [{"name": "result.json", "url": "/jobs/j/artifacts/result.json"}],
+    "artifacts": [{"name": "result.json", "bytes": 7, "sha256": "0" * 64, "url": "/jobs/j/artifacts/result.json"}],
 }
 
 

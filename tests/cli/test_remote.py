@@ -85,7 +85,7 @@ def test_the_watch_counts_only_an_absence_without_a_break() -> None:
 
 def test_artifacts_stay_in_the_folder(run: Run, demo: list[object], serve: Serve, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    address = serve(service(artifacts=[{"name": "../outside.txt", "url": "/"}]))
+    address = serve(service(artifacts=[{"name": "../outside.txt", "bytes": 1, "sha256": None, "url": "/jobs/j"}]))
     outcome = run(*demo, "--output", folder, "--server", address)
     assert outcome.code == 0, outcome.stderr
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["outside.txt"]
