@@ -27,6 +27,7 @@ class At:
             os.kill(os.getpid(), number)
 
 module, number = sys.argv[1], int(sys.argv[2])
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # below nohup it is ignored
 sys.argv = ["regnf", *sys.argv[3:]]
 from regnf_cli.main import main
 sys.meta_path.insert(0, At())
