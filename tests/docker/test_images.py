@@ -57,8 +57,16 @@ def result() -> dict[str, Any]:
     return {"verdict": "registered", "T_object_scene": truth["T_object_scene"], "center_object": [0.0, 0.0, 0.0]}
 
 
+def passes(result: dict[str, Any]) -> bool:
+    try:
+        check(result)
+    except TrialError:
+        return False
+    return True
+
+
 def test_the_truth_passes(result: dict[str, Any]) -> None:
-    check(result)
+    assert passes(result)
 
 
 @pytest.mark.parametrize("wrong", ["moved", "larger", "turned", "rejected"])
@@ -73,8 +81,7 @@ def test_a_wrong_result_does_not(result: dict[str, Any], wrong: str) -> None:
         matrix[0][:3], matrix[1][:3] = [-value for value in matrix[1][:3]], matrix[0][:3]
     else:
         changed["verdict"] = "not_registered"
-    with pytest.raises(TrialError):
-        check(changed)
+    assert not passes(changed)
 
 
 @pytest.mark.long

@@ -37,11 +37,12 @@ def environment(folder: Path) -> dict[str, str]:
     return plain | own | {"REGNF_STATE_DIR": str(folder / "state"), "XDG_CACHE_HOME": str(folder / "cache")}
 
 
-def run(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> None:
+def faults(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> str:
+    """What was run and what it said, where it failed; else nothing."""
     done = subprocess.run(
         command, input=text, cwd=folder, env=variables, capture_output=True, text=True, timeout=280, check=False
     )
-    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+    return "" if done.returncode == 0 else f"{text}\n{done.stdout}\n{done.stderr}"
 
 
 @contextmanager
@@ -82,11 +83,11 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
         for block in found:
             code = block.code.replace(ADDRESS, address)
             if block.language == "bash" and block.code != SERVE:
-                run(["bash", "-euo", "pipefail"], code, tmp_path, variables)
+                assert faults(["bash", "-euo", "pipefail"], code, tmp_path, variables) == ""
             elif block.language == "python":
                 program += code
         if program:
-            run([sys.executable, "-W", "error", "-"], program, tmp_path, variables)
+            assert faults([sys.executable, "-W", "error", "-"], program, tmp_path, variables) == ""
 
 
 def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:

@@ -139,6 +139,7 @@ def test_the_guarded_command_ends_with_whoever_asked_for_it() -> None:
             command = eventually(sleeper, "the guarded command")
             parent.kill()
             eventually(lambda: not alive(command), "its end")
+            assert not alive(command)
         finally:
             parent.kill()
 

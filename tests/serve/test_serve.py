@@ -105,6 +105,7 @@ def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> N
     process.kill()
     process.wait()
     eventually(started.all_gone, "the end of every process", DEADLINE_S)
+    assert [pid for pid in started.seen if alive(pid)] == []
     started.end()
 
 

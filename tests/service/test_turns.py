@@ -65,15 +65,16 @@ def test_a_few_begin_in_each_turn_of_the_loop() -> None:
 
 
 def test_who_leaves_keeps_nobody_waiting() -> None:
-    async def leave() -> None:
+    async def leave() -> list[bool]:
         turns = Turns()
         asking = [asyncio.create_task(turns.come("caller", 0.0)) for _ in range(5)]
         await asyncio.sleep(0)
         asking[1].cancel()
         await asyncio.gather(*asking, return_exceptions=True)
         await turns.come("caller", 0.0)
+        return [one.cancelled() for one in asking]
 
-    asyncio.run(leave())
+    assert asyncio.run(leave()) == [False, True, False, False, False]
 
 
 def test_an_address_is_no_callers_name() -> None:

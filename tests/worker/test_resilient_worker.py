@@ -127,8 +127,10 @@ def test_no_refusal_keeps_the_worker_from_looking_after_its_child(
 
 def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch) -> None:
     worker = offline_worker()
-    monkeypatch.setattr(worker.connection, "execute_command", Refusals(1))
+    refusals = Refusals(1)
+    monkeypatch.setattr(worker.connection, "execute_command", refusals)
     worker.set_shutdown_requested_date()
+    assert refusals.calls == []
 
 
 # the loop, over a real Redis of which every command in turn is refused
