@@ -168,12 +168,12 @@ def load_dataset(folder: str | os.PathLike[str], opengl: bool = False) -> PosedI
     DATASET_SIZES_DIFFER, DATASET_DEPTH_UNIT_MISSING, DATASET_PATH_OUTSIDE, DATASET_INSTANCE_INVALID, DATASET_TOO_LARGE.
     """
     root = Path(folder)
-    metadata = _metadata(root)
-    _check_camera(metadata)
+    metadata = read_metadata(root)
+    check_camera(metadata)
     frames = _frames(metadata)
     size = _size(metadata, root, frames)
     # What lies in the metadata comes first: it is refused before any image is decoded.
-    intrinsics = np.stack([_intrinsics(frame, metadata, index) for index, frame in enumerate(frames)])
+    intrinsics = np.stack([intrinsics_of_frame(frame, metadata, index) for index, frame in enumerate(frames)])
     poses = [rigid(f.get("camtoworld"), f"camtoworld of frame {i}", _pose_reason(f)) for i, f in enumerate(frames)]
     bounds = _bounds(metadata)
     instances = read_instances(metadata.get("instances"))
@@ -185,11 +185,11 @@ def load_dataset(folder: str | os.PathLike[str], opengl: bool = False) -> PosedI
         depths=_depths(root, metadata, frames, size),
         masks=_masks(root, metadata, frames, size),
         instances=instances,
-        T_metric_world=_metric_world(metadata),
+        T_metric_world=metric_world(metadata),
     )
 
 
-def _metadata(folder: Path) -> dict[str, Any]:
+def read_metadata(folder: Path) -> dict[str, Any]:
     path = folder / METADATA
     if not path.is_file():
         raise DatasetError(f"{folder.name} holds no {METADATA}", reason="DATASET_NO_METADATA")
@@ -204,7 +204,7 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return content
 
 
-def _check_camera(metadata: dict[str, Any]) -> None:
+def check_camera(metadata: dict[str, Any]) -> None:
     model = metadata.get("camera_model", "OPENCV")
     if model not in _CAMERAS:
         raise DatasetError(
@@ -250,7 +250,7 @@ def _size(metadata: dict[str, Any], folder: Path, frames: list[dict[str, Any]]) 
     return height, width
 
 
-def _intrinsics(frame: dict[str, Any], metadata: dict[str, Any], index: int) -> NDArray[np.float64]:
+def intrinsics_of_frame(frame: dict[str, Any], metadata: dict[str, Any], index: int) -> NDArray[np.float64]:
     given = frame.get("intrinsics", metadata.get("intrinsics"))
     matrix = array(given, ((4, 4), (3, 3), (3, 4)), f"intrinsics of frame {index}", _INTRINSICS)[:3, :3]
     upright = np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], (0.0, 0.0, 0.0, 1.0))
@@ -273,7 +273,7 @@ def _bounds(metadata: dict[str, Any]) -> NDArray[np.float64]:
     return bounds
 
 
-def _metric_world(metadata: dict[str, Any]) -> NDArray[np.float64] | None:
+def metric_world(metadata: dict[str, Any]) -> NDArray[np.float64] | None:
     given = metadata.get("worldtogt")
     if given is None:  # some files say it with each instance instead
         named = metadata.get("instances")

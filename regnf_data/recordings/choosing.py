@@ -1,0 +1,128 @@
+"""Which frames of a recording are worth reading, and where its surfaces lie."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_core.errors import DatasetError
+from regnf_core.geometry.box import OrientedBox
+from regnf_data.recordings.camera import Array
+from regnf_data.recordings.recording import Frame, Recording
+
+_LOOKED_AT = 240
+"""Frames whose depths are looked at, evenly spread over the recording."""
+_POINTS = 4_000
+"""Of each such frame."""
+_CELLS_ACROSS = 64
+"""Of the recording's extent, or of the box's longest side: a cell that a frame sees is worth half of what it was worth
+before another one saw it."""
+_LEAST_GAIN = 0.002
+"""Of all that the chosen frames show so far: frames that add less are left out."""
+_OUTLIERS = 0.005
+"""The share of the cells, at each end of an axis, outside the bounds: flying pixels, views through windows."""
+_MARGIN = 0.02
+"""Of the extent, around it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """indices: of the frames, in their order · bounds: (2, 3), world, of what they show · looked_at: how many were."""
+
+    indices: tuple[int, ...]
+    bounds: Array
+    looked_at: int
+
+
+def choose_frames(
+    recording: Recording,
+    most: int = 80,
+    box: OrientedBox | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Chosen:
+    """At most ``most`` frames, by what they add. box: what lies outside does not count, the nearer frame sees more.
+
+    Frames that cannot be read are an error. Raises DatasetError: DATASET_DEPTH_MISSING where no frame has a depth,
+    DATASET_NOTHING_IN_BOUNDS where none shows a surface in the box.
+    """
+    count = min(len(recording), _LOOKED_AT)
+    looked_at = [(index * len(recording)) // count for index in range(count)]
+    seen: list[tuple[Array, float]] = []
+    for number, index in enumerate(looked_at):
+        if progress is not None:
+            progress(number, count)
+        frame = recording.frames[index].read(color=False)
+        seen.append((_some_points(frame), _sharpness(frame)))
+    points = [each for each, _ in seen]
+    if not sum(map(len, points)):
+        raise DatasetError(f"{recording.name}: no frame has a measured depth", reason="DATASET_DEPTH_MISSING")
+    bounds = _bounds(np.concatenate(points))
+    if box is not None:
+        points = [each[_inside(box, each)] for each in points]
+        if not sum(map(len, points)):
+            raise DatasetError(
+                f"{recording.name}: no frame shows a surface in the box", reason="DATASET_NOTHING_IN_BOUNDS"
+            )
+    edge = float((bounds[1] - bounds[0]).max() if box is None else box.size.max()) / _CELLS_ACROSS
+    # Two frames of a room see a wall alike; of a thing in a box, the one with the narrower pixels counts for more.
+    worth = [1.0 if box is None else sharp for _, sharp in seen]
+    picked = _greedy([_cells(each, edge) for each in points], worth, most)
+    return Chosen(tuple(sorted(looked_at[each] for each in picked)), bounds, count)
+
+
+def _some_points(frame: Frame) -> Array:
+    """World points of at most some 4,000 pixels, on a regular grid."""
+    stride = max(1, int(np.sqrt(frame.depth.size / _POINTS)))
+    depth = frame.depth[::stride, ::stride]
+    rows, columns = np.nonzero(depth > 0.0)
+    rays = frame.camera.rays(np.stack([columns * stride + 0.5, rows * stride + 0.5], axis=1))
+    local = rays * depth[rows, columns][:, None]
+    return local @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
+
+
+def _sharpness(frame: Frame) -> float:
+    """Pixels a meter, at the nearer part of what the frame shows."""
+    measured = frame.depth[frame.depth > 0.0]
+    return float(frame.camera.K[0, 0] / np.quantile(measured, 0.25)) if len(measured) else 0.0
+
+
+def _inside(box: OrientedBox, points: Array) -> NDArray[np.bool_]:
+    local = (points - box.center.numpy()) @ box.rotation.numpy()
+    return np.asarray((np.abs(local) <= box.size.numpy() / 2.0).all(axis=1))
+
+
+def _bounds(points: Array) -> Array:
+    """(2, 3): of the points' cells, without the outermost ones."""
+    spread = np.quantile(points, 0.99, axis=0) - np.quantile(points, 0.01, axis=0)
+    cells = np.unique(np.floor(points / max(float(spread.max()) / _CELLS_ACROSS, 1e-9)).astype(np.int64), axis=0)
+    edge = max(float(spread.max()) / _CELLS_ACROSS, 1e-9)
+    low, high = (np.quantile(cells * edge, share, axis=0) for share in (_OUTLIERS, 1.0 - _OUTLIERS))
+    margin = _MARGIN * float((high - low).max()) + edge
+    return np.stack([low - margin, high + edge + margin])
+
+
+def _cells(points: Array, edge: float) -> NDArray[np.int64]:
+    """One number for each cell that holds a point."""
+    cells = np.floor(points / edge).astype(np.int64)
+    return np.unique(cells @ np.array([1, 1 << 21, 1 << 42], np.int64))
+
+
+def _greedy(cells: list[NDArray[np.int64]], worth: list[float], most: int) -> list[int]:
+    """Frames in the order of what they add: each time a cell is seen, seeing it again is worth half as much."""
+    known, places = np.unique(np.concatenate(cells), return_inverse=True)
+    each = np.split(places, np.cumsum([len(one) for one in cells])[:-1])
+    left = np.ones(len(known))
+    picked: list[int] = []
+    total = 0.0
+    while len(picked) < min(most, len(cells)):
+        gains = [0.0 if index in picked else worth[index] * float(left[one].sum()) for index, one in enumerate(each)]
+        best = int(np.argmax(gains))
+        if gains[best] <= _LEAST_GAIN * total:
+            break
+        total += gains[best]
+        picked.append(best)
+        left[each[best]] *= 0.5
+    return picked

@@ -1,0 +1,469 @@
+"""Recordings whose poses are text: TUM RGB-D, 7-Scenes, Redwood, ScanNet, Replica, and a frame alone.
+
+Facts of each layout are those of its own documentation. Sensors count pixel centers as whole numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from regnf_core.errors import DatasetError
+from regnf_data.recordings.camera import Array, Camera, CameraFile, camera_of, read_camera_file
+from regnf_data.recordings.recording import (
+    Recording,
+    StoredFrame,
+    checked_size,
+    color_file,
+    depth_file,
+    pose_of,
+    recording_of,
+)
+
+if TYPE_CHECKING:
+    from regnf_data.recordings.opening import Given
+
+_INVALID = "DATASET_METADATA_INVALID"
+_MILLIMETER = 0.001
+_MOST_TEXT = 256 << 20
+_DEPTHS = (".png", ".tif", ".tiff", ".npy", ".pgm")
+_COLORS = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".webp")
+_NUMBER = re.compile(r"\d+")
+
+
+# TUM RGB-D: time stamps and file names in lists, poses with time stamps.
+
+_TUM_CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+"""fx fy cx cy as the benchmark publishes them, by the part of the folder's name; its lists have no intrinsics."""
+_TUM_STEP_M = 1.0 / 5000.0
+_MOST_APART_S = 0.05
+"""Between an image and the poses on both sides of it, or the color beside it."""
+
+
+def is_tum(path: Path) -> bool:
+    return path.is_dir() and (path / "depth.txt").is_file() and _tum_poses(path) is not None
+
+
+def _tum_poses(folder: Path) -> Path | None:
+    names = ("groundtruth.txt", "trajectory.txt", "poses.txt", "CameraTrajectory.txt")
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def read_tum(folder: Path, given: Given) -> Recording:
+    """Poses between time stamps are interpolated."""
+    notes: list[str] = []
+    found = camera_beside(folder)
+    camera = given.camera or (found.camera if found else None)
+    if camera is None:
+        published = next((value for part, value in _TUM_CAMERAS.items() if part in folder.resolve().name), None)
+        if published is None:
+            raise no_intrinsics(folder.name)
+        camera = camera_of(*published, size=(480, 640), whole_centers=True)
+        notes.append("the folder has no intrinsics: those that the benchmark publishes for it are taken")
+    unit = given.depth_unit or (found.depth_unit if found else None) or _TUM_STEP_M
+    stamps, poses = _tum_trajectory(_tum_poses(folder) or folder / "groundtruth.txt")
+    depths, colors = _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
+    color_stamps = np.array([stamp for stamp, _ in colors])
+    placed = interpolated(stamps, poses, np.array([stamp for stamp, _ in depths]))
+    if depths and not any(pose is not None for pose in placed):
+        first, last = depths[0][0], depths[-1][0]
+        raise DatasetError(
+            f"{folder.name}: the images are from {first:.2f} to {last:.2f} s, the poses from {stamps[0]:.2f} to"
+            f" {stamps[-1]:.2f} s: none belong together",
+            reason="DATASET_NO_FRAMES",
+        )
+    frames: list[StoredFrame | None] = []
+    for (stamp, name), pose in zip(depths, placed, strict=True):
+        path = folder / name
+        if pose is None or not path.is_file():
+            frames.append(None)
+            continue
+        color = None
+        if len(color_stamps):
+            nearest = int(np.abs(color_stamps - stamp).argmin())
+            beside = folder / colors[nearest][1]
+            if abs(color_stamps[nearest] - stamp) <= _MOST_APART_S and beside.is_file():
+                color = color_file(beside)
+        frames.append(StoredFrame(Path(name).stem, camera, pose, depth_file(path, unit), color))
+    return recording_of(folder.name, "TUM RGB-D", frames, notes)
+
+
+def _tum_list(path: Path) -> list[tuple[float, str]]:
+    found = []
+    for line in _lines(path) if path.is_file() else ():
+        words = line.split()
+        if len(words) >= 2:
+            found.append((_number(words[0], path.name), words[1]))
+    return found
+
+
+def _tum_trajectory(path: Path) -> tuple[Array, Array]:
+    """Time stamps (N,), rising, and poses (N, 4, 4)."""
+    rows = [[_number(word, path.name) for word in line.replace(",", " ").split()] for line in _lines(path)]
+    if not rows or any(len(row) != 8 for row in rows):
+        raise DatasetError(f"{path.name}: expected lines of t tx ty tz qx qy qz qw", reason=_INVALID)
+    values = np.array(rows)
+    values = values[np.isfinite(values).all(axis=1)]
+    values = values[np.argsort(values[:, 0], kind="stable")]
+    if not len(values):
+        raise DatasetError(f"{path.name}: no pose has finite numbers", reason="DATASET_NO_FRAMES")
+    return values[:, 0], poses_of(values[:, 1:4], values[:, 4:], path.name)
+
+
+def poses_of(places: Array, quaternions: Array, name: str) -> Array:
+    """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w. Raises DatasetError (DATASET_POSE_NOT_RIGID)."""
+    from scipy.spatial.transform import Rotation
+
+    if (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > 0.05).any():
+        raise DatasetError(f"{name}: a quaternion has not the length 1", reason="DATASET_POSE_NOT_RIGID")
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = places
+    return poses
+
+
+def interpolated(stamps: Array, poses: Array, wanted: Array) -> list[Array | None]:
+    """Poses at the times ``wanted`` (M,), s, between those at ``stamps`` (N,); None where the nearest are too far."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    keep = np.concatenate([[True], np.diff(stamps) > 0.0])
+    stamps, poses = stamps[keep], poses[keep]
+    gaps = np.abs(stamps[None] - wanted[:, None]).min(axis=1) if len(wanted) * len(stamps) < 1 << 26 else None
+    if gaps is None:
+        right = np.clip(np.searchsorted(stamps, wanted), 1, max(len(stamps) - 1, 1)) if len(stamps) > 1 else 0
+        gaps = np.minimum(np.abs(stamps[right] - wanted), np.abs(stamps[np.maximum(right - 1, 0)] - wanted))
+    if len(stamps) == 1:
+        return [poses[0] if gap <= _MOST_APART_S else None for gap in gaps]
+    inside = np.clip(wanted, stamps[0], stamps[-1])
+    turns = Slerp(stamps, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
+    places = np.stack([np.interp(inside, stamps, poses[:, axis, 3]) for axis in range(3)], axis=1)
+    found: list[Array | None] = []
+    for turn, place, gap in zip(turns, places, gaps, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = turn, place
+        found.append(pose if gap <= _MOST_APART_S else None)
+    return found
+
+
+# 7-Scenes, 3DMatch and others: frame-000000.depth.png, .color.png, .pose.txt in one folder.
+
+_SEVEN_SCENES = 585.0, 585.0, 320.0, 240.0
+"""fx fy cx cy that 7-Scenes publishes for its depth images; other data of this layout have a file of intrinsics."""
+
+
+def is_seven_scenes(path: Path) -> bool:
+    return path.is_dir() and any(path.glob("*.pose.txt"))
+
+
+def read_seven_scenes(folder: Path, given: Given) -> Recording:
+    """Millimeters; the largest number stands for none; poses lead from the camera to the world."""
+    notes: list[str] = []
+    found = camera_beside(folder)
+    camera = given.camera or (found.camera if found else None)
+    if camera is None:
+        camera = camera_of(*_SEVEN_SCENES, size=(480, 640), whole_centers=True)
+        notes.append(
+            "the folder has no intrinsics: those that 7-Scenes publishes for it are taken (585, 585, 320, 240)"
+        )
+    unit = given.depth_unit or (found.depth_unit if found else None) or _MILLIMETER
+    frames = []
+    for pose_file in sorted(folder.glob("*.pose.txt")):
+        name = pose_file.name.removesuffix(".pose.txt")
+        depth = _first_file(folder, (f"{name}.depth",), _DEPTHS)
+        pose = pose_of(matrix_file(pose_file), name)
+        color = _first_file(folder, (f"{name}.color", f"{name}.rgb"), _COLORS)
+        frames.append(_frame(name, camera, pose, depth, unit, color))
+    return recording_of(folder.name, "7-Scenes, 3DMatch", frames, notes)
+
+
+# Redwood and Open3D: depth/, color/ or image/, a trajectory.
+
+_DEPTH_FOLDERS = ("depth", "depths", "depth_images")
+_COLOR_FOLDERS = ("color", "image", "rgb", "images", "colors")
+
+
+def is_redwood(path: Path) -> bool:
+    return path.is_dir() and _subfolder(path, _DEPTH_FOLDERS) is not None and _trajectory_file(path) is not None
+
+
+def _trajectory_file(folder: Path) -> Path | None:
+    places = [*sorted(folder.glob("*.log")), *sorted(folder.glob("*.json")), *sorted(folder.glob("scene/*.log"))]
+    places += sorted(folder.glob("scene/*.json"))
+    return next((p for p in places if p.suffix == ".log" or "pose_graph" in p.name or "trajectory" in p.name), None)
+
+
+def read_redwood(folder: Path, given: Given) -> Recording:
+    """A trajectory has a frame's numbers, then its pose to the world in four rows; images are in their order."""
+    path = _trajectory_file(folder)
+    depths = _subfolder(folder, _DEPTH_FOLDERS)
+    if path is None or depths is None:
+        raise DatasetError(f"{folder.name} has no depth/ or no trajectory", reason="DATASET_NO_METADATA")
+    found = camera_beside(folder)
+    camera = given.camera or (found.camera if found else None)
+    notes: list[str] = []
+    if camera is None:
+        camera = camera_of(525.0, 525.0, 319.5, 239.5, (480, 640), whole_centers=True)
+        notes.append("the folder has no intrinsics: those of the PrimeSense camera, Open3D's default, are taken")
+    unit = given.depth_unit or (found.depth_unit if found else None) or _MILLIMETER
+    colors = _subfolder(folder, _COLOR_FOLDERS)
+    poses = _redwood_poses(path)
+    images = _in_order(depths, _DEPTHS)
+    pictures = _in_order(colors, _COLORS) if colors else []
+    matched = len(pictures) == len(images)
+    if len(poses) > len(images):
+        raise DatasetError(
+            f"{path.name} has {len(poses)} poses, {depths.name} {len(images)} images", reason="DATASET_SIZES_DIFFER"
+        )
+    frames = []
+    for index, image in enumerate(images):
+        pose = pose_of(poses[index], image.stem) if index in poses else None
+        frames.append(_frame(image.stem, camera, pose, image, unit, pictures[index] if matched else None))
+    return recording_of(folder.name, "Redwood, Open3D", frames, notes)
+
+
+def _redwood_poses(path: Path) -> dict[int, Any]:
+    if path.suffix == ".log":
+        lines = list(_lines(path))
+        if len(lines) % 5:
+            raise DatasetError(f"{path.name}: expected five lines a pose", reason=_INVALID)
+        poses: dict[int, Any] = {}
+        for at in range(0, len(lines), 5):
+            number = int(_number(lines[at].split()[0], path.name))
+            poses[number] = [[_number(word, path.name) for word in line.split()] for line in lines[at + 1 : at + 5]]
+        return poses
+    values = read_json(path)
+    nodes = values.get("nodes") if isinstance(values, dict) else None
+    if isinstance(nodes, list):  # Open3D's PoseGraph: matrices by columns
+        return {
+            index: np.array(node["pose"], np.float64).reshape(4, 4).T
+            for index, node in enumerate(nodes)
+            if "pose" in node
+        }
+    parameters = values.get("parameters") if isinstance(values, dict) else None
+    if isinstance(parameters, list):  # Open3D's PinholeCameraTrajectory: world to camera, by columns
+        return {
+            index: np.linalg.inv(np.array(each["extrinsic"], np.float64).reshape(4, 4).T)
+            for index, each in enumerate(parameters)
+            if "extrinsic" in each
+        }
+    raise DatasetError(f"{path.name} has no poses that are known: nodes or parameters of Open3D", reason=_INVALID)
+
+
+# ScanNet, extracted: color/0.jpg, depth/0.png, pose/0.txt, intrinsic/.
+
+
+def is_scannet(path: Path) -> bool:
+    return path.is_dir() and (path / "pose").is_dir() and _subfolder(path, _DEPTH_FOLDERS) is not None
+
+
+def read_scannet(folder: Path, given: Given) -> Recording:
+    """Millimeters; color and depth have cameras of their own; rows of -inf are lost frames."""
+    depths, colors = _subfolder(folder, _DEPTH_FOLDERS), _subfolder(folder, _COLOR_FOLDERS)
+    assert depths is not None
+    found = _named_camera(folder, "intrinsic_depth") or camera_beside(folder)
+    camera = given.camera or (found.camera if found else None)
+    if camera is None:
+        raise no_intrinsics(folder.name)
+    of_color = _named_camera(folder, "intrinsic_color")
+    unit = given.depth_unit or (found.depth_unit if found else None) or _MILLIMETER
+    frames = []
+    for pose_file in sorted((folder / "pose").glob("*.txt"), key=_order):
+        name = pose_file.stem
+        depth = _first_file(depths, (name,), _DEPTHS)
+        color = _first_file(colors, (name,), _COLORS) if colors else None
+        pose = pose_of(matrix_file(pose_file), name)
+        frames.append(_frame(name, camera, pose, depth, unit, color, of_color.camera if of_color else None))
+    return recording_of(folder.name, "ScanNet, extracted", frames)
+
+
+def _named_camera(folder: Path, name: str) -> CameraFile | None:
+    path = next((p for p in (folder / "intrinsic" / f"{name}.txt", folder / f"{name}.txt") if p.is_file()), None)
+    return read_camera_file(path) if path else None
+
+
+# Replica as NICE-SLAM renders it: results/frame000000.jpg, results/depth000000.png, traj.txt, cam_params.json.
+
+
+def is_replica(path: Path) -> bool:
+    return path.is_dir() and (path / "traj.txt").is_file() and any((path / "results").glob("depth*"))
+
+
+def read_replica(folder: Path, given: Given) -> Recording:
+    """A line of traj.txt is a pose to the world, 16 numbers. The intrinsics lie in the folder or the one above it."""
+    found = camera_beside(folder) or camera_beside(folder.resolve().parent)
+    camera = given.camera or (found.camera if found else None)
+    if camera is None:
+        raise no_intrinsics(folder.name)
+    unit = given.depth_unit or (found.depth_unit if found else None) or 1.0 / 6553.5
+    images = _in_order(folder / "results", _DEPTHS, "depth")
+    lines = list(_lines(folder / "traj.txt"))
+    if len(lines) != len(images):
+        raise DatasetError(
+            f"traj.txt has {len(lines)} poses, results {len(images)} depth images", reason="DATASET_SIZES_DIFFER"
+        )
+    frames = []
+    for line, image in zip(lines, images, strict=True):
+        pose = pose_of([_number(word, "traj.txt") for word in line.split()], image.stem)
+        color = _first_file(folder / "results", (image.stem.replace("depth", "frame"),), _COLORS)
+        frames.append(_frame(image.stem, camera, pose, image, unit, color))
+    return recording_of(folder.name, "Replica (NICE-SLAM)", frames)
+
+
+# One frame: a depth image, a file of intrinsics, and perhaps a color image; or the depth image itself.
+
+
+def is_frame(path: Path) -> bool:
+    return _frame_files(path) is not None
+
+
+def _frame_files(path: Path) -> tuple[Path, Path | None] | None:
+    """The depth image and the color image; None where there is no one depth image."""
+    if path.is_file():
+        return (path, None) if path.suffix.lower() in _DEPTHS else None
+    images = [p for p in sorted(path.iterdir()) if p.suffix.lower() in (*_DEPTHS, *_COLORS) and p.is_file()]
+    named = [p for p in images if "depth" in p.name.lower() and p.suffix.lower() in _DEPTHS]
+    depths = named or [p for p in images if p.suffix.lower() == ".npy" or _has_16_bits(p)]
+    if len(depths) != 1:
+        return None
+    colors = [p for p in images if p != depths[0] and p.suffix.lower() in _COLORS and "mask" not in p.name.lower()]
+    named = [p for p in colors if re.search("colou?r|rgb|image", p.name.lower())]
+    chosen = named if named else colors
+    return depths[0], chosen[0] if len(chosen) == 1 else None
+
+
+def _has_16_bits(path: Path) -> bool:
+    try:
+        with Image.open(path) as image:
+            return image.mode.startswith("I") or image.mode == "F"
+    except (OSError, ValueError, SyntaxError):
+        return False
+
+
+def read_frame(path: Path, given: Given) -> Recording:
+    """The camera's frame is the world."""
+    files = _frame_files(path)
+    if files is None:
+        raise DatasetError(f"{path.name} has not one depth image", reason="DATASET_NO_FRAMES")
+    depth, color = files
+    folder = path if path.is_dir() else path.parent
+    found = camera_beside(folder) if path.is_dir() or given.camera is None else None
+    camera = given.camera or (found.camera if found else None)
+    if camera is None:
+        raise no_intrinsics(path.name)
+    notes = []
+    unit = given.depth_unit or (found.depth_unit if found else None)
+    if unit is None:
+        unit = _MILLIMETER
+        if depth.suffix.lower() != ".npy":
+            notes.append("no file says the depth's unit: millimeters are taken")
+    # A camera file of the color image's resolution is scaled to the depth image's.
+    size = checked_size(depth)
+    picture = color_file(color) if color else None
+    frame = StoredFrame(depth.stem, camera.of_size(size, depth.name), np.eye(4), depth_file(depth, unit), picture)
+    return recording_of(path.name, "one frame", [frame], notes)
+
+
+# What they share.
+
+
+def camera_beside(folder: Path) -> CameraFile | None:
+    """The camera of a file of the folder whose name says so; the first that holds intrinsics."""
+    pattern = re.compile(r"intrinsic|camera|cam_params|calib|cam_k|^k\.txt$", re.IGNORECASE)
+    places = [
+        folder,
+        *(folder / name for name in ("intrinsic", "intrinsics", "calibration") if (folder / name).is_dir()),
+    ]
+    for place in places:
+        for path in sorted(place.iterdir()):
+            suffix = path.suffix.lower()
+            if pattern.search(path.name) and suffix in (".json", ".txt", ".yaml", ".yml") and path.is_file():
+                found = read_camera_file(path)
+                if found is not None:
+                    return found
+    return None
+
+
+def no_intrinsics(name: str) -> DatasetError:
+    """The error where neither the layout nor the caller has a camera."""
+    return DatasetError(
+        f"{name} has no intrinsics: put a camera_intrinsic.json beside the images, or give --intrinsics fx,fy,cx,cy",
+        reason="DATASET_INTRINSICS_INVALID",
+    )
+
+
+def _frame(
+    name: str,
+    camera: Camera,
+    pose: Array | None,
+    depth: Path | None,
+    unit: float,
+    color: Path | None,
+    color_camera: Camera | None = None,
+) -> StoredFrame | None:
+    if pose is None or depth is None:
+        return None
+    picture: Callable[[], NDArray[np.uint8]] | None = color_file(color) if color else None
+    return StoredFrame(name, camera, pose, depth_file(depth, unit), picture, color_camera)
+
+
+def matrix_file(path: Path) -> list[list[float]]:
+    """The numbers of a text file, by rows. Raises DatasetError (DATASET_METADATA_INVALID)."""
+    rows = [[_number(word, path.name) for word in line.replace(",", " ").split()] for line in _lines(path)]
+    return [row for row in rows if row]
+
+
+def read_json(path: Path) -> Any:
+    """Raises DatasetError (DATASET_METADATA_INVALID, DATASET_TOO_LARGE)."""
+    if path.stat().st_size > _MOST_TEXT:
+        raise DatasetError(f"{path.name} has more than {_MOST_TEXT} bytes", reason="DATASET_TOO_LARGE")
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path.name} is not JSON: {error}", reason=_INVALID) from error
+
+
+def _lines(path: Path) -> Iterable[str]:
+    """Without empty lines and comments."""
+    if path.stat().st_size > _MOST_TEXT:
+        raise DatasetError(f"{path.name} has more than {_MOST_TEXT} bytes", reason="DATASET_TOO_LARGE")
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if (stripped := line.strip()) and not stripped.startswith("#"):
+                yield stripped
+
+
+def _number(word: str, name: str) -> float:
+    try:
+        return float(word)
+    except ValueError as error:
+        raise DatasetError(f"{name}: {word[:40]!r} is no number", reason=_INVALID) from error
+
+
+def _order(path: Path) -> tuple[list[int], str]:
+    """Frames by the numbers in their names."""
+    return [int(number[:18]) for number in _NUMBER.findall(path.stem)[:8]], path.name
+
+
+def _in_order(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name.startswith(prefix)]
+    return sorted(found, key=_order)
+
+
+def _first_file(folder: Path, stems: Iterable[str], suffixes: Sequence[str]) -> Path | None:
+    names = (folder / f"{stem}{suffix}" for stem in stems for suffix in suffixes)
+    return next((path for path in names if path.is_file()), None)
+
+
+def _subfolder(folder: Path, names: Sequence[str]) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_dir()), None)

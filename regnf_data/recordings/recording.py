@@ -1,0 +1,275 @@
+"""Frames of one world: read one at a time, chosen by what they add, taken together as posed images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_core.errors import DatasetError
+from regnf_data.posed_images import PosedImages
+from regnf_data.recordings.camera import Array, Camera, Size
+from regnf_data.sdfstudio import image_size, read_colors, read_depth, read_mask
+
+MOST_FRAMES = 100_000
+MOST_PIXELS = 1 << 25
+"""Of one image."""
+_FARTHEST = 1e6
+"""Camera positions beyond are no meters."""
+_NOT_RIGID = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One depth image and its camera, without a lens.
+
+    depth: (H, W) float32, meters along the camera's axis, 0 where nothing was measured · camera: of the depth image ·
+    T_world_camera: (4, 4), OpenCV's axes · color: (H', W', 3) uint8 as it was taken, by ``color_camera`` from the same
+    place · mask: (H', W') of the same size as the color, or as the depth without color: true on the thing.
+    """
+
+    name: str
+    depth: NDArray[np.float32]
+    camera: Camera
+    T_world_camera: Array
+    color: NDArray[np.uint8] | None = None
+    color_camera: Camera | None = None
+
+    def registered(self, image: NDArray[Any]) -> NDArray[Any]:
+        """An image (H', W', ...) by the color's camera as the depth's camera would have taken it: (H, W, ...).
+
+        Both look from the same place; pixels that the color's camera did not see are 0.
+        """
+        source = self.color_camera or self.camera
+        if image.shape[:2] == self.depth.shape and source is self.camera:
+            return image
+        height, width = self.depth.shape
+        rows, columns = np.indices((height, width)) + 0.5
+        found = source.project(self.camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1)))
+        column, row = np.floor(found).astype(np.int64).T
+        inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
+        out = np.zeros((height * width, *image.shape[2:]), image.dtype)
+        out[inside] = image[row[inside], column[inside]]
+        return out.reshape(height, width, *image.shape[2:])
+
+    def points(self) -> tuple[Array, NDArray[np.bool_]]:
+        """World points (P, 3) of the measured pixels, and which those are: (H, W)."""
+        measured = self.depth > 0.0
+        rows, columns = np.nonzero(measured)
+        rays = self.camera.rays(np.stack([columns + 0.5, rows + 0.5], axis=1))
+        local = rays * self.depth[measured][:, None]
+        return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3], measured
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFrame:
+    """A frame that was not read yet. depth, color: decode the image, the former to meters along the axis (or along the
+    ray), of any size that has the shape of the camera's."""
+
+    name: str
+    camera: Camera
+    T_world_camera: Array
+    depth: Callable[[], NDArray[np.float32]]
+    color: Callable[[], NDArray[np.uint8]] | None = None
+    color_camera: Camera | None = None
+    along_ray: bool = False
+
+    def read(self, color: bool = True) -> Frame:
+        """Raises DatasetError (DATASET_IMAGE_INVALID, DATASET_INTRINSICS_INVALID, ...) naming the frame."""
+        depth = self.depth()
+        camera = self.camera.of_size((depth.shape[0], depth.shape[1]), self.name).check(self.name)
+        camera, depth = _without_lens(camera, depth)
+        if self.along_ray:
+            rows, columns = np.indices(depth.shape) + 0.5
+            rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))
+            depth = (depth / np.linalg.norm(rays, axis=1).reshape(depth.shape)).astype(np.float32)
+        frame = Frame(self.name, depth, camera, self.T_world_camera)
+        if not color or self.color is None:
+            return frame
+        picture = self.color()
+        taken = (self.color_camera or self.camera).of_size((picture.shape[0], picture.shape[1]), self.name)
+        taken, picture = _without_lens(taken.check(self.name), picture)
+        return replace(frame, color=picture, color_camera=taken)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Frames whose poses share a world, in the order of their recording.
+
+    name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one.
+    """
+
+    name: str
+    layout: str
+    frames: tuple[StoredFrame, ...]
+    notes: tuple[str, ...] = ()
+    T_metric_world: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def index(self, name: str | int) -> int:
+        """The place of the frame of a name, with or without its ending, or of a number.
+
+        Raises DatasetError (DATASET_FRAMES_INVALID).
+        """
+        if isinstance(name, int) and 0 <= name < len(self):
+            return name
+        names = [frame.name for frame in self.frames]
+        wanted = str(name)
+        for place, known in enumerate(names):
+            if wanted in (known, Path(known).name, Path(known).stem):
+                return place
+        if wanted.isdigit() and int(wanted) < len(self):
+            return int(wanted)
+        near = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        raise DatasetError(f"{self.name} has no frame {wanted[:80]!r}; it has {near}", reason="DATASET_FRAMES_INVALID")
+
+    def posed_images(self, chosen: Sequence[int], bounds: Array) -> PosedImages:
+        """The chosen frames as images of one size, the most common among them. bounds: (2, 3), world."""
+        frames = [self.frames[index].read() for index in chosen]
+        shapes = [frame.depth.shape for frame in frames]
+        shape = max(set(shapes), key=shapes.count)
+        frames = [frame for frame in frames if frame.depth.shape == shape]
+        colors = [
+            np.full((*shape, 3), 128, np.uint8) if frame.color is None else frame.registered(frame.color)
+            for frame in frames
+        ]
+        return PosedImages(
+            colors=np.stack(colors),
+            intrinsics=np.stack([frame.camera.K for frame in frames]),
+            T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
+            bounds=bounds,
+            depths=np.stack([frame.depth for frame in frames]),
+            T_metric_world=self.T_metric_world,
+        )
+
+
+def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[Any]]:
+    ideal, found = camera.undistorted()
+    if found is None:
+        return ideal, image
+    rows, columns, inside = found
+    taken = image[rows, columns]
+    taken[~inside] = 0
+    return ideal, taken
+
+
+# What readers of layouts share.
+
+
+def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float32]]:
+    """Reads a depth image: whole numbers of ``unit`` meters, or numbers in meters where the file has a point."""
+
+    def read() -> NDArray[np.float32]:
+        depth = read_depth(path, checked_size(path), unit)
+        if unit is not None and path.suffix.lower() == ".npy" and _whole_numbers(path):
+            depth = depth * np.float32(unit)
+        return depth
+
+    return read
+
+
+def color_file(path: Path) -> Callable[[], NDArray[np.uint8]]:
+    """Reads a color image."""
+    return lambda: read_colors(path, checked_size(path))
+
+
+def mask_file(path: Path) -> NDArray[np.bool_]:
+    """(H, W): the mask of an image file of any size."""
+    return read_mask(path, checked_size(path))
+
+
+def checked_size(path: Path) -> Size:
+    """The size by the file's header. Raises DatasetError (DATASET_IMAGE_INVALID, DATASET_TOO_LARGE)."""
+    if path.suffix.lower() == ".npy":
+        try:
+            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+        except (OSError, ValueError, EOFError) as error:
+            raise DatasetError(f"{path.name} cannot be read: {error}", reason="DATASET_IMAGE_INVALID") from error
+        shape = tuple(side for side in shape if side != 1)
+        if len(shape) != 2:
+            raise DatasetError(f"{path.name} is no image of one channel", reason="DATASET_IMAGE_INVALID")
+        size = (int(shape[0]), int(shape[1]))
+    else:
+        size = image_size(path)
+    if size[0] * size[1] > MOST_PIXELS:
+        raise DatasetError(f"{path.name} has {size[1]} x {size[0]} pixels", reason="DATASET_TOO_LARGE")
+    return size
+
+
+def _whole_numbers(path: Path) -> bool:
+    return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
+
+
+def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) -> Array | None:
+    """A camera's pose (4, 4), to the world, of a matrix as files have it: three or four rows; None where the camera was
+    lost. inverse: the matrix leads from the world to the camera · unit: meters of its translation's unit.
+
+    Raises DatasetError (DATASET_POSE_NOT_RIGID), naming ``name``, the frame.
+    """
+    try:
+        given = np.array(matrix, np.float64)
+    except (TypeError, ValueError) as error:
+        raise DatasetError(f"{name}: the pose is not numbers", reason="DATASET_POSE_NOT_RIGID") from error
+    if given.shape == (16,):
+        given = given.reshape(4, 4)
+    if given.shape not in ((4, 4), (3, 4)):
+        raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")
+    if not np.isfinite(given).all():
+        return None
+    pose = np.eye(4)
+    pose[:3] = given[:3]
+    rotation = pose[:3, :3]
+    if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID:
+        scale = np.cbrt(abs(np.linalg.det(rotation)))
+        hint = f": its axes have the length {scale:.3g}" if abs(scale - 1.0) > _NOT_RIGID else ""
+        raise DatasetError(f"{name}: the pose is no rotation and translation{hint}", reason="DATASET_POSE_NOT_RIGID")
+    if np.linalg.det(rotation) < 0.0:
+        raise DatasetError(f"{name}: the pose mirrors (its determinant is -1)", reason="DATASET_POSE_NOT_RIGID")
+    if given.shape == (4, 4) and not np.allclose(given[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
+        if np.allclose(given[:3, 3], 0.0):
+            raise DatasetError(
+                f"{name}: the pose is transposed: its last row holds the translation", reason="DATASET_POSE_NOT_RIGID"
+            )
+        raise DatasetError(f"{name}: the pose's last row is not 0 0 0 1", reason="DATASET_POSE_NOT_RIGID")
+    u, _, vt = np.linalg.svd(rotation)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] *= unit
+    if inverse:
+        pose = np.linalg.inv(pose)
+    if np.abs(pose[:3, 3]).max() > _FARTHEST:
+        raise DatasetError(
+            f"{name}: the camera is {np.abs(pose[:3, 3]).max():.3g} m from the origin", reason="DATASET_POSE_NOT_RIGID"
+        )
+    return pose
+
+
+def recording_of(
+    name: str,
+    layout: str,
+    frames: Sequence[StoredFrame | None],
+    notes: Sequence[str] = (),
+    T_metric_world: Array | None = None,
+) -> Recording:
+    """The recording of the frames that have a pose; what was left out is noted.
+
+    Raises DatasetError (DATASET_NO_FRAMES) where there is none.
+    """
+    found = tuple(frame for frame in frames if frame is not None)
+    if not found:
+        raise DatasetError(
+            f"{name}: no frame has depth and a pose of finite numbers ({layout})", reason="DATASET_NO_FRAMES"
+        )
+    if len(found) > MOST_FRAMES:
+        raise DatasetError(f"{name}: {len(found)} frames; at most {MOST_FRAMES}", reason="DATASET_TOO_LARGE")
+    lost = len(frames) - len(found)
+    said = (
+        (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
+    )
+    return Recording(name, layout, found, said, T_metric_world)
