@@ -108,7 +108,7 @@ class Camera:
                 )
             if not (0.0 <= K[0, 2] <= width and 0.0 <= K[1, 2] <= height):
                 raise DatasetError(
-                    f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is outside the image of {width} x {height}:"
+                    f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is outside the image, {width} x {height}:"
                     " are the intrinsics those of another resolution?",
                     reason=_INVALID,
                 )

@@ -1,0 +1,116 @@
+"""Every layout gives back the recording that an independent writer wrote."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from regnf_core.errors import DatasetError
+from regnf_data.recordings import Recording, open_recording
+from tests.data.recordings import writers
+from tests.data.recordings.truth import HEIGHT, WIDTH, K, Truth, walk
+
+HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+_BAGS = (("mcap", "16UC1", "tf"), ("mcap", "32FC1", "odometry"), ("sqlite3", "compressedDepth", "tf"))
+
+
+@cache
+def truth() -> Truth:
+    return walk()
+
+
+def assert_as_recorded(recording: Recording, step: float) -> None:
+    """Every frame has the true depth to half a step, the true camera and color."""
+    assert len(recording) == len(truth())
+    for index, stored in enumerate(recording.frames):
+        frame = stored.read()
+        # Poses may differ by a rigid motion of the world: they are compared with the first one's.
+        first = np.linalg.inv(recording.frames[0].T_world_camera) @ frame.T_world_camera
+        wanted = np.linalg.inv(truth().poses[0]) @ truth().poses[index]
+        np.testing.assert_allclose(first, wanted, atol=1e-6)
+        np.testing.assert_allclose(frame.camera.K, K + HALF, atol=1e-6)
+        measured = frame.depth > 0.0
+        assert measured.mean() > 0.99
+        np.testing.assert_allclose(frame.depth[measured], truth().depths[index][measured], atol=0.51 * step)
+        assert frame.color is not None
+        np.testing.assert_array_equal(frame.registered(frame.color), truth().colors[index])
+
+
+@pytest.mark.parametrize("layout", writers.FOLDERS)
+def test_a_layout_is_read_as_it_was_recorded(layout: str, tmp_path: Path) -> None:
+    write, step = writers.FOLDERS[layout]
+    recording = open_recording(write(tmp_path / "recording", truth()))
+    assert_as_recorded(recording, step)
+    if layout == "scannet":
+        assert recording.notes == ("1 of 7 frames have no pose or no depth and are left out",)
+
+
+@pytest.mark.parametrize(("storage", "coding", "poses"), _BAGS)
+def test_a_bag_is_read_as_it_was_recorded(storage: str, coding: str, poses: str, tmp_path: Path) -> None:
+    path = writers.bag(tmp_path / "bag", truth(), storage, coding, poses)
+    assert_as_recorded(open_recording(path), 1e-3 if coding != "32FC1" else 1e-6)
+    if storage == "mcap":
+        assert_as_recorded(open_recording(next(path.glob("*.mcap"))), 1e-3 if coding != "32FC1" else 1e-6)
+
+
+@pytest.mark.parametrize("camera", ["realsense", "ros", "kinect", "matrix", "numbers"])
+def test_a_frame_alone_is_read_with_any_file_of_intrinsics(camera: str, tmp_path: Path) -> None:
+    writers.depth_png(tmp_path / "depth.png", truth().depths[0], 4000.0 if camera == "realsense" else 1000.0)
+    writers.png(tmp_path / "color.png", truth().colors[0])
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if camera == "realsense":
+        text = f'{{"width": {WIDTH}, "height": {HEIGHT}, "fx": {fx}, "fy": {fy}, "ppx": {cx}, "ppy": {cy}'
+        (tmp_path / "intrinsics.json").write_text(text + ', "coeffs": [0, 0, 0, 0, 0], "depth_scale": 0.00025}')
+    elif camera == "ros":
+        lines = [f"image_width: {WIDTH}", f"image_height: {HEIGHT}", "distortion_model: plumb_bob"]
+        lines += ["camera_matrix:", "  rows: 3", "  cols: 3", f"  data: {K.ravel().tolist()}"]
+        lines += ["distortion_coefficients:", "  data: [0, 0, 0, 0, 0]"]
+        (tmp_path / "camera_info.yaml").write_text("\n".join(lines))
+    elif camera == "kinect":
+        (tmp_path / "calibration.json").write_text(f'{{"depth": {{"K": {K.tolist()}}}}}')
+    elif camera == "matrix":
+        writers.text(tmp_path / "cam_K.txt", K)
+    else:
+        (tmp_path / "intrinsics.txt").write_text(f"{fx} {fy} {cx} {cy}\n")
+    recording = open_recording(tmp_path)
+    frame = recording.frames[0].read()
+    np.testing.assert_allclose(frame.depth, truth().depths[0], atol=0.00051)
+    np.testing.assert_allclose(frame.camera.K, K + HALF)
+    np.testing.assert_array_equal(frame.T_world_camera, np.eye(4))
+    assert ("millimeters" in " ".join(recording.notes)) == (camera != "realsense")
+
+
+def test_a_folder_of_recordings_names_them(tmp_path: Path) -> None:
+    for scene in ("000001", "000002"):
+        writers.bop(tmp_path / "test" / scene, truth())
+    with pytest.raises(DatasetError, match="holds 2: give one of test/000001, test/000002") as found:
+        open_recording(tmp_path)
+    assert found.value.reason == "DATASET_NOT_RECOGNIZED"
+
+
+def test_a_lens_is_undone(tmp_path: Path) -> None:
+    """Depth by the truth through a lens: the pinhole's image comes back where the lens saw it."""
+    from regnf_data.recordings.camera import Camera
+
+    ideal = Camera(K + HALF, (HEIGHT, WIDTH))
+    lens = Camera(K + HALF, (HEIGHT, WIDTH), "brown", (-0.2, 0.05, 0.001, -0.002, 0.0))
+    # An image whose value is the slope of the ray, as the lens takes it: invert the lens by a fine search.
+    rows, columns = np.indices((4 * HEIGHT, 4 * WIDTH)) / 4.0 + 0.125
+    aim = ideal.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    seen = np.floor(lens.project(aim)).astype(int)
+    inside = (seen >= 0).all(1) & (seen[:, 0] < WIDTH) & (seen[:, 1] < HEIGHT)
+    image = np.zeros((HEIGHT, WIDTH))
+    image[seen[inside, 1], seen[inside, 0]] = aim[inside, 0]
+    pinhole, index = lens.undistorted()
+    assert index is not None and pinhole.lens == "none"
+    taken = image[index[0], index[1]]
+    rows, columns = np.indices((HEIGHT, WIDTH)) + 0.5
+    wanted = ideal.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))[:, 0].reshape(HEIGHT, WIDTH)
+    middle = (slice(15, 45), slice(20, 60))
+    assert np.abs(taken - wanted)[middle].max() < 1.5 / K[0, 0]
+    assert np.abs(image - wanted)[middle].max() > 1.5 / K[0, 0] * 0.5
+
+
