@@ -165,13 +165,8 @@ def _run_lengths(value: Mapping[str, Any]) -> Mask:
         lengths = _text_lengths(counts) if isinstance(counts, str) else [int(count) for count in counts]
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise InvalidDetectionError(f"the mask's run lengths cannot be read: {error}") from error
-    if (
-        height < 1
-        or width < 1
-        or height * width > MOST_PIXELS
-        or min(lengths, default=0) < 0
-        or sum(lengths) != height * width
-    ):
+    within = height > 0 and width > 0 and height * width <= MOST_PIXELS
+    if not within or min(lengths, default=0) < 0 or sum(lengths) != height * width:
         raise InvalidDetectionError(f"the mask's runs have {sum(lengths)} pixels, its size {width} x {height}")
     flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
     return flat.reshape(width, height).T
@@ -274,10 +269,8 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
     high[2] = max(high[2], low[2] + behind)
     size = (high - low) * (1.0 + _LOOSE)
     R, t = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
-    box = OrientedBox(
-        torch.from_numpy(R @ ((low + high) / 2.0) + t), torch.from_numpy(size), torch.from_numpy(R.copy()), detection.label,
-        detection.score,
-    )  # fmt: skip
+    center, axes = torch.from_numpy(R @ ((low + high) / 2.0) + t), torch.from_numpy(R.copy())
+    box = OrientedBox(center, torch.from_numpy(size), axes, detection.label, detection.score)
     return Lifted(box, camera_points @ R.T + t, pixels, frame)
 
 
@@ -289,7 +282,7 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
     if mask is not None:
         if mask.shape != given:
             raise InvalidDetectionError(
-                f"frame {frame.name}: the mask has {mask.shape[1]} x {mask.shape[0]} pixels, the image {width} x {height}"
+                f"frame {frame.name}: the mask has {mask.shape[1]} x {mask.shape[0]} pixels, not {width} x {height}"
             )
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the mask is empty")

@@ -154,7 +154,8 @@ def local_planes(depths: NDArray[np.float32], intrinsics: Floats) -> LocalPlanes
     """
     cosines, left_over = np.zeros(depths.shape, np.float32), np.zeros(depths.shape, np.float32)
     for image, (depth, camera) in enumerate(zip(depths, intrinsics, strict=True)):
-        cosines[image], left_over[image] = _of_one(depth, camera)
+        planes = pixel_planes(depth, camera)
+        cosines[image], left_over[image] = planes.cosines, planes.deviations
     return LocalPlanes(cosines, _normals_by_depth(depths, left_over, cosines > 0.0))
 
 
@@ -173,7 +174,21 @@ def _normals_by_depth(
     return np.interp(depths, middles, medians).astype(np.float32)
 
 
-def _of_one(depth: NDArray[np.float32], camera: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+@dataclass(frozen=True, eq=False)
+class PixelPlanes:
+    """Of one image. known: (H, W), where a plane could be laid; elsewhere the others mean nothing · depth: (H, W), the
+    plane's at the pixel, its noise averaged · normals: (H, W, 3), unit, camera frame, towards the camera · cosines,
+    deviations: (H, W), see LocalPlanes."""
+
+    known: NDArray[np.bool_]
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    cosines: NDArray[np.float32]
+    deviations: NDArray[np.float32]
+
+
+def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
+    """The planes of :func:`local_planes` for one image. depth: (H, W) · camera: (3, 3)."""
     rows, columns = np.indices(depth.shape) + 0.5
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera).T  # (H, W, 3)
     valid = depth > 0.0
@@ -197,7 +212,10 @@ def _of_one(depth: NDArray[np.float32], camera: Floats) -> tuple[NDArray[np.floa
     variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
     deviation = np.where(known, np.sqrt(variance) * depth.astype(np.float64) ** 2, 0.0)
     cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
-    return cosine.astype(np.float32), deviation.astype(np.float32)
+    smooth = np.divide(1.0, here, out=depth.astype(np.float64), where=known & (here > 0.0))
+    normals = -normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    kept = (smooth, normals, cosine, deviation)
+    return PixelPlanes(known, *(each.astype(np.float32) for each in kept))
 
 
 def _moments(x: Floats, y: Floats, inverse: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats]:
