@@ -1,4 +1,4 @@
-"""The region of a detection, made from a few depth images as finely as a pixel is wide there: in a fraction of a second.
+"""The region of a detection, from a few depth images, as finely as a pixel is wide there, in a fraction of a second.
 
 A map of a room has voxels of a centimeter, and takes seconds. A thing of 10 cm needs millimeters, in its own box alone.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -15,141 +16,166 @@ from scipy import ndimage
 
 from regnf_core.errors import DatasetError
 from regnf_core.fields.build import VoxelGridFunction
-from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.observation import Observation, ObservedField, SdfField
 from regnf_core.fields.user_fields import BoxExtension, FunctionField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_data.recordings.recording import Frame
 from regnf_fit.images.observing import pixel_planes
 
 Floats = NDArray[np.float64]
 
-_MOST_NODES = 4_000_000
+_MOST_NODES = 1_000_000
 _SHARP = 0.25
 """The share of the measured pixels that are no wider at their surface than a voxel is."""
 _PLANAR = 3.0
 """Voxels from the surface up to which distances are those from a pixel's plane; beyond, from its point."""
 _BEHIND = 8.0
 """Voxels behind a surface that count as matter; what lies farther behind it was not seen."""
+_AROUND = 8
+"""Pixels around the region's picture, for the planes at its edge."""
 _MARGIN = 1.5
 """Voxels before a surface that are not called free yet, and as many standard deviations of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
-    """What one image measured in the region. points, normals: (P, 3), world · depth: (H, W), smoothed, 0 for none ·
-    margin: (H, W)."""
+class _View:
+    """What one image measured in the region, in the region's frame. points, normals: (P, 3) · T_camera_region: (4, 4) ·
+    K: (3, 3), of the part of the image that shows the region · depth: (H, W) of that part, smoothed, 0 for none ·
+    margin: (H, W), a standard deviation of the depth."""
 
-    frame: Frame
     points: Floats
     normals: Floats
+    T_camera_region: Floats
+    K: Floats
     depth: NDArray[np.float32]
     margin: NDArray[np.float32]
 
 
-def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None) -> ObservedField:
+def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
-    voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface.
+    voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
+    nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image measured a surface in the region.
     """
-    corners = region.corners().numpy()
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    seen = [surface for frame in frames if (surface := _measured(frame, low, high)) is not None]
-    if not seen:
+    half = region.size.numpy() / 2.0
+    T_region_world = np.eye(4)
+    T_region_world[:3, :3] = region.rotation.numpy().T
+    T_region_world[:3, 3] = -T_region_world[:3, :3] @ region.center.numpy()
+    views = [view for frame in frames if (view := _view(frame, T_region_world, half)) is not None]
+    if not views:
         raise DatasetError("no depth image shows a surface in the region", reason="DATASET_NOTHING_IN_BOUNDS")
-    points, normals = (np.concatenate([getattr(one, name) for one in seen]) for name in ("points", "normals"))
-    edge = voxel or _pixel_width(seen)
-    edge = max(edge, float(np.prod(high - low) / _MOST_NODES) ** (1.0 / 3.0))
-    shape = tuple(int(n) for n in np.ceil((high - low) / edge) + 1)
-    nodes = np.stack(np.meshgrid(*(low[k] + edge * np.arange(shape[k]) for k in range(3)), indexing="ij"), axis=-1)
-    free, behind = _carved(nodes.reshape(-1, 3), seen, edge)
-    values = _distances(nodes, points, normals, free.reshape(shape), behind.reshape(shape), low, edge)
+    points, normals = (np.concatenate([getattr(one, name) for one in views]) for name in ("points", "normals"))
+    edge = max(voxel or _pixel_width(views), float(np.prod(2.0 * half) / _MOST_NODES) ** (1.0 / 3.0))
+    shape = tuple(int(n) for n in np.ceil(2.0 * half / edge) + 1)
+    low = -half
+    axes = (low[k] + edge * np.arange(shape[k]) for k in range(3))
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+    free, behind = _carved(nodes, views, edge)
+    values = _distances(nodes, points, normals, behind, low, edge, shape)
     observation = _observation(points, free.reshape(shape), low, edge, shape)
-    origin, step = (torch.from_numpy(np.asarray(v, np.float32)) for v in (low, np.full(3, edge)))
-    top = torch.from_numpy((low + edge * (np.array(shape) - 1)).astype(np.float32))
-    function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step, None), origin, top, 1.0)
-    field = FunctionField(function, torch.from_numpy(np.stack([low, low + edge * (np.array(shape) - 1)])))
-    return ObservedField(field, observation)
+    high = low + edge * (np.array(shape) - 1)
+    origin, top, step = (torch.from_numpy(v.astype(np.float32)) for v in (low, high, np.full(3, edge)))
+    function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step), origin, top, 1.0)
+    field = ObservedField(FunctionField(function, torch.from_numpy(np.stack([low, high]))), observation)
+    return TransformedField(field, Sim3.from_matrix(T_region_world.tolist()))
 
 
-def _measured(frame: Frame, low: Floats, high: Floats) -> _Surface | None:
+def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
     """The pixels whose surface lies in the region; those that share a plane with too few others are left out: at edges
     sensors mix two depths."""
-    planes = pixel_planes(frame.depth, frame.camera.K)
-    depth = np.where(planes.known, planes.depth, 0.0)
-    rows, columns = np.nonzero(depth > 0.0)
-    rays = frame.camera.rays(np.stack([columns, rows], axis=1) + 0.5)
-    R, t = frame.T_world_camera[:3, :3], frame.T_world_camera[:3, 3]
-    points = (rays * depth[rows, columns][:, None]) @ R.T + t
-    inside = ((points >= low) & (points <= high)).all(axis=1)
+    T_region_camera = T_region_world @ frame.T_world_camera
+    T_camera_region = np.linalg.inv(T_region_camera)
+    rows, columns = _part(frame, T_camera_region, half)
+    depth, K = frame.depth[rows, columns], frame.camera.K.copy()
+    K[:2, 2] -= columns.start, rows.start
+    if not (depth > 0.0).any():
+        return None
+    planes = pixel_planes(depth, K)
+    smooth = np.where(planes.known, planes.depth, np.float32(0.0))
+    row, column = np.nonzero(smooth > 0.0)
+    slopes = (np.stack([column, row], axis=1) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
+    local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * smooth[row, column][:, None]
+    points = local @ T_region_camera[:3, :3].T + T_region_camera[:3, 3]
+    inside = (np.abs(points) <= half).all(axis=1)
     if not inside.any():
         return None
-    normals = planes.normals[rows[inside], columns[inside]] @ R.T
-    return _Surface(frame, points[inside], normals, depth.astype(np.float32), planes.deviations)
+    normals = planes.normals[row[inside], column[inside]] @ T_region_camera[:3, :3].T
+    return _View(points[inside], normals, T_camera_region, K, smooth, planes.deviations)
 
 
-def _pixel_width(seen: Sequence[_Surface]) -> float:
-    widths = []
-    for one in seen:
-        T = np.linalg.inv(one.frame.T_world_camera)
-        z = one.points @ T[2, :3] + T[2, 3]
-        widths.append(z / one.frame.camera.K[0, 0])
-    return float(np.quantile(np.concatenate(widths), _SHARP))
+def _part(frame: Frame, T_camera_region: Floats, half: Floats) -> tuple[slice, slice]:
+    """Rows and columns of the image that show the region, and a few more; all of them where it reaches behind."""
+    height, width = frame.depth.shape
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half @ T_camera_region[:3, :3].T + T_camera_region[:3, 3]
+    if corners[:, 2].min() <= 0.0:
+        return slice(0, height), slice(0, width)
+    pixels = frame.camera.project(corners)
+    low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - _AROUND, 0, [width - 1, height - 1])
+    high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + _AROUND, low + 1, [width, height])
+    return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-def _carved(nodes: Floats, seen: Sequence[_Surface], edge: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _pixel_width(views: Sequence[_View]) -> float:
+    """The width of a pixel of the sharper images at its surface."""
+    depths = [(one.points @ one.T_camera_region[2, :3] + one.T_camera_region[2, 3]) / one.K[0, 0] for one in views]
+    return float(np.quantile(np.concatenate(depths), _SHARP))
+
+
+def _carved(
+    nodes: NDArray[np.float32], views: Sequence[_View], edge: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which nodes (N, 3) an image looked through, and which lie behind what one measured, in no image before it."""
     free, behind = np.zeros(len(nodes), np.bool_), np.zeros(len(nodes), np.bool_)
-    for one in seen:
-        T = np.linalg.inv(one.frame.T_world_camera)
+    for one in views:
+        T, K = one.T_camera_region.astype(np.float32), one.K.astype(np.float32)
         local = nodes @ T[:3, :3].T + T[:3, 3]
-        ahead = local[:, 2] > 0.0
-        pixels = np.floor(one.frame.camera.project(np.where(ahead[:, None], local, 1.0))).astype(np.int64)
         height, width = one.depth.shape
-        ahead &= (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
-        row, column = (np.where(ahead, pixels[:, k], 0) for k in (1, 0))
-        measured = one.depth[row, column]
-        ahead &= measured > 0.0
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            column = np.floor(local[:, 0] / local[:, 2] * K[0, 0] + K[0, 2])
+            row = np.floor(local[:, 1] / local[:, 2] * K[1, 1] + K[1, 2])
+            shown = (local[:, 2] > 0.0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = np.where(shown, row * width + column, 0).astype(np.int64)
+        measured = one.depth.ravel()[pixel]
+        shown &= measured > 0.0
         gap = measured - local[:, 2]
-        free |= ahead & (gap > _MARGIN * (edge + one.margin[row, column]))
-        behind |= ahead & (gap < 0.0)
+        free |= shown & (gap > _MARGIN * (edge + one.margin.ravel()[pixel]))
+        behind |= shown & (gap < 0.0)
     return free, behind & ~free
 
 
 def _distances(
-    nodes: Floats,
+    nodes: NDArray[np.float32],
     points: Floats,
     normals: Floats,
-    free: NDArray[np.bool_],
     behind: NDArray[np.bool_],
     low: Floats,
     edge: float,
+    shape: tuple[int, ...],
 ) -> NDArray[np.float32]:
     """(X, Y, Z): from the nearest voxel's mean point and plane near the surface, from the point beyond."""
-    shape = free.shape
-    cells = np.round((points - low) / edge).astype(np.int64)
-    flat = np.ravel_multi_index(tuple(np.clip(cells, 0, np.array(shape) - 1).T), shape)
-    count = np.bincount(flat, minlength=free.size)
-    held = np.flatnonzero(count)
+    cells = np.clip(np.round((points - low) / edge).astype(np.int64), 0, np.array(shape) - 1)
+    held, of, count = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True, return_counts=True)
 
-    def means(values: Floats) -> Floats:
-        sums = [np.bincount(flat, values[:, axis], minlength=free.size)[held] for axis in range(3)]
-        return np.stack(sums, axis=1) / count[held][:, None]
+    def means(values: Floats) -> NDArray[np.float32]:
+        sums = [np.bincount(of, values[:, axis], minlength=len(held)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
 
     places, planes = means(points), means(normals)
     planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
-    number = np.full(free.size, -1)
+    number = np.full(len(nodes), -1)
     number[held] = np.arange(len(held))
-    nearest = ndimage.distance_transform_edt((count == 0).reshape(shape), return_distances=False, return_indices=True)
+    empty = (number < 0).reshape(shape)
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     index = number[np.ravel_multi_index(tuple(nearest.reshape(3, -1)), shape)]
-    offset = nodes.reshape(-1, 3) - places[index]
-    apart = np.linalg.norm(offset, axis=1)
+    offset = nodes - places[index]
+    apart = np.sqrt(np.einsum("nc,nc->n", offset, offset))
     across = np.einsum("nc,nc->n", offset, planes[index])
-    sign = np.where(behind.ravel() & (apart <= _BEHIND * edge), -1.0, 1.0)
-    near = apart <= _PLANAR * edge
-    values = np.where(near, across, sign * apart)
-    return values.reshape(shape).astype(np.float32)
+    sign = np.where(behind & (apart <= _BEHIND * edge), np.float32(-1.0), np.float32(1.0))
+    return np.where(apart <= _PLANAR * edge, across, sign * apart).reshape(shape).astype(np.float32)
 
 
 def _observation(
