@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 _MOST_NODES = 1_000_000
 _SHARP = 0.25
 """The share of the measured pixels that are no wider at their surface than a voxel is."""
-_PLANAR = 3.0
-"""Voxels from the surface up to which distances are those from a pixel's plane; beyond, from its point."""
+_PLANAR, _BESIDE = 3.0, 1.5
+"""Voxels: how near the nearest pixel's plane tells side and distance; how far beside its point the plane holds."""
 _BEHIND = 8.0
 """Voxels behind a surface that count as matter; what lies farther behind it was not seen."""
 _AROUND = 8
@@ -175,7 +175,10 @@ def _distances(
     apart = np.sqrt(np.einsum("nc,nc->n", offset, offset))
     across = np.einsum("nc,nc->n", offset, planes[index])
     sign = np.where(behind & (apart <= _BEHIND * edge), np.float32(-1.0), np.float32(1.0))
-    return np.where(apart <= _PLANAR * edge, across, sign * apart).reshape(shape).astype(np.float32)
+    # Straight above a pixel's patch its plane tells the distance; beside the patch the point does.
+    straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
+    far = sign * np.where(straight, np.abs(across), apart)
+    return np.where(apart <= _PLANAR * edge, across, far).reshape(shape).astype(np.float32)
 
 
 def _observation(

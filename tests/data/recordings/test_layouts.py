@@ -105,12 +105,11 @@ def test_a_lens_is_undone(tmp_path: Path) -> None:
     image = np.zeros((HEIGHT, WIDTH))
     image[seen[inside, 1], seen[inside, 0]] = aim[inside, 0]
     pinhole, index = lens.undistorted()
-    assert index is not None and pinhole.lens == "none"
+    assert index is not None
+    assert pinhole.lens == "none"
     taken = image[index[0], index[1]]
     rows, columns = np.indices((HEIGHT, WIDTH)) + 0.5
     wanted = ideal.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))[:, 0].reshape(HEIGHT, WIDTH)
     middle = (slice(15, 45), slice(20, 60))
     assert np.abs(taken - wanted)[middle].max() < 1.5 / K[0, 0]
     assert np.abs(image - wanted)[middle].max() > 1.5 / K[0, 0] * 0.5
-
-

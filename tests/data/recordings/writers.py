@@ -111,7 +111,11 @@ def pose_graph(folder: Path, truth: Truth) -> Path:
 
 
 def scannet(folder: Path, truth: Truth) -> Path:
-    wide = np.diag([2.0, 2.0, 1.0]) @ (K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    wide = np.diag([2.0, 2.0, 1.0]) @ ([*K, [0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) - [
+        [0, 0, 0.5],
+        [0, 0, 0.5],
+        [0, 0, 0],
+    ]
     for i, pose in enumerate(truth.poses):
         depth_png(folder / f"depth/{i}.png", truth.depths[i], 1000.0)
         png(folder / f"color/{i}.png", truth.colors[i].repeat(2, axis=0).repeat(2, axis=1))
@@ -154,7 +158,7 @@ def nerfstudio(folder: Path, truth: Truth) -> Path:
 def sdfstudio(folder: Path, truth: Truth) -> Path:
     frames = []
     intrinsics = np.eye(4)
-    intrinsics[:3, :3] = K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    intrinsics[:3, :3] = [*K, [0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     for i, pose in enumerate(truth.poses):
         folder.mkdir(exist_ok=True)
         np.save(folder / f"{i:06d}_depth.npy", truth.depths[i].astype(np.float32))
@@ -262,7 +266,10 @@ def bag(path: Path, truth: Truth, storage: str = "mcap", coding: str = "16UC1", 
             return lambda stamp, value: writer.write(connection, int(stamp * 1e9), store.serialize_cdr(value, kind))
 
         image = "sensor_msgs/msg/CompressedImage" if "compressed" in coding else "sensor_msgs/msg/Image"
-        depths, colors = topic("/camera/depth/image_rect_raw", image), topic("/camera/color/image", "sensor_msgs/msg/Image")
+        depths, colors = (
+            topic("/camera/depth/image_rect_raw", image),
+            topic("/camera/color/image", "sensor_msgs/msg/Image"),
+        )
         info = topic("/camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
         tf, fixed = topic("/tf", "tf2_msgs/msg/TFMessage"), topic("/tf_static", "tf2_msgs/msg/TFMessage")
         odometry = topic("/odom", "nav_msgs/msg/Odometry")
@@ -274,15 +281,38 @@ def bag(path: Path, truth: Truth, storage: str = "mcap", coding: str = "16UC1", 
             if poses == "tf":
                 tf(stamp, make("tf2_msgs/msg/TFMessage", [transform(stamp, "map", "body", body)]))
             else:
-                with_covariance = make("geometry_msgs/msg/PoseWithCovariance", placed(body, "Point", "Pose"), np.zeros(36))
+                with_covariance = make(
+                    "geometry_msgs/msg/PoseWithCovariance", placed(body, "Point", "Pose"), np.zeros(36)
+                )
                 still = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-                twist = make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", still, still), np.zeros(36))
+                twist = make(
+                    "geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", still, still), np.zeros(36)
+                )
                 odometry(stamp, make("nav_msgs/msg/Odometry", header(stamp, "odom"), "body", with_covariance, twist))
             matrix = [K.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel()]
-            info(stamp, make("sensor_msgs/msg/CameraInfo", header(stamp, "optical"), HEIGHT, WIDTH, "plumb_bob", np.zeros(5), *matrix, 0, 0, region))
+            info(
+                stamp,
+                make(
+                    "sensor_msgs/msg/CameraInfo",
+                    header(stamp, "optical"),
+                    HEIGHT,
+                    WIDTH,
+                    "plumb_bob",
+                    np.zeros(5),
+                    *matrix,
+                    0,
+                    0,
+                    region,
+                ),
+            )
             depths(stamp, make(image, header(stamp, "optical"), *_coded(depth, coding)))
             row = color.reshape(-1)
-            colors(stamp + 0.005, make("sensor_msgs/msg/Image", header(stamp + 0.005, "optical"), HEIGHT, WIDTH, "rgb8", 0, 3 * WIDTH, row))
+            colors(
+                stamp + 0.005,
+                make(
+                    "sensor_msgs/msg/Image", header(stamp + 0.005, "optical"), HEIGHT, WIDTH, "rgb8", 0, 3 * WIDTH, row
+                ),
+            )
     return path
 
 

@@ -1,0 +1,162 @@
+"""Detections in images: every way to write one, and where they are in space."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from regnf_core.errors import InvalidDetectionError
+from regnf_data.recordings.camera import Camera
+from regnf_data.recordings.detection import ImageDetection, is_image_detection, lift, read_image_detections
+from regnf_data.recordings.recording import Frame
+
+H, W = 120, 160
+CAMERA = Camera(np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]]), (H, W))
+CENTER, RADIUS = np.array([0.05, 0.02, 0.9]), 0.12
+"""A ball before a wall at 1.5 m, on a table whose top lies at y = 0.14 in the camera's frame."""
+WALL, TABLE = 1.5, 0.14
+
+
+def ball_image() -> tuple[Frame, np.ndarray[Any, np.dtype[np.bool_]]]:
+    """The depth by formulas, and which pixels show the ball."""
+    rows, columns = np.indices((H, W)) + 0.5
+    rays = CAMERA.rays(np.stack([columns.ravel(), rows.ravel()], axis=1)).reshape(H, W, 3)
+    with np.errstate(divide="ignore"):
+        depth = np.minimum(WALL, np.where(rays[..., 1] > 0.0, TABLE / rays[..., 1], np.inf))
+    a, b, c = (rays**2).sum(-1), rays @ CENTER, CENTER @ CENTER - RADIUS**2
+    root = b * b - a * c
+    hit = (b - np.sqrt(np.maximum(root, 0.0))) / a
+    shown = (root > 0.0) & (hit < depth)
+    return Frame("0", np.where(shown, hit, depth).astype(np.float32), CAMERA, np.eye(4)), shown
+
+
+def grown(mask: Any, pixels: int) -> Any:
+    from scipy import ndimage
+
+    change = ndimage.binary_dilation if pixels > 0 else ndimage.binary_erosion
+    return change(mask, iterations=abs(pixels)) if pixels else mask
+
+
+MASK = np.zeros((3, 4), np.bool_)
+MASK[1:, 1:3] = True
+# Down the columns: 000 011 011 000, so runs of 4, 2, 1, 2, 3. As text: one character a number, differences from the
+# third number on: 4, 2, 1, 2 - 2, 3 - 1.
+RUNS = [4, 2, 1, 2, 3]
+TEXT = "".join(chr(48 + value) for value in (4, 2, 1, 0, 2))
+
+
+def png_of(mask: Any) -> str:
+    file = io.BytesIO()
+    Image.fromarray(mask.astype(np.uint8) * 255).save(file, "PNG")
+    return base64.b64encode(file.getvalue()).decode()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"mask": {"size": [3, 4], "counts": RUNS}},
+        {"mask": {"size": [3, 4], "counts": TEXT}},
+        {"mask": "mask.png"},
+        {"mask": f"data:image/png;base64,{png_of(MASK)}"},
+        {"image_id": 0, "category_id": 3, "segmentation": {"size": [3, 4], "counts": RUNS}, "bbox": [1, 1, 2, 2]},
+    ],
+)
+def test_a_mask_is_read_however_it_is_written(given: dict[str, Any], tmp_path: Path) -> None:
+    Image.fromarray(MASK.astype(np.uint8)).save(tmp_path / "mask.png")
+    assert is_image_detection(given)
+    (found,) = read_image_detections(given, tmp_path)
+    assert found.mask is not None
+    np.testing.assert_array_equal(found.mask, MASK)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"frame": "7", "box_2d": [10, 20, 30, 60]},
+        [{"image_id": 7, "category_id": 1, "bbox": [10, 20, 20, 40], "score": 0.5}],
+        [{"name": "cup", "class": 41, "confidence": 0.5, "box": {"x1": 10, "y1": 20, "x2": 30, "y2": 60}}],
+        {"annotations": [{"image_id": 7, "bbox": [10, 20, 20, 40]}]},
+    ],
+)
+def test_a_box_is_read_however_it_is_written(given: Any) -> None:
+    assert is_image_detection(given)
+    (found,) = read_image_detections(given)
+    assert found.box == (10.0, 20.0, 30.0, 60.0)
+    assert found.score in (None, 0.5)
+
+
+def test_of_several_detections_one_is_chosen() -> None:
+    listed = [{"name": "cup", "bbox": [0, 0, 5, 5]}, {"name": "bowl", "bbox": [10, 20, 20, 40]}]
+    with pytest.raises(InvalidDetectionError, match="2 detections are listed: say which .0: cup, 1: bowl."):
+        read_image_detections(listed)
+    assert read_image_detections(listed, index=1)[0].label == "bowl"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"mask": {"size": [3, 4], "counts": [4, 2]}}, "runs have 6 pixels, its size 4 x 3"),
+        ({"mask": "no such file"}, "no file, no image"),
+        ({"box_2d": [30, 20, 10, 60]}, "no area"),
+        ({"box_2d": [1, 2, 3]}, "not 4 finite numbers"),
+        ({"point_2d": ["a", 2]}, "not 2 finite numbers"),
+        ({"label": "cup"}, "has a mask, a box_2d or a point_2d"),
+    ],
+)
+def test_what_is_wrong_is_said(given: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidDetectionError, match=said):
+        read_image_detections(given, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["mask", "mask grown", "mask shrunk", "box", "box loose", "point", "point beside"])
+def test_a_thing_is_lifted_to_its_box(kind: str) -> None:
+    frame, shown = ball_image()
+    rows, columns = np.nonzero(shown)
+    tight = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+    middle = float(columns.mean()), float(rows.mean())
+    detection = {
+        "mask": ImageDetection(mask=shown),
+        "mask grown": ImageDetection(mask=grown(shown, 4)),
+        "mask shrunk": ImageDetection(mask=grown(shown, -3)),
+        "box": ImageDetection(box=tight),  # type: ignore[arg-type]
+        "box loose": ImageDetection(box=(tight[0] - 9, tight[1] - 9, tight[2] + 9, tight[3] + 9)),
+        "point": ImageDetection(point=middle),
+        "point beside": ImageDetection(point=(middle[0] + 8, middle[1] - 6)),
+    }[kind]
+    found = lift(frame, detection, diameter=2.0 * RADIUS)
+    # Nearly all pixels are the ball's, and most of the ball's are among them.
+    assert (found.pixels & shown).sum() >= 0.95 * found.pixels.sum()
+    assert (found.pixels & shown).sum() >= 0.7 * shown.sum()
+    # The box holds the visible cap, and is not much larger than the ball.
+    np.testing.assert_allclose(found.box.center.numpy(), CENTER, atol=0.3 * RADIUS)
+    size = found.box.size.numpy()
+    assert (size > 1.4 * RADIUS).all()
+    assert (size < 3.0 * RADIUS).all()
+
+
+@pytest.mark.parametrize(
+    ("detection", "said"),
+    [
+        (ImageDetection(mask=np.zeros((H, W), np.bool_)), "frame 0: the mask is empty"),
+        (ImageDetection(mask=np.ones((9, 9), np.bool_)), "frame 0: the mask has 9 x 9 pixels, not 160 x 120"),
+        (ImageDetection(box=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box lies outside the image"),
+        (ImageDetection(point=(-1.0, 5.0)), "frame 0: the point .* lies outside the image"),
+    ],
+)
+def test_a_detection_beside_the_image_is_refused(detection: ImageDetection, said: str) -> None:
+    with pytest.raises(InvalidDetectionError, match=said):
+        lift(ball_image()[0], detection)
+
+
+def test_a_detection_without_depth_is_refused() -> None:
+    frame, shown = ball_image()
+    holes = Frame("0", np.where(shown, 0.0, frame.depth).astype(np.float32), CAMERA, np.eye(4))
+    with pytest.raises(InvalidDetectionError, match=r"frame 0: 0 of \d+ pixels of the detection") as found:
+        lift(holes, ImageDetection(mask=shown))
+    assert found.value.reason == "DETECTION_WITHOUT_DEPTH"
