@@ -43,7 +43,7 @@ _MARGIN = 1.5
 @dataclass(frozen=True, eq=False)
 class _View:
     """What one image measured in the region, in the region's frame. points, normals: (P, 3) · T_camera_region: (4, 4) ·
-    K: (3, 3), of the part of the image that shows the region · depth: (H, W) of that part, smoothed, 0 for none ·
+    K: (3, 3), of the part of the image that shows the region · depth: (H, W) of that part, 0 for none ·
     margin: (H, W), a standard deviation of the depth."""
 
     points: Floats
@@ -95,16 +95,17 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
     if not (depth > 0.0).any():
         return None
     planes = pixel_planes(depth, K)
-    smooth = np.where(planes.known, planes.depth, np.float32(0.0))
-    row, column = np.nonzero(smooth > 0.0)
+    # A plane's own depth would cut the tops of curved surfaces: voxels average the noise.
+    kept = np.where(planes.known, depth, np.float32(0.0))
+    row, column = np.nonzero(kept > 0.0)
     slopes = (np.stack([column, row], axis=1) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * smooth[row, column][:, None]
+    local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * kept[row, column][:, None]
     points = local @ T_region_camera[:3, :3].T + T_region_camera[:3, 3]
     inside = (np.abs(points) <= half).all(axis=1)
     if not inside.any():
         return None
     normals = planes.normals[row[inside], column[inside]] @ T_region_camera[:3, :3].T
-    return _View(points[inside], normals, T_camera_region, K, smooth, planes.deviations)
+    return _View(points[inside], normals, T_camera_region, K, kept, planes.deviations)
 
 
 def _part(frame: Frame, T_camera_region: Floats, half: Floats) -> tuple[slice, slice]:

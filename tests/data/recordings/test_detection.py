@@ -93,7 +93,7 @@ def test_a_box_is_read_however_it_is_written(given: Any) -> None:
 
 def test_of_several_detections_one_is_chosen() -> None:
     listed = [{"name": "cup", "bbox": [0, 0, 5, 5]}, {"name": "bowl", "bbox": [10, 20, 20, 40]}]
-    with pytest.raises(InvalidDetectionError, match="2 detections are listed: say which .0: cup, 1: bowl."):
+    with pytest.raises(InvalidDetectionError, match=r"2 detections are listed: say which \(0: cup, 1: bowl\)"):
         read_image_detections(listed)
     assert read_image_detections(listed, index=1)[0].label == "bowl"
 

@@ -13,7 +13,7 @@ from regnf_data.recordings import Recording, open_recording
 from tests.data.recordings import writers
 from tests.data.recordings.truth import HEIGHT, WIDTH, K, Truth, walk
 
-HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+HALF = writers.HALF
 _BAGS = (("mcap", "16UC1", "tf"), ("mcap", "32FC1", "odometry"), ("sqlite3", "compressedDepth", "tf"))
 
 

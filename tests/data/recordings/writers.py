@@ -16,6 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.data.recordings.truth import HEIGHT, WIDTH, Array, K, Truth
 
+HALF = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+"""From pixel centers at whole numbers to centers at one half."""
+
 
 def png(path: Path, image: NDArray[Any]) -> None:
     """8 bits a channel, or 16 bits of one channel."""
