@@ -158,7 +158,7 @@ def mask_of(value: Any, folder: Path | None = None, size: Any = None) -> Mask:
 
 
 def _run_lengths(value: Mapping[str, Any]) -> Mask:
-    """COCO's: lengths of runs of 0 and 1 in turn, down the columns; as numbers or as its text, five bits a character."""
+    """COCO's: lengths of runs of 0 and 1 in turn, down the columns; as numbers or as text of five bits each."""
     try:
         height, width = (int(side) for side in value["size"])
         counts = value["counts"]

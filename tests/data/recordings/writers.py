@@ -114,7 +114,7 @@ def pose_graph(folder: Path, truth: Truth) -> Path:
 
 
 def scannet(folder: Path, truth: Truth) -> Path:
-    wide = np.diag([2.0, 2.0, 1.0]) @ ([*K, [0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]) - [
+    wide = np.diag([2.0, 2.0, 1.0]) @ (K + HALF) - [
         [0, 0, 0.5],
         [0, 0, 0.5],
         [0, 0, 0],
@@ -161,7 +161,7 @@ def nerfstudio(folder: Path, truth: Truth) -> Path:
 def sdfstudio(folder: Path, truth: Truth) -> Path:
     frames = []
     intrinsics = np.eye(4)
-    intrinsics[:3, :3] = [*K, [0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    intrinsics[:3, :3] = K + HALF
     for i, pose in enumerate(truth.poses):
         folder.mkdir(exist_ok=True)
         np.save(folder / f"{i:06d}_depth.npy", truth.depths[i].astype(np.float32))
