@@ -251,10 +251,18 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         raise InvalidDetectionError(
             f"frame {frame.name}: {share} of the detection have a measured depth", reason="DETECTION_WITHOUT_DEPTH"
         )
+    if detection.point is not None and seed is not None and diameter is not None:
+        # Nothing of a thing that was clicked on is farther from the click than its diameter.
+        here = _points(frame, measured)
+        rows, columns = np.nonzero(measured)
+        clicked = here[np.hypot(rows - seed[0], columns - seed[1]).argmin()]
+        region = region & (frame.depth > 0.0)
+        region[rows, columns] = np.linalg.norm(here - clicked, axis=1) <= diameter
+        measured = region.copy()
     if detection.mask is None:
         measured = _without_background(frame, region, measured)
-    pixels = _largest(frame.depth, measured, seed)
-    camera_points = frame.camera.rays(np.stack(np.nonzero(pixels)[::-1], axis=1) + 0.5) * frame.depth[pixels][:, None]
+    pixels = _largest(frame.depth, measured, seed, detection.point is not None)
+    camera_points = _points(frame, pixels)
     if diameter is not None and detection.mask is None:
         # Nothing of the thing is farther from its middle than its diameter.
         near = np.linalg.norm(camera_points - np.median(camera_points, axis=0), axis=1) <= diameter
@@ -320,13 +328,12 @@ def _without_background(frame: Frame, region: Mask, measured: Mask) -> Mask:
     ring = np.zeros_like(region)
     first, last = np.maximum(low - reach, 0), high + reach
     ring[first[0] : last[0], first[1] : last[1]] = True
-    around = ring & (frame.depth > 0.0) & ~region if not region.all() else frame.depth > 0.0
+    around = ring & (frame.depth > 0.0) & (~region | region.all())
     if around.sum() < 3 * _FEWEST:
         return measured
     rng = np.random.default_rng(0)
-    inside = frame.camera.rays(np.stack(np.nonzero(measured)[::-1], axis=1) + 0.5) * frame.depth[measured][:, None]
+    inside, points = _points(frame, measured), _points(frame, around)
     kept = np.ones(len(inside), dtype=np.bool_)
-    points = frame.camera.rays(np.stack(np.nonzero(around)[::-1], axis=1) + 0.5) * frame.depth[around][:, None]
     left = points[rng.permutation(len(points))[:5000]]
     total = len(left)
     for _ in range(_PLANES):
@@ -366,16 +373,22 @@ def _plane(points: Array, rng: np.random.Generator) -> tuple[Array, float] | Non
     return normal, float(normal @ middle)
 
 
-def _largest(depth: NDArray[np.float32], measured: Mask, seed: tuple[float, float] | None) -> Mask:
-    """The connected surface with most pixels; with a seed, those near it count for more."""
+def _points(frame: Frame, pixels: Mask) -> Array:
+    """(P, 3): the measured points of pixels (H, W), camera frame."""
+    return frame.camera.rays(np.stack(np.nonzero(pixels)[::-1], axis=1) + 0.5) * frame.depth[pixels][:, None]
+
+
+def _largest(depth: NDArray[np.float32], measured: Mask, seed: tuple[float, float] | None, clicked: bool) -> Mask:
+    """The connected surface with most pixels; with a seed, those near it count for more, or it alone is ``clicked``."""
     labels, count = _surfaces(depth, measured)
     rows, columns = np.nonzero(measured)
+    if not len(rows):
+        return measured
     weight = np.ones(len(rows))
     if seed is not None:
         apart = np.hypot(rows - seed[0], columns - seed[1])
-        if measured.all() or measured.sum() > 0.5 * measured.size:  # a point: the surface that it lies on
-            nearest = int(apart.argmin())
-            return _of(labels[nearest], labels, measured)
+        if clicked:
+            return _of(int(labels[apart.argmin()]), labels, measured)
         spread = 0.25 * max(np.ptp(rows), np.ptp(columns), 1)
         weight = np.exp(-0.5 * (apart / spread) ** 2)
     sizes = np.bincount(labels, weight, minlength=count)
