@@ -1,27 +1,31 @@
-"""The client that blocks until an answer is there."""
+"""The client that blocks until an answer is there, and the same to be awaited."""
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from functools import update_wrapper
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import httpx
 
 from regnf_client.answers import refusal, unreachable
 from regnf_client.batches import BatchReader, PairLike, PairResult
-from regnf_client.calls import Calls, JobLike, LibraryCalls, id_of, signed
-from regnf_client.fields import ADDRESS, WORKER_TIMEOUT_S, Connection, Report
+from regnf_client.calls import Calls, JobLike, LibraryCalls, id_of
 from regnf_client.models import Event, EventReader
-from regnf_client.steps import Call, Download, Flow, Patience, Pause, Step
+from regnf_client.steps import ADDRESS, WORKER_TIMEOUT_S, Call, Connection, Download, Flow, Pause, Report, Step, Tries
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 _Calls = TypeVar("_Calls")
+_Driver = TypeVar("_Driver")
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class SyncDriver:
-    """Over one HTTP client."""
+    """Performs the steps of flows over one HTTP client."""
 
     def __init__(self, http: httpx.Client) -> None:
         self._http = http
@@ -55,12 +59,9 @@ class SyncDriver:
         return step.do()
 
     def _download(self, step: Download) -> httpx.Response:
-        """Go on behind what the file holds already."""
-        held = step.target.stat().st_size if step.target.exists() else 0
-        headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={held}-"} if held else {})
-        with self._http.stream("GET", step.path, headers=headers) as answer:
+        with self._http.stream("GET", step.path, headers=step.headers()) as answer:
             if answer.is_success:
-                with step.target.open("ab" if answer.status_code == httpx.codes.PARTIAL_CONTENT else "wb") as file:
+                with step.target.open(step.mode(answer)) as file:
                     for block in answer.iter_bytes():
                         file.write(block)
             else:
@@ -68,27 +69,87 @@ class SyncDriver:
             return answer
 
 
-class _Blocking(Generic[_Calls]):
-    """What performs flows of calls."""
+class AsyncDriver:
+    """The same, awaited; what takes time is done in threads."""
 
-    def __init__(self, calls: _Calls, driver: SyncDriver) -> None:
+    def __init__(self, http: httpx.AsyncClient) -> None:
+        self._http = http
+
+    async def run(self, flow: Flow[_T]) -> _T:
+        """What the flow returns."""
+        answer: Any = None
+        try:
+            while True:
+                answer = await self._perform(flow.send(answer))
+        except StopIteration as done:
+            value: _T = done.value
+            return value
+        finally:
+            flow.close()
+
+    async def _perform(self, step: Step) -> Any:
+        if isinstance(step, Pause):
+            return await asyncio.sleep(step.seconds)
+        try:
+            if isinstance(step, Call):
+                return await self._http.request(step.method, step.path, **step.how)
+            if isinstance(step, Download):
+                return await self._download(step)
+        except httpx.RequestError as error:
+            return error
+        return await asyncio.to_thread(step.do)
+
+    async def _download(self, step: Download) -> httpx.Response:
+        async with self._http.stream("GET", step.path, headers=step.headers()) as answer:
+            if answer.is_success:
+                with step.target.open(step.mode(answer)) as file:
+                    async for block in answer.aiter_bytes():
+                        await asyncio.to_thread(file.write, block)
+            else:
+                await answer.aread()
+            return answer
+
+
+class _Performing(Generic[_Calls, _Driver]):
+    """What performs the flows of calls with a driver."""
+
+    def __init__(self, calls: _Calls, driver: _Driver) -> None:
         self._calls = calls
         self._driver = driver
 
 
+def _signed(function: _Function, flow: Callable[..., Flow[Any]]) -> _Function:
+    """The function with the name, the docstring and the signature of a flow, with what the flow returns."""
+    signature = inspect.signature(flow)
+    returned = str(signature.return_annotation).removeprefix("Flow[").removesuffix("]")
+    update_wrapper(function, flow)
+    function.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
+    return function
+
+
 def blocking(
     method: Callable[Concatenate[_Calls, _P], Flow[_T]],
-) -> Callable[Concatenate[_Blocking[_Calls], _P], _T]:
-    """A method of a client: the flow, performed. It has the flow's parameters and docstring."""
+) -> Callable[Concatenate[_Performing[_Calls, SyncDriver], _P], _T]:
+    """A method of a client: the flow, performed."""
 
-    @signed(method)
-    def performed(self: _Blocking[_Calls], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+    def performed(self: _Performing[_Calls, SyncDriver], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
         return self._driver.run(method(self._calls, *args, **kwargs))
 
-    return performed
+    return _signed(performed, method)
 
 
-class Library(_Blocking[LibraryCalls]):
+def awaited(
+    method: Callable[Concatenate[_Calls, _P], Flow[_T]],
+) -> Callable[Concatenate[_Performing[_Calls, AsyncDriver], _P], Coroutine[Any, Any, _T]]:
+    """The same, to be awaited."""
+
+    async def performed(self: _Performing[_Calls, AsyncDriver], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        return await self._driver.run(method(self._calls, *args, **kwargs))
+
+    return _signed(performed, method)
+
+
+class Library(_Performing[LibraryCalls, SyncDriver]):
     """Objects by name. An ``Entry`` may be given wherever a field may."""
 
     add = blocking(LibraryCalls.add)
@@ -99,7 +160,7 @@ class Library(_Blocking[LibraryCalls]):
     download = blocking(LibraryCalls.download)
 
 
-class Client(_Blocking[Calls]):
+class Client(_Performing[Calls, SyncDriver]):
     """A regnf service.
 
     Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects. A
@@ -179,7 +240,7 @@ class Client(_Blocking[Calls]):
 
     def watch(self, job: JobLike) -> Iterator[Event]:
         """A job's events as they come, until it has finished; a broken stream goes on where it stopped."""
-        reader, tries = EventReader(), Patience(retries=self._connection.retries).tries()
+        reader, tries = EventReader(), Tries(self._connection.retries)
         while not reader.ended:
             try:
                 with self._http.stream("GET", f"/jobs/{id_of(job)}/events", headers=reader.headers()) as answer:
@@ -197,3 +258,103 @@ class Client(_Blocking[Calls]):
                 if wait_s is None:
                     raise unreachable(error) from error
                 self._driver.sleep(wait_s)
+
+
+class AsyncLibrary(_Performing[LibraryCalls, AsyncDriver]):
+    """Objects by name. An ``Entry`` may be given wherever a field may."""
+
+    add = awaited(LibraryCalls.add)
+    entries = awaited(LibraryCalls.entries)
+    get = awaited(LibraryCalls.get)
+    change = awaited(LibraryCalls.change)
+    remove = awaited(LibraryCalls.remove)
+    download = awaited(LibraryCalls.download)
+
+
+class AsyncClient(_Performing[Calls, AsyncDriver]):
+    """The same as ``Client``, to be awaited. Files are read and hashed in threads."""
+
+    def __init__(
+        self,
+        address: str = ADDRESS,
+        token: str | None = None,
+        *,
+        retries: int = 4,
+        worker_timeout_s: float | None = WORKER_TIMEOUT_S,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self._connection = Connection(address, token, retries, worker_timeout_s)
+        self._http = httpx.AsyncClient(transport=transport, **self._connection.http_options())
+        super().__init__(Calls(self._connection), AsyncDriver(self._http))
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._http.aclose()
+
+    @property
+    def address(self) -> str:
+        """Of the service."""
+        return self._connection.address.rstrip("/")
+
+    @property
+    def library(self) -> AsyncLibrary:
+        """Objects by name, with tags."""
+        return AsyncLibrary(LibraryCalls(self._connection), self._driver)
+
+    upload = awaited(Calls.upload)
+    field = awaited(Calls.field)
+    fields = awaited(Calls.fields)
+    delete_field = awaited(Calls.delete_field)
+    register = awaited(Calls.register)
+    submit = awaited(Calls.submit)
+    search = awaited(Calls.search)
+    register_batch = awaited(Calls.register_batch)
+    render = awaited(Calls.render)
+    job = awaited(Calls.job)
+    jobs = awaited(Calls.jobs)
+    wait = awaited(Calls.wait)
+    cancel = awaited(Calls.cancel)
+    result = awaited(Calls.result)
+    rendering = awaited(Calls.rendering)
+    artifact = awaited(Calls.artifact)
+    download = awaited(Calls.download)
+    save = awaited(Calls.save)
+
+    async def batch(
+        self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
+    ) -> AsyncIterator[PairResult]:
+        """As ``Client.batch``."""
+        asking = self._connection.asking(progress, timeout_s)
+        reader = BatchReader(asking, requests, asking.deadline())
+        while (found := await self._driver.run(reader.post())) is not None:
+            while found is not None:
+                for one in found:
+                    yield one
+                found = await self._driver.run(reader.read())
+
+    async def watch(self, job: JobLike) -> AsyncIterator[Event]:
+        """As ``Client.watch``."""
+        reader, tries = EventReader(), Tries(self._connection.retries)
+        while not reader.ended:
+            try:
+                async with self._http.stream("GET", f"/jobs/{id_of(job)}/events", headers=reader.headers()) as answer:
+                    if answer.status_code == httpx.codes.NO_CONTENT:
+                        return
+                    if not answer.is_success:
+                        await answer.aread()
+                        raise refusal(answer)
+                    reader.connected()
+                    async for line in answer.aiter_lines():
+                        if (event := reader.take(line)) is not None:
+                            yield event
+            except httpx.RequestError as error:
+                wait_s = tries.wait_s(error)
+                if wait_s is None:
+                    raise unreachable(error) from error
+                await asyncio.sleep(wait_s)

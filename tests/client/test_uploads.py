@@ -17,7 +17,7 @@ import trimesh
 import regnf
 from regnf_client import Client, ServiceError, UnreachableError
 from regnf_client.batches import BatchReader
-from regnf_client.fields import Deadline
+from regnf_client.steps import Deadline
 from regnf_core.importing.meshes.ply import read_ply
 from tests.client.transports import Counted
 from tests.contract.asgi import AppTransport
