@@ -14,7 +14,7 @@ from regnf_cli.report import EXIT_BAD_INPUT, err, fail
 from regnf_core import __version__
 
 COMMANDS = {
-    "demo": "demo", "register": "register", "search": "search", "batch": "batch", "serve": "serve", "worker": "serve",
+    "demo": "demo", "register": "register", "search": "register", "batch": "batch", "serve": "serve", "worker": "serve",
     "inspect": "inspect", "convert": "convert", "fit": "fit", "fuse": "fit", "render": "render", "edit": "render",
     "doctor": "doctor", "render-dataset": "render_dataset", "manual": "manual",
 }  # fmt: skip

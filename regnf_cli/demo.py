@@ -24,7 +24,7 @@ from typing import Annotated
 import typer
 
 from regnf_cli.guard import require
-from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, reporting, show_pose
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, fail, out, reporting, show_pose, tell
 from regnf_cli.serve import demo_folder
 from regnf_client import Client, Result
 
@@ -112,7 +112,7 @@ def demo(
                 if waits:
                     _wait_for_enter()
         except RuntimeError as error:  # the service did not start
-            err.print((folder / "serve.log").read_text(errors="replace")[-2000:], markup=False, soft_wrap=True)
+            tell((folder / "serve.log").read_text(errors="replace")[-2000:])
             raise typer.Exit(fail("SERVICE_NOT_STARTED", str(error), EXIT_UNAVAILABLE)) from error
     if not good:
         raise typer.Exit(EXIT_NOT_REGISTERED)

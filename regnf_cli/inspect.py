@@ -14,20 +14,9 @@ import typer
 
 from regnf_cli.guard import require
 from regnf_cli.options import Config, Description, Field, NoConfig, choice_of, source_of
-from regnf_cli.report import out
-from regnf_cli.search import keep_pictures
-from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
+from regnf_cli.report import out, say, tell
+from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError, filled_folder
 from regnf_core.library_entries import shown_number
-
-Picture = Annotated[Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)]
-Candidates = Annotated[
-    Path | None,
-    typer.Option(
-        help="Where to write pictures of what the file may be, if nothing in it tells.",
-        file_okay=False,
-        metavar="FOLDER",
-    ),
-]
 
 
 def inspect(
@@ -35,8 +24,17 @@ def inspect(
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
-    picture: Picture = None,
-    candidates: Candidates = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
+    ] = None,
+    candidates: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where to write pictures of what the file may be, if nothing in it tells.",
+            file_okay=False,
+            metavar="FOLDER",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility.
@@ -76,12 +74,16 @@ def _check(picture: Path | None, candidates: Path | None) -> None:
 
 @contextmanager
 def _asked(folder: Path | None) -> Iterator[None]:
-    """Pictures of what a refused file may be are kept in the folder."""
+    """Pictures of what a refused file may be are kept in the folder, 1.png and so on as they are numbered."""
     try:
         yield
     except FieldFormatError as error:
         if folder is not None and error.candidates:
-            keep_pictures(error.candidates, folder)
+            with filled_folder(folder) as work:
+                for number, one in enumerate(error.candidates, 1):
+                    if one.picture is not None:
+                        (work / f"{number}.png").write_bytes(one.picture)
+                        tell(f"wrote {folder / f'{number}.png'}")
         raise
 
 
@@ -97,7 +99,7 @@ def _show(values: dict[str, Any], indent: int = 0) -> None:
             out.print(f"{'  ' * indent}{name}:")
             _show(value, indent + 1)
         else:
-            out.print(f"{'  ' * indent}{name:<24} {_readable(value)}", markup=False, soft_wrap=True)
+            say(f"{'  ' * indent}{name:<24} {_readable(value)}")
 
 
 def _readable(value: Any) -> str:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
 from regnf_cli.guard import require
-from regnf_cli.report import err, out
+from regnf_cli.report import progress, say
 from regnf_core.errors import InvalidOptionsError
 
 if TYPE_CHECKING:
@@ -20,36 +19,31 @@ if TYPE_CHECKING:
 _LARGEST_EDGE = 4096
 
 
-class Trajectory(StrEnum):
-    """How the camera moves."""
-
-    LONG = "long"
-    SHORT = "short"
-    SINGLE = "single"
-
-
-Source = Annotated[
-    Path,
-    typer.Argument(help="A mesh (glb, obj, ply, stl; meters, z up) or a layout (.json).", exists=True, dir_okay=False),
-]
-Meshes = Annotated[Path | None, typer.Option(help="The folder with the layout's meshes.", exists=True, file_okay=False)]
-Frames = Annotated[
-    int | None, typer.Option(min=1, max=10_000, help="Images; else 60 or 20 of a mesh, 240 or 60 of a layout.")
-]
-UnitsPerMeter = Annotated[float | None, typer.Option(help="World units a meter; else the layout's, or 1 for a mesh.")]
+Trajectory = Literal["long", "short", "single"]
 
 
 def render_dataset(
-    source: Source,
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A mesh (glb, obj, ply, stl; meters, z up) or a layout (.json).", exists=True, dir_okay=False
+        ),
+    ],
     output: Annotated[Path, typer.Argument(metavar="OUT", help="The folder to make, in the sdfstudio data format.")],
-    meshes: Meshes = None,
-    trajectory: Annotated[Trajectory, typer.Option(help="All round, a walk past, or one bad view.")] = Trajectory.LONG,
+    meshes: Annotated[
+        Path | None, typer.Option(help="The folder with the layout's meshes.", exists=True, file_okay=False)
+    ] = None,
+    trajectory: Annotated[Trajectory, typer.Option(help="All round, a walk past, or one bad view.")] = "long",
     instance: Annotated[str | None, typer.Option(help="Which of the layout's instances a single view shows.")] = None,
-    frames: Frames = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, max=10_000, help="Images; else 60 or 20 of a mesh, 240 or 60 of a layout.")
+    ] = None,
     width: Annotated[int, typer.Option(min=8, max=_LARGEST_EDGE)] = 160,
     height: Annotated[int, typer.Option(min=8, max=_LARGEST_EDGE)] = 120,
     noise: Annotated[bool, typer.Option(help="A depth camera's errors, or exact depths.")] = True,
-    units_per_meter: UnitsPerMeter = None,
+    units_per_meter: Annotated[
+        float | None, typer.Option(help="World units a meter; else the layout's, or 1 for a mesh.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of the noise.")] = 0,
 ) -> None:
     """Render posed RGB-D images of a mesh or of a furnished room, with boxes and true transforms.
@@ -65,7 +59,7 @@ def render_dataset(
     _check(layout, meshes, trajectory, instance, units_per_meter)
     check_target(output)
     options = RenderOptions(
-        trajectory=trajectory.value,
+        trajectory=trajectory,
         frames=frames,
         size=(height, width),
         sensor=DepthSensor() if noise else None,
@@ -75,7 +69,7 @@ def render_dataset(
     write_dataset(images, output)
     megabytes = sum(path.stat().st_size for path in output.iterdir()) / 1e6
     names = ", ".join(each.label for each in images.instances)
-    out.print(f"{output}: {len(images)} images of {names}, {megabytes:.1f} MB", markup=False, soft_wrap=True)
+    say(f"{output}: {len(images)} images of {names}, {megabytes:.1f} MB")
 
 
 def _check(
@@ -85,7 +79,7 @@ def _check(
         raise InvalidOptionsError("a layout needs --meshes, the folder with its meshes")
     if not layout and (meshes is not None or instance is not None):
         raise InvalidOptionsError("--meshes and --instance go with a layout (.json)")
-    if layout and (trajectory is Trajectory.SINGLE) != (instance is not None):
+    if layout and (trajectory == "single") != (instance is not None):
         raise InvalidOptionsError("a layout's single view needs --instance, and nothing else does")
     if units_per_meter is not None and not 1e-6 <= units_per_meter <= 1e6:
         raise InvalidOptionsError("the units per meter must lie between 1e-6 and 1e6")
@@ -97,8 +91,7 @@ def _rendered(
     from regnf_data.composing import render_object, render_room
     from regnf_data.layouts import read_layout
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=err) as bar:
+    with progress(MofNCompleteColumn(), TimeRemainingColumn()) as bar:
         task = bar.add_task("rendering", total=None)
 
         def report(done: int, total: int) -> None:

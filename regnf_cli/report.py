@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeElapsedColumn
 from rich.table import Table
 
-from regnf_core.errors import hint_of
+from regnf_core.errors import Candidate, RegnfError, Said, hint_of
 
 # What the commands share for talking to people and to programs.
 
@@ -31,11 +32,21 @@ _PAGE = re.compile(r"\bdocs/([a-z0-9/-]+)\.md\b")
 def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None = None) -> int:
     """Say on stderr what went wrong, and what to do next; returns the exit code."""
     err.print(f"[bold red]{reason}[/] ", end="")
-    err.print(_with_commands(message), markup=False, soft_wrap=True)
+    tell(_with_commands(message))
     if hint := hint or hint_of(reason):
         err.print("[bold]hint:[/] ", end="")
-        err.print(_with_commands(hint), markup=False, soft_wrap=True)
+        tell(_with_commands(hint))
     return code
+
+
+def show_candidates(error: RegnfError) -> None:
+    """Say on stderr what to add to the command for each function that a refused file may be, if that is why."""
+    asked: Sequence[Candidate] = getattr(error, "candidates", ())
+    said: Said = getattr(error, "said", None) or Said(None, {})
+    option = "--description" if said.use is None else f"--{said.use}-description"
+    for number, one in enumerate(asked, 1):
+        told = f"{number}  {one.name}\n   {option} {shlex.quote(json.dumps(one.added_to(said.description)))}"
+        tell(told)
 
 
 def _with_commands(text: str) -> str:
@@ -43,19 +54,34 @@ def _with_commands(text: str) -> str:
     return _PAGE.sub(r"`regnf manual \1`", text)
 
 
+def say(text: str) -> None:
+    """A line on stdout, as it is."""
+    out.print(text, markup=False, soft_wrap=True)
+
+
+def tell(text: str) -> None:
+    """The same on stderr, for people: what is on stdout may be JSON."""
+    err.print(text, markup=False, soft_wrap=True)
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Tell them, a line each."""
+    for warning in warnings:
+        tell(f"warning: {warning}")
+
+
 @contextmanager
 def reporting(phase: str) -> Iterator[Callable[[str, float], None]]:
     """A bar of phases and their shares, which begins with ``phase``."""
-    with phase_progress() as bar:
+    with progress() as bar:
         task = bar.add_task(phase, total=1.0)
         yield lambda phase, share: bar.update(task, description=phase, completed=share)
 
 
-def phase_progress() -> Progress:
-    """A bar on stderr, so that stdout stays clean for results."""
-    return Progress(
-        TextColumn("{task.description:>14}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), console=err
-    )
+def progress(*columns: str | ProgressColumn) -> Progress:
+    """A bar on stderr, so that stdout stays clean for results. columns: in place of the share and the time."""
+    rest = columns or (TaskProgressColumn(), TimeElapsedColumn())
+    return Progress("{task.description:>14}", BarColumn(), *rest, console=err)
 
 
 _EXIT_CODES = {"registered": EXIT_REGISTERED, "ambiguous": EXIT_AMBIGUOUS}
@@ -170,7 +196,7 @@ def _show_alternatives(alternatives: list[dict[str, Any]]) -> None:
 
 
 def _line(name: str, value: str) -> None:
-    out.print(f"{name:<12} {value}", markup=False, soft_wrap=True)
+    say(f"{name:<12} {value}")
 
 
 def _numbers(values: list[float | None]) -> str:

@@ -203,8 +203,8 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
 
         def batch(self, requests: Iterator[Any]) -> Iterator[PairResult]:
             for index, one in enumerate(requests):
-                assert one.more["pictures"] is (one.seed == 3)  # as the file says, else none
-                told = {"status": "successful", "verdict": "registered", "job": f"job {one.seed}"}
+                assert one["pictures"] is (one["seed"] == 3)  # as the file says, else none
+                told = {"status": "successful", "verdict": "registered", "job": f"job {one['seed']}"}
                 matrix = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
                 back = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
                 poses = {"T_scene_object": back, "T_object_scene": matrix, "probability": 0.9}

@@ -52,7 +52,10 @@ ELSEWHERE = [
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch._C", "torch.nn")],
     *[("SIGINT", name, ["register", *PAIR]) for name in ("scipy.spatial", "PIL.Image")],
     ("SIGHUP", "torch", ["register", *PAIR]),
-    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
+    *[
+        ("SIGINT", name, ["search", *PAIR])
+        for name in ("regnf_cli.registration", "torch", "regnf_core.viewing.artifacts")
+    ],
     ("SIGINT", "regnf_cli.inspect", ["inspect", CHAIR]),
     *[("SIGINT", name, ["convert", CHAIR, "chair.ply"]) for name in ("igl", "igl.pyigl_core")],
     ("SIGINT", "pydantic_settings", ["serve", "--port", "0", "--state-dir", "state"]),

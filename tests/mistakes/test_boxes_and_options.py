@@ -82,7 +82,7 @@ def test_swapped_scene_and_object(run: Run, folder: Path) -> None:
 
 
 def test_the_same_file_twice(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("regnf_cli.register._register_here", lambda *_: {"verdict": "rejected"})
+    monkeypatch.setattr("regnf_cli.registration.register_here", lambda *_: {"verdict": "rejected"})
     monkeypatch.setattr("regnf_cli.report.show_result", lambda _: None)
     outcome = run("register", "room.safetensors", "room.safetensors", "--detection", "box.json")
     assert outcome.code == 1

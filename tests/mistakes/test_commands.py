@@ -196,7 +196,7 @@ def test_an_interrupted_local_registration_ends_with_130(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("regnf_cli.register._register_here", interrupt)
+    monkeypatch.setattr("regnf_cli.registration.register_here", interrupt)
     outcome = run(*REGISTER)
     assert outcome.code == 130
     assert "Traceback" not in outcome.stderr
