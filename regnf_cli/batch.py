@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import signal
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -132,7 +132,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
     box = OrientedBox.from_detection(detection)
     start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
     if pair.is_search:
-        _require_nothing_of_one_object(start, truth)
+        _require_nothing_of_one_object(request)
         library = [_candidate(one, options) for one in pair.objects]
         found = search_library(scene, box, library, options, request["seed"], clouds=False)
         ranking = ranking_document(found.ranking, {})
@@ -148,17 +148,14 @@ def _document(pair: FilePair) -> dict[str, Any]:
     return told
 
 
-def _require_nothing_of_one_object(start: object, truth: object) -> None:
+def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
     """Raises InvalidInputError, as a service refuses such a line."""
-    for name, given, reason in (
-        ("initial_transform", start, "INITIAL_TRANSFORM_UNSUPPORTED"),
-        ("ground_truth", truth, "INVALID_REQUEST"),
-    ):
-        if given is not None:
+    reasons = {"initial_transform": "INITIAL_TRANSFORM_UNSUPPORTED", "ground_truth": "INVALID_REQUEST"}
+    for name, reason in reasons.items():
+        if request.get(name) is not None:
             hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
-            raise InvalidInputError(
-                f"`{name}` applies to one object, not to several candidates", reason=reason, hint=hint
-            )
+            message = f"`{name}` applies to one object, not to several candidates"
+            raise InvalidInputError(message, reason=reason, hint=hint)
 
 
 @lru_cache(_FIELDS_OPEN)
@@ -253,7 +250,6 @@ def _show_failures(failures: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def _write(ended: Iterator[tuple[FilePair, dict[str, Any]]], results: ResultsFile, count: int) -> None:
-    """Append results as they come."""
     try:
         with progress() as bar:
             task = bar.add_task("registering", total=count)

@@ -45,9 +45,7 @@ class Finding:
 _COLORS = {"ok": "green", "warning": "yellow", "error": "bold red"}
 
 
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
-) -> None:
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False) -> None:
     """Look at libraries, GPU, Redis, storage, disk, memory, open files and the port, and say how to mend what is wrong.
 
     The service's settings are read from REGNF_* in the environment.

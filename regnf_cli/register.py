@@ -13,11 +13,11 @@ import typer
 
 import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.registration import Files, answer, check_box_by_header
+from regnf_cli.registration import Files, answer, check_box
 from regnf_cli.report import tell
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
-from regnf_core.field_files import library_files
+from regnf_core.field_files import library_files, stored_bounds
 from regnf_core.field_source import FieldSource
 from regnf_core.library_folder import LibraryFolder
 from regnf_core.options import Preset, RegistrationOptions
@@ -88,7 +88,7 @@ def register(
     thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
     if place.file.samefile(thing.file):
         tell(f"warning: scene and object are the same file, {scene}")
-    check_box_by_header(place.file, box, thing.file)
+    check_box(place.file, box, stored_bounds(place.file), stored_bounds(thing.file))
     client = cli.client_of(server, token, worker_timeout)
     answer(place, thing, request, Files(output, recording), client, None, cancel_on_interrupt, as_json)
 
@@ -148,7 +148,7 @@ def search(
     if server is None:
         require("engine")
     place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
-    check_box_by_header(place.file, box)
+    check_box(place.file, box, stored_bounds(place.file))
     objects: list[FieldSource] = []
     if server is None or library:
         for one in _objects_of(library, tag):

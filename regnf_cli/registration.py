@@ -15,14 +15,7 @@ import typer
 
 from regnf_cli.report import exit_code, reporting, show, tell
 from regnf_core.detections import Bounds, Detection, parse_detection, require_in_scene
-from regnf_core.errors import (
-    InvalidDetectionError,
-    InvalidInputError,
-    NoSurfaceError,
-    filled_folder,
-    require_writable,
-)
-from regnf_core.field_files import stored_bounds
+from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfaceError, filled_folder, require_writable
 from regnf_core.field_source import FieldSource
 from regnf_core.options import RegistrationOptions, RobustOptions
 
@@ -32,7 +25,6 @@ if TYPE_CHECKING:
     from regnf_core.fields.observation import SdfField
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import LibraryObject
-    from regnf_core.loading import LoadedField
 
 Objects = FieldSource | list[FieldSource]
 """One object to register, or several to search among."""
@@ -117,7 +109,8 @@ def register_here(scene: FieldSource, objects: Objects, request: dict[str, Any],
     with reporting("loading") as report:
         if isinstance(objects, list):
             import_smallest_first((scene, *objects))
-            opened = _open_scene(scene, detection)
+            opened = load_field(scene)
+            check_box(scene.named, detection, _bounds_of(opened.field))
             library, unusable = _modeled(objects, options.robust, partial(report, "library"))
             found = search_library(opened.field, box, library, options, seed, report, clouds=wanted)
             result, name = found.result, found.ranking[0].name
@@ -126,7 +119,8 @@ def register_here(scene: FieldSource, objects: Objects, request: dict[str, Any],
         else:
             import_smallest_first((scene, objects))
             obj = load_field(objects)
-            opened = _open_scene(scene, detection, obj.field)
+            opened = load_field(scene)
+            check_box(scene.named, detection, _bounds_of(opened.field), _bounds_of(obj.field))
             start, truth = request["initial_transform"], request["ground_truth"]
             warm = WarmStart(T_object_scene=Sim3.from_matrix(start) if start else None)
             said["truth"] = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
@@ -139,35 +133,21 @@ def register_here(scene: FieldSource, objects: Objects, request: dict[str, Any],
     return document
 
 
-def check_box_by_header(scene: Path, box: Detection, obj: Path | None = None) -> None:
-    """Refuse a box outside the scene before anything is opened; a checkpoint has no header that tells its bounds.
+def check_box(scene: Path, box: Detection, bounds: Bounds | None, obj: Bounds | None = None) -> None:
+    """Refuse a box outside the scene as soon as its bounds are known: a checkpoint has no header that tells them.
 
     Raises InvalidDetectionError naming the scene's file.
     """
-    bounds = stored_bounds(scene)
-    if bounds is not None:
-        _require_in(scene, box, bounds, None if obj is None else stored_bounds(obj))
-
-
-def _open_scene(source: FieldSource, box: Detection, obj: SdfField | None = None) -> LoadedField:
-    """The scene's field, refused as above by the bounds that only the imports of scene and object told."""
-    from regnf_core.loading import load_field
-
-    loaded = load_field(source)
-    _require_in(source.named, box, _bounds_of(loaded.field), None if obj is None else _bounds_of(obj))
-    return loaded
+    try:
+        if bounds is not None:
+            require_in_scene(box, bounds, obj)
+    except InvalidDetectionError as error:
+        raise InvalidDetectionError(f"{scene}: {error}", reason=error.reason, hint=error.hint) from error
 
 
 def _bounds_of(field: SdfField) -> Bounds:
     lower, upper = field.bounds.tolist()
     return lower, upper
-
-
-def _require_in(path: Path, box: Detection, scene: Bounds, obj: Bounds | None) -> None:
-    try:
-        require_in_scene(box, scene, obj)
-    except InvalidDetectionError as error:
-        raise InvalidDetectionError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
 
 
 def _field_of(source: FieldSource) -> SdfField:

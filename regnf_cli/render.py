@@ -30,8 +30,7 @@ ModeChoice = Annotated[
 Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 8 by default.")]
 Elevation = Annotated[float | None, typer.Option(help="Of the orbit above the horizon, degrees; 25 by default.")]
 Around = Annotated[
-    Path | None,
-    typer.Option(help="JSON: a box to orbit round; by default the first edit's, or the scene.", **cli.FILE),
+    Path | None, typer.Option(help="JSON: a box to orbit round; by default the first edit's, or the scene.", **cli.FILE)
 ]
 UpAxis = Annotated[str | None, typer.Option(help="The scene's vertical: x, y, z, -x, -y or -z; z by default.")]
 Outputs = Annotated[

@@ -59,11 +59,7 @@ def render_dataset(
     _check(layout, meshes, trajectory, instance, units_per_meter)
     check_target(output)
     options = RenderOptions(
-        trajectory=trajectory,
-        frames=frames,
-        size=(height, width),
-        sensor=DepthSensor() if noise else None,
-        seed=seed,
+        trajectory=trajectory, frames=frames, size=(height, width), sensor=DepthSensor() if noise else None, seed=seed
     )
     images = _rendered(source, meshes, instance, units_per_meter, options)
     write_dataset(images, output)

@@ -7,7 +7,8 @@ import inspect
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
 from functools import update_wrapper
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from types import MethodType
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, overload
 
 import httpx
 
@@ -19,9 +20,7 @@ from regnf_client.steps import ADDRESS, WORKER_TIMEOUT_S, Call, Connection, Down
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
-_Calls = TypeVar("_Calls")
 _Driver = TypeVar("_Driver")
-_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class SyncDriver:
@@ -110,57 +109,88 @@ class AsyncDriver:
             return answer
 
 
-class _Performing(Generic[_Calls, _Driver]):
+class _Performing(Generic[_Driver]):
     """What performs the flows of calls with a driver."""
 
-    def __init__(self, calls: _Calls, driver: _Driver) -> None:
+    def __init__(self, calls: Any, driver: _Driver) -> None:
         self._calls = calls
         self._driver = driver
 
 
-def _signed(function: _Function, flow: Callable[..., Flow[Any]]) -> _Function:
-    """The function with the name, the docstring and the signature of a flow, with what the flow returns."""
-    signature = inspect.signature(flow)
-    returned = str(signature.return_annotation).removeprefix("Flow[").removesuffix("]")
-    update_wrapper(function, flow)
-    function.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
-    return function
+class _Method(Generic[_P, _T]):
+    """A flow as a method of both clients, with its parameters and docstring: one returns what it returns, the other
+    something to be awaited."""
+
+    def __init__(self, flow: Callable[Concatenate[Any, _P], Flow[_T]]) -> None:
+        self._flow = flow
+        signature = inspect.signature(flow)
+        returned = str(signature.return_annotation).removeprefix("Flow[").removesuffix("]")
+        self.__signature__ = signature.replace(return_annotation=returned)
+        update_wrapper(self, flow)
+
+    @overload
+    def __get__(self, client: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, client: _Performing[SyncDriver], owner: type) -> Callable[_P, _T]: ...
+    @overload
+    def __get__(self, client: _Performing[AsyncDriver], owner: type) -> Callable[_P, Coroutine[Any, Any, _T]]: ...
+    def __get__(self, client: _Performing[Any] | None, owner: type) -> Any:
+        return self if client is None else MethodType(self, client)
+
+    def __call__(self, client: _Performing[Any], /, *args: _P.args, **kwargs: _P.kwargs) -> Any:
+        return client._driver.run(self._flow(client._calls, *args, **kwargs))
 
 
-def blocking(
-    method: Callable[Concatenate[_Calls, _P], Flow[_T]],
-) -> Callable[Concatenate[_Performing[_Calls, SyncDriver], _P], _T]:
-    """A method of a client: the flow, performed."""
-
-    def performed(self: _Performing[_Calls, SyncDriver], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return self._driver.run(method(self._calls, *args, **kwargs))
-
-    return _signed(performed, method)
+class _Library(_Performing[_Driver]):
+    add = _Method(LibraryCalls.add)
+    entries = _Method(LibraryCalls.entries)
+    get = _Method(LibraryCalls.get)
+    change = _Method(LibraryCalls.change)
+    remove = _Method(LibraryCalls.remove)
+    download = _Method(LibraryCalls.download)
 
 
-def awaited(
-    method: Callable[Concatenate[_Calls, _P], Flow[_T]],
-) -> Callable[Concatenate[_Performing[_Calls, AsyncDriver], _P], Coroutine[Any, Any, _T]]:
-    """The same, to be awaited."""
-
-    async def performed(self: _Performing[_Calls, AsyncDriver], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return await self._driver.run(method(self._calls, *args, **kwargs))
-
-    return _signed(performed, method)
-
-
-class Library(_Performing[LibraryCalls, SyncDriver]):
+class Library(_Library[SyncDriver]):
     """Objects by name. An ``Entry`` may be given wherever a field may."""
 
-    add = blocking(LibraryCalls.add)
-    entries = blocking(LibraryCalls.entries)
-    get = blocking(LibraryCalls.get)
-    change = blocking(LibraryCalls.change)
-    remove = blocking(LibraryCalls.remove)
-    download = blocking(LibraryCalls.download)
+
+class AsyncLibrary(_Library[AsyncDriver]):
+    """The same, to be awaited."""
 
 
-class Client(_Performing[Calls, SyncDriver]):
+class _Client(_Performing[_Driver]):
+    """What both clients have."""
+
+    def __init__(self, connection: Connection, driver: _Driver) -> None:
+        super().__init__(Calls(connection), driver)
+        self._connection = connection
+
+    @property
+    def address(self) -> str:
+        """Of the service."""
+        return self._connection.address.rstrip("/")
+
+    upload = _Method(Calls.upload)
+    field = _Method(Calls.field)
+    fields = _Method(Calls.fields)
+    delete_field = _Method(Calls.delete_field)
+    register = _Method(Calls.register)
+    submit = _Method(Calls.submit)
+    search = _Method(Calls.search)
+    register_batch = _Method(Calls.register_batch)
+    render = _Method(Calls.render)
+    job = _Method(Calls.job)
+    jobs = _Method(Calls.jobs)
+    wait = _Method(Calls.wait)
+    cancel = _Method(Calls.cancel)
+    result = _Method(Calls.result)
+    rendering = _Method(Calls.rendering)
+    artifact = _Method(Calls.artifact)
+    download = _Method(Calls.download)
+    save = _Method(Calls.save)
+
+
+class Client(_Client[SyncDriver]):
     """A regnf service.
 
     Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects. A
@@ -181,9 +211,9 @@ class Client(_Performing[Calls, SyncDriver]):
     ) -> None:
         """token: None takes that of the environment variable REGNF_API_TOKEN, if it is set. worker_timeout_s: how long
         to wait while the service has no worker; None: for ever. transport: of httpx, for proxies and tests."""
-        self._connection = Connection(address, token, retries, worker_timeout_s)
-        self._http = httpx.Client(transport=transport, **self._connection.http_options())
-        super().__init__(Calls(self._connection), SyncDriver(self._http))
+        connection = Connection(address, token, retries, worker_timeout_s)
+        self._http = httpx.Client(transport=transport, **connection.http_options())
+        super().__init__(connection, SyncDriver(self._http))
 
     def __enter__(self) -> Client:
         return self
@@ -196,33 +226,9 @@ class Client(_Performing[Calls, SyncDriver]):
         self._http.close()
 
     @property
-    def address(self) -> str:
-        """Of the service."""
-        return self._connection.address.rstrip("/")
-
-    @property
     def library(self) -> Library:
         """Objects by name, with tags."""
         return Library(LibraryCalls(self._connection), self._driver)
-
-    upload = blocking(Calls.upload)
-    field = blocking(Calls.field)
-    fields = blocking(Calls.fields)
-    delete_field = blocking(Calls.delete_field)
-    register = blocking(Calls.register)
-    submit = blocking(Calls.submit)
-    search = blocking(Calls.search)
-    register_batch = blocking(Calls.register_batch)
-    render = blocking(Calls.render)
-    job = blocking(Calls.job)
-    jobs = blocking(Calls.jobs)
-    wait = blocking(Calls.wait)
-    cancel = blocking(Calls.cancel)
-    result = blocking(Calls.result)
-    rendering = blocking(Calls.rendering)
-    artifact = blocking(Calls.artifact)
-    download = blocking(Calls.download)
-    save = blocking(Calls.save)
 
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
@@ -260,18 +266,7 @@ class Client(_Performing[Calls, SyncDriver]):
                 self._driver.sleep(wait_s)
 
 
-class AsyncLibrary(_Performing[LibraryCalls, AsyncDriver]):
-    """Objects by name. An ``Entry`` may be given wherever a field may."""
-
-    add = awaited(LibraryCalls.add)
-    entries = awaited(LibraryCalls.entries)
-    get = awaited(LibraryCalls.get)
-    change = awaited(LibraryCalls.change)
-    remove = awaited(LibraryCalls.remove)
-    download = awaited(LibraryCalls.download)
-
-
-class AsyncClient(_Performing[Calls, AsyncDriver]):
+class AsyncClient(_Client[AsyncDriver]):
     """The same as ``Client``, to be awaited. Files are read and hashed in threads."""
 
     def __init__(
@@ -283,9 +278,9 @@ class AsyncClient(_Performing[Calls, AsyncDriver]):
         worker_timeout_s: float | None = WORKER_TIMEOUT_S,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        self._connection = Connection(address, token, retries, worker_timeout_s)
-        self._http = httpx.AsyncClient(transport=transport, **self._connection.http_options())
-        super().__init__(Calls(self._connection), AsyncDriver(self._http))
+        connection = Connection(address, token, retries, worker_timeout_s)
+        self._http = httpx.AsyncClient(transport=transport, **connection.http_options())
+        super().__init__(connection, AsyncDriver(self._http))
 
     async def __aenter__(self) -> AsyncClient:
         return self
@@ -298,33 +293,9 @@ class AsyncClient(_Performing[Calls, AsyncDriver]):
         await self._http.aclose()
 
     @property
-    def address(self) -> str:
-        """Of the service."""
-        return self._connection.address.rstrip("/")
-
-    @property
     def library(self) -> AsyncLibrary:
         """Objects by name, with tags."""
         return AsyncLibrary(LibraryCalls(self._connection), self._driver)
-
-    upload = awaited(Calls.upload)
-    field = awaited(Calls.field)
-    fields = awaited(Calls.fields)
-    delete_field = awaited(Calls.delete_field)
-    register = awaited(Calls.register)
-    submit = awaited(Calls.submit)
-    search = awaited(Calls.search)
-    register_batch = awaited(Calls.register_batch)
-    render = awaited(Calls.render)
-    job = awaited(Calls.job)
-    jobs = awaited(Calls.jobs)
-    wait = awaited(Calls.wait)
-    cancel = awaited(Calls.cancel)
-    result = awaited(Calls.result)
-    rendering = awaited(Calls.rendering)
-    artifact = awaited(Calls.artifact)
-    download = awaited(Calls.download)
-    save = awaited(Calls.save)
 
     async def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None

@@ -58,24 +58,6 @@ def test_what_is_read_is_not_overwritten(run: Run, tmp_path: Path) -> None:
     assert mesh.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("output", "reason"),
-    [
-        ("chair.stl", "INVALID_OPTIONS"),
-        ("absent/chair.ply", "INVALID_OPTIONS"),
-        ("chair.safetensors", "FORMAT_NOT_RECOGNIZED"),
-        ("chair.ply", "FORMAT_NOT_RECOGNIZED"),
-    ],
-)
-@pytest.mark.usefixtures("cache")
-def test_refusals(output: str, reason: str, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "field.ckpt").write_bytes(bytes(8) + b"{" if reason == "INVALID_OPTIONS" else b"\x07" * 4000)
-    outcome = run("convert", tmp_path / "field.ckpt", tmp_path / output)
-    assert outcome.code == 2
-    assert outcome.stderr.startswith(f"{reason} ")
-    assert {path.name for path in tmp_path.iterdir()} <= {"field.ckpt", "cache"}
-
-
 @pytest.mark.usefixtures("cache")
 def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_RADIUS).apply_translation(BALL_CENTER)
@@ -100,11 +82,11 @@ def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) 
 
 @pytest.mark.usefixtures("cache")
 def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Path) -> None:
-    trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(tmp_path / "ball.glb")
+    trimesh.creation.icosphere(subdivisions=1, radius=0.5).export(tmp_path / "ball.glb")
     # Half a turn about x: a camera at (0, 0, 1.5) that looks down on the ball.
     poses = [f"{index} {0.1 * index} 0 1.5 1 0 0 0" for index in range(3)]
     (tmp_path / "poses.txt").write_text("\n".join(poses))
-    said = ("--intrinsics", "100,100,64,48,128,96")
+    said = ("--intrinsics", "50,50,32,24,64,48")
     safe = tmp_path / "ball.safetensors"
     outcome = run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said)
     assert outcome.code == 0, outcome.stderr
@@ -113,7 +95,7 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
     assert told not in run("inspect", DATA / "armchair.safetensors").stdout
     observation = observation_of(open_field(safe))
     assert observation is not None
-    assert observation.at(torch.tensor([[0.0, 0.0, 0.499], [0.0, 0.0, -0.499], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]
+    assert observation.at(torch.tensor([[0.0, 0.0, 0.49], [0.0, 0.0, -0.49], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]
     refusals = {
         "CAMERAS_OF_ANOTHER_FRAME": ("--cameras", tmp_path / "poses.txt", *said, "--camera-axes", "opengl"),
         "CAMERAS_INTRINSICS_MISSING": ("--cameras", tmp_path / "poses.txt"),
@@ -123,5 +105,4 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
         outcome = run("convert", tmp_path / "ball.glb", safe, *options)
         assert outcome.code != 0
         assert reason in outcome.stderr
-    turned = run("convert", tmp_path / "ball.glb", safe, *refusals["CAMERAS_OF_ANOTHER_FRAME"])
-    assert "say --camera-axes opencv" in " ".join(turned.stderr.split())
+        assert "ANOTHER_FRAME" not in reason or "say --camera-axes opencv" in " ".join(outcome.stderr.split())

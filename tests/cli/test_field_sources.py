@@ -224,6 +224,7 @@ def test_settings_that_are_not_there_are_refused(run: Run, run_folder: Path) -> 
     assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "FILE_NOT_FOUND")
 
 
+@pytest.mark.long
 def test_a_real_run_is_converted_from_its_folder(run: Run, tmp_path: Path) -> None:
     outcome = run("convert", dev_data("formats", "neus", "exp"), tmp_path / "field.safetensors")
     assert outcome.code == 0, outcome.stderr

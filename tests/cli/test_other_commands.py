@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from pathlib import Path
 
 import pytest
@@ -13,8 +13,6 @@ from regnf_core import __version__
 from regnf_state.settings import Settings
 from tests.cli.conftest import DATA, Run
 
-TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-
 
 def test_version_and_help(run: Run) -> None:
     assert run("--version").stdout.strip() == __version__
@@ -24,41 +22,10 @@ def test_version_and_help(run: Run) -> None:
 
 
 def test_inspect_shows_a_field(run: Run) -> None:
-    outcome = run("inspect", DATA / "armchair.safetensors", "--json")
+    outcome = run("inspect", DATA / "armchair.safetensors")
     assert outcome.code == 0, outcome.stderr
-    assert json.loads(outcome.stdout)["parameters"] > 10_000
-    assert "plausibility:" in run("inspect", DATA / "armchair.safetensors").stdout
-
-
-@pytest.mark.parametrize(("content", "reason"), [(b"", "FILE_EMPTY"), (b"\x07" * 4000, "FORMAT_NOT_RECOGNIZED")])
-def test_inspect_refuses_what_is_no_field(content: bytes, reason: str, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "field.ckpt").write_bytes(content)
-    outcome = run("inspect", tmp_path / "field.ckpt")
-    assert outcome.code == 2
-    assert outcome.stderr.startswith(f"{reason} ")
-    assert "Traceback" not in outcome.stderr
-
-
-@pytest.mark.parametrize(
-    ("mesh", "output", "more", "reason"),
-    [
-        (TRIANGLE, "field.txt", [], "INVALID_OPTIONS"),
-        (TRIANGLE, "absent/field.safetensors", [], "INVALID_OPTIONS"),
-        (TRIANGLE, "field.safetensors", ["--extent", "0"], "INVALID_OPTIONS"),
-        (TRIANGLE, "field.safetensors", ["--extent", "-1"], "INVALID_OPTIONS"),
-        (TRIANGLE, "field.safetensors", ["--extent", "nan"], "INVALID_OPTIONS"),
-        (TRIANGLE, "field.safetensors", ["--label", "x" * 201], "INVALID_OPTIONS"),
-        ("f 1 2 3\n", "field.safetensors", [], "MESH_INVALID"),
-        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "field.safetensors", [], "MESH_INVALID"),
-        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "field.safetensors", ["--extent", "1"], "MESH_INVALID"),
-    ],
-)
-def test_fit_refuses(mesh: str, output: str, more: list[str], reason: str, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "mesh.obj").write_text(mesh)
-    outcome = run("fit", tmp_path / "mesh.obj", tmp_path / output, *more)
-    assert outcome.code == 2
-    assert f"{reason} " in outcome.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["mesh.obj"]
+    assert "plausibility:" in outcome.stdout
+    assert re.search(r"^parameters +\d{5,}$", outcome.stdout, re.MULTILINE)
 
 
 @pytest.mark.parametrize("command", ["serve", "worker"])

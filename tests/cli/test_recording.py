@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +23,6 @@ def test_the_recording_is_the_only_file(run: Run, demo: list[object], tmp_path: 
     np.testing.assert_allclose(matrix_of(rows["/scene/object"][-1]), expected, atol=2e-6)
     assert "/scene/detection" in rows
     assert document["object"] in rows["/verdict"][0]["TextDocument:text"][0]
-
-
-def test_the_extra_is_asked_for_before_the_work(
-    run: Run, demo: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.setattr("regnf_core.loading.load_field", lambda *_: pytest.fail("the work has begun"))
-    outcome = run(*demo, "--recording", tmp_path / "chair.rrd")
-    assert outcome.code == 3
-    assert outcome.stderr.strip() == "EXTRA_MISSING not installed: rerun; pip install 'regnf[rerun]'"
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from pathlib import Path
 
 import pytest
@@ -92,28 +91,6 @@ def test_artifacts_stay_in_the_folder(run: Run, demo: list[object], serve: Serve
     assert (folder / "outside.txt").read_text() == "content"
 
 
-def test_a_dead_port_is_unavailable(run: Run, demo: list[object]) -> None:
-    with socket.socket() as bound:  # bound, but nobody listens
-        bound.bind(("127.0.0.1", 0))
-        outcome = run(*demo, "--server", f"http://127.0.0.1:{bound.getsockname()[1]}")
-    assert outcome.code == 3
-    assert "SERVICE_UNAVAILABLE " in outcome.stderr
-
-
-def test_a_service_that_cannot_now_is_unavailable(run: Run, demo: list[object], serve: Serve) -> None:
-    problem = json.dumps({"reason": "QUEUE_UNAVAILABLE", "detail": "Redis does not answer"})
-    outcome = run(*demo, "--server", serve(lambda method, path: (503, problem)))
-    assert outcome.code == 3
-    assert "QUEUE_UNAVAILABLE Redis does not answer" in outcome.stderr
-
-
-def test_a_refusal_is_bad_input_with_the_services_reason(run: Run, demo: list[object], serve: Serve) -> None:
-    problem = json.dumps({"reason": "UNAUTHENTICATED", "title": "Who are you?"})
-    outcome = run(*demo, "--server", serve(lambda method, path: (401, problem)))
-    assert outcome.code == 2
-    assert "UNAUTHENTICATED Who are you?" in outcome.stderr
-
-
 def test_a_failed_job_tells_its_own_reason(run: Run, demo: list[object], serve: Serve) -> None:
     own = {"reason": "NO_SURFACE_IN_DETECTION", "status": 422, "detail": "12 surface points were found"}
     whole = service()
@@ -128,17 +105,3 @@ def test_a_failed_job_tells_its_own_reason(run: Run, demo: list[object], serve: 
     outcome = run(*demo, "--server", serve(answers))
     assert outcome.code == 2
     assert "NO_SURFACE_IN_DETECTION 12 surface points were found" in outcome.stderr
-
-
-@pytest.mark.parametrize("answer", [(200, "<html>hello</html>"), (200, "[]"), (404, "<html>"), (418, "[1]")])
-def test_what_is_no_regnf_service(answer: Answer, run: Run, demo: list[object], serve: Serve) -> None:
-    outcome = run(*demo, "--server", serve(lambda method, path: answer))
-    assert outcome.code == 2
-    assert f"SERVICE_ERROR HTTP status {answer[0]}" in outcome.stderr
-
-
-@pytest.mark.parametrize("address", ["", "here", "127.0.0.1:8080", "http://", "http://[::1", "ftp://127.0.0.1"])
-def test_what_is_no_address(address: str, run: Run, demo: list[object]) -> None:
-    outcome = run(*demo, "--server", address)
-    assert outcome.code == 2
-    assert "INVALID_ADDRESS " in outcome.stderr

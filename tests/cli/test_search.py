@@ -17,7 +17,7 @@ from regnf_core.field_files import library_files
 from regnf_core.field_source import find_source
 from regnf_core.object_models import object_model
 from regnf_core.options import RobustOptions
-from tests.cli.conftest import DATA, Answer, Answers, Run, Serve, field, service
+from tests.cli.conftest import DATA, Answers, Run, Serve, service
 
 CHAIRS = [DATA / "dining-chair.safetensors", DATA / "armchair.safetensors"]
 DEMO: list[object] = ["search", DATA / "mix-room.safetensors", *CHAIRS, "--detection", DATA / "detection.json"]
@@ -125,38 +125,22 @@ def test_a_ranking_is_printed_as_far_as_asked(capfd: pytest.CaptureFixture[str])
     ]
 
 
-def searching(state_of: dict[str, str]) -> Answers:
-    """A service whose search puts the armchair first; fields are in these states, by name."""
+def searching() -> Answers:
+    """A service whose search puts the armchair first."""
     shas = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in CHAIRS}
     ranking = [
         candidate(shas["armchair"], "refined", 0.02, "ambiguous"),
         candidate(shas["dining-chair"], "coarse", 0.4),
     ]
-    found = service(verdict="ambiguous", object=shas["armchair"], candidates=ranking, artifacts=[])
-
-    def answers(method: str, path: str) -> Answer:
-        if path == "/fields":  # what was rejected is sent again
-            return 201, field(shas["armchair"], state="validating")
-        name = next((name for name, sha in shas.items() if sha in path), "")
-        if name in state_of:
-            return 200, field(path, state=state_of[name], error={"reason": "TENSOR_NOT_FINITE", "detail": "not finite"})
-        return found(method, path)
-
-    return answers
+    return service(verdict="ambiguous", object=shas["armchair"], candidates=ranking, artifacts=[])
 
 
 def test_a_search_on_a_server_names_the_files(run: Run, serve: Serve) -> None:
-    outcome = run(*DEMO, "--server", serve(searching({})), "--json")
+    outcome = run(*DEMO, "--server", serve(searching()), "--json")
     assert outcome.code == 4, outcome.stderr
     document = json.loads(outcome.stdout)
     assert document["object"] == str(CHAIRS[1])
     assert [one["object"] for one in document["candidates"]] == [str(CHAIRS[1]), str(CHAIRS[0])]
-
-
-def test_a_field_that_the_server_rejects_is_named(run: Run, serve: Serve) -> None:
-    outcome = run(*DEMO, "--server", serve(searching({"armchair": "rejected"})))
-    assert outcome.code == 2
-    assert f"TENSOR_NOT_FINITE {CHAIRS[1]}: not finite" in outcome.stderr
 
 
 def test_a_library_at_the_server_is_searched_by_its_tags(run: Run, serve: Serve) -> None:

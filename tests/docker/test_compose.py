@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -14,9 +13,6 @@ import yaml
 from regnf_state.settings import Settings
 from tests.docker.files import COMPOSE, DOCKERFILES, ROOT, compose, services
 
-every_service = pytest.mark.parametrize(
-    "name", ["redis", "api", "proxy", "worker", "worker-gpu", "prometheus", "grafana"]
-)
 # Read by the compose file itself, not by the program.
 COMPOSE_ONLY = {"REGNF_PUBLISH", "REGNF_TLS_DIR"}
 
@@ -71,19 +67,16 @@ def test_what_watches_finds_what_it_watches() -> None:
             assert not source_path.startswith("..") or (ROOT / "docker" / source_path).exists()
 
 
-@every_service
-def test_is_hardened(name: str) -> None:
-    service = services()[name]
-    assert service["cap_drop"] == ["ALL"]
-    assert service["security_opt"] == ["no-new-privileges:true"]
-    assert service["read_only"] is True
-    assert any(entry.startswith("/tmp") for entry in service["tmpfs"])
-    assert service["restart"] == "unless-stopped"
-    assert service["healthcheck"]["test"]
-    limits = service["deploy"]["resources"]["limits"]
-    assert {"memory", "pids"} <= set(limits)
-    assert "privileged" not in service
-    assert "cap_add" not in service
+def test_every_service_is_hardened() -> None:
+    for name, service in services().items():
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert service["read_only"] is True, name
+        assert any(entry.startswith("/tmp") for entry in service["tmpfs"]), name
+        assert service["restart"] == "unless-stopped", name
+        assert service["healthcheck"]["test"], name
+        assert {"memory", "pids"} <= set(service["deploy"]["resources"]["limits"]), name
+        assert not {"privileged", "cap_add"} & set(service), name
 
 
 def test_redis_forgets_nothing() -> None:
@@ -101,14 +94,17 @@ def test_redis_forgets_nothing() -> None:
     assert int(memory[1]) * 2 <= int(redis["deploy"]["resources"]["limits"]["memory"].removesuffix("M"))
 
 
-@pytest.mark.parametrize("name", ["api", "worker", "worker-gpu"])
-def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
-    service = services()[name]
-    assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
-    assert service["volumes"] == ["state:/var/lib/regnf", "redis:/run/redis:ro"]
-    assert service["environment"]["REGNF_REDIS_PASSWORD"] == "@/run/redis/password"
-    assert service["environment"]["REGNF_STATE_DIR"] == "/var/lib/regnf"
-    assert service["environment"]["REGNF_REDIS_URL"] == "redis://redis:6379/0"
+def test_programs_wait_for_redis_share_the_state_and_are_built_here() -> None:
+    for name in ("api", "worker", "worker-gpu"):
+        service = services()[name]
+        assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
+        assert service["volumes"] == ["state:/var/lib/regnf", "redis:/run/redis:ro"]
+        assert service["environment"]["REGNF_REDIS_PASSWORD"] == "@/run/redis/password"
+        assert service["environment"]["REGNF_STATE_DIR"] == "/var/lib/regnf"
+        assert service["environment"]["REGNF_REDIS_URL"] == "redis://redis:6379/0"
+        context = (COMPOSE.parent / service["build"]["context"]).resolve()
+        assert context == ROOT
+        assert (context / service["build"]["dockerfile"]).is_file()
 
 
 def test_volumes_and_networks_are_declared() -> None:
@@ -157,14 +153,6 @@ def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch)
     assert settings.api_tokens == frozenset()
     assert settings.allow_unauthenticated is False
     assert settings.threads == 2
-
-
-@pytest.mark.parametrize("name", ["api", "worker", "worker-gpu"])
-def test_is_built_from_a_dockerfile_that_exists(name: str) -> None:
-    build: dict[str, Any] = services()[name]["build"]
-    context = (COMPOSE.parent / build["context"]).resolve()
-    assert context == ROOT
-    assert (context / build["dockerfile"]).is_file()
 
 
 def test_the_worker_can_hold_an_import() -> None:

@@ -17,10 +17,6 @@ COMMANDS = documented_commands(ROOT)
 every_command = pytest.mark.parametrize("command", COMMANDS, ids=lambda command: f"{command.source}: {command.text}")
 
 
-def rendered(command: ComposeCommand) -> dict[str, Service]:
-    return render(ROOT / command.file, command.variables, command.profiles)
-
-
 def settings_of(service: Service, monkeypatch: pytest.MonkeyPatch) -> Settings:
     """What the program in the container reads: its environment, and nothing of this process'."""
     for name in [name for name in os.environ if name.startswith("REGNF_")]:
@@ -37,27 +33,18 @@ def test_the_documentation_prints_commands() -> None:
 
 
 @every_command
-def test_the_front_end_starts(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = settings_of(rendered(command)["api"], monkeypatch)
-    check_access(settings)
-    assert settings.redis_url == "redis://redis:6379/0"
-
-
-@every_command
-def test_a_worker_starts(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
-    services = rendered(command)
+def test_what_a_command_starts_has_what_it_needs(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    services = render(ROOT / command.file, command.variables, command.profiles)
     workers = [name for name in services if name.startswith("worker")]
     assert workers
     assert set(command.scale) <= set(services)
-    for name in workers:
+    for name in ("api", *workers):
         settings = settings_of(services[name], monkeypatch)
         assert settings.redis_url == "redis://redis:6379/0"
-        assert not settings.api_tokens
-
-
-@every_command
-def test_grafana_is_given_a_password(command: ComposeCommand) -> None:
-    services = rendered(command)
+        if name == "api":
+            check_access(settings)
+        else:
+            assert not settings.api_tokens
     assert ("grafana" in services) == ("observability" in command.profiles)
     if "grafana" in services:
         assert services["grafana"]["environment"]["GF_SECURITY_ADMIN_PASSWORD"]

@@ -28,33 +28,18 @@ def health() -> ModuleType:
     return module
 
 
-def worker_of(redis: Redis, hostname: str) -> Any:
-    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{hostname}-1")
-    worker.hostname = hostname
-    worker.register_birth()
-    return worker
-
-
-def test_a_registered_worker_is_alive(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "here")
-    assert health.is_alive(redis, "here")
-
-
-def test_another_hosts_worker_does_not_count(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "elsewhere")
-    assert not health.is_alive(redis, "here")
-
-
-def test_a_worker_that_said_goodbye_is_not_alive(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "here").register_death()
-    assert not health.is_alive(redis, "here")
-
-
-def test_a_worker_that_stopped_reporting_is_not_alive(health: ModuleType, redis: Redis) -> None:
-    worker = worker_of(redis, "here")
-    assert redis.ttl(worker.key) > 0  # the registration runs out by itself ...
-    redis.delete(worker.key)  # ... as it has now
-    assert not health.is_alive(redis, "here")
+def test_a_worker_of_this_host_that_reports_is_alive(health: ModuleType, redis: Redis) -> None:
+    """Another host's does not count, nor one that said goodbye, or whose registration has run out."""
+    workers = {}
+    for host in ("here", "gone", "silent"):
+        workers[host] = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{host}-1")
+        workers[host].hostname = host
+        workers[host].register_birth()
+    assert [health.is_alive(redis, host) for host in ("here", "gone", "silent", "elsewhere")] == [True] * 3 + [False]
+    workers["gone"].register_death()
+    assert redis.ttl(workers["silent"].key) > 0
+    redis.delete(workers["silent"].key)
+    assert [health.is_alive(redis, host) for host in ("here", "gone", "silent")] == [True, False, False]
 
 
 @pytest.mark.parametrize(

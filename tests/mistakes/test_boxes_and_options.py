@@ -70,6 +70,7 @@ def test_wrong_options(case: Case, run: Run, folder: Path) -> None:
     outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "box.json", "--options", "o.json")
     assert outcome.code == case.code, outcome.stderr
     assert outcome.stderr.startswith(case.reason)
+    assert outcome.stderr.count("\n") == 2  # the message and the hint, however narrow the terminal
     case.check(outcome.stderr)
 
 

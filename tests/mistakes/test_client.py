@@ -111,7 +111,8 @@ def test_a_service_that_is_another() -> None:
     case = Case(
         "", "SERVICE_ERROR", 0, "HTTP status 200 from http://service/jobs/j", "no regnf service", "Check address"
     )
-    assert_refused(case, lambda: pretended(lambda _: httpx.Response(200, text="<html>")).job("j"))
+    for text in ("<html>", "[]"):
+        assert_refused(case, lambda text=text: pretended(lambda _: httpx.Response(200, text=text)).job("j"))  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("token", [None, "the-secret-of-eve"])
