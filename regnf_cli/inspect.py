@@ -44,7 +44,12 @@ def inspect(
     A file that may be one of several functions is refused with what to say for each; `--candidates` draws them.
     """
     require("engine")
-    _check(picture, candidates)
+    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
+        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
+        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
+    if candidates is not None and not candidates.parent.is_dir():
+        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
+        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
     from regnf_core.importing.gate.gate import import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
 
@@ -52,24 +57,16 @@ def inspect(
     drawn = picture is not None or candidates is not None
     with tempfile.TemporaryDirectory() as folder:
         with _asked(candidates), source.naming(), source.packed_settings() as settings:
-            made = import_field(source.file, Path(folder), description, None, drawn, settings)
-            report = made.to_dict()
+            report = import_field(source.file, Path(folder), description, None, drawn, settings).to_dict()
         if picture is not None:
-            _keep(Path(folder) / PICTURE_NAME, picture)
+            made = Path(folder) / PICTURE_NAME
+            if not made.exists():
+                raise InvalidInputError("no picture could be made: the field is too slow for it", reason="NO_PICTURE")
+            shutil.copyfile(made, picture)
     if as_json:
         out.print_json(json.dumps(report))
     else:
         _show(report)
-
-
-def _check(picture: Path | None, candidates: Path | None) -> None:
-    """Refuse before the work what would fail after it."""
-    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
-        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
-        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
-    if candidates is not None and not candidates.parent.is_dir():
-        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
-        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
 
 
 @contextmanager
@@ -85,12 +82,6 @@ def _asked(folder: Path | None) -> Iterator[None]:
                         (work / f"{number}.png").write_bytes(one.picture)
                         tell(f"wrote {folder / f'{number}.png'}")
         raise
-
-
-def _keep(made: Path, picture: Path) -> None:
-    if not made.exists():
-        raise InvalidInputError("no picture could be made: the field is too slow for it", reason="NO_PICTURE")
-    shutil.copyfile(made, picture)
 
 
 def _show(values: dict[str, Any], indent: int = 0) -> None:

@@ -59,13 +59,13 @@ class Shelf:
     def __init__(self, folder: LibraryFolder, client: Client | None) -> None:
         self._folder = folder
         self._client = client
+        self._kept = folder if client is None else client.library
 
     def entries(self, tag: str | None = None, part: str | None = None) -> list[Shown]:
-        kept = self._folder if self._client is None else self._client.library
-        return [self._shown(one) for one in kept.entries(tag, part)]
+        return [self._shown(one) for one in self._kept.entries(tag, part)]
 
     def get(self, name: str) -> Shown:
-        return self._shown((self._folder if self._client is None else self._client.library).get(name))
+        return self._shown(self._kept.get(name))
 
     def add(self, source: FieldSource, notes: EntryNotes) -> Shown:
         if self._client is None:
@@ -80,7 +80,7 @@ class Shelf:
         return self._shown(self._client.library.change(name, **notes.to_dict()))
 
     def remove(self, name: str) -> None:
-        (self._folder if self._client is None else self._client.library).remove(name)
+        self._kept.remove(name)
 
     def file(self, entry: Shown, folder: Path) -> Path:
         """The entry's safe field: where it lies; of a service, written into ``folder``."""

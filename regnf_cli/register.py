@@ -94,9 +94,8 @@ def register(
 
 
 def _request(box: Detection, options: dict[str, Any], seed: int) -> dict[str, Any]:
-    return {
-        "detection": box.canonical(), "options": options, "seed": seed, "initial_transform": None, "ground_truth": None,
-    }  # fmt: skip
+    asked = {"detection": box.canonical(), "options": options, "seed": seed}
+    return asked | {"initial_transform": None, "ground_truth": None}
 
 
 # The objects of a search: entries of libraries by their names, and fields by their files.

@@ -117,11 +117,17 @@ def show_result(document: dict[str, Any]) -> None:
         _line("probability", f"{100 * probability:.1f} % that {meant} is right")
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
-    _show_warnings(document.get("fields") or {})
+    for name in ("scene", "object"):
+        for warning in ((document.get("fields") or {}).get(name) or {}).get("warnings") or ():
+            _line("warning", f"{name}: {warning}")
     show_pose(document)
     if symmetry := document.get("symmetry"):
         _line("symmetry", symmetry_in_words(symmetry))
-    _show_alternatives(document.get("alternatives") or [])
+    if alternatives := document.get("alternatives"):
+        table = Table("", "score", "relation to the result", title="alternatives", title_justify="left", box=None)
+        for number, other in enumerate(alternatives, 1):
+            table.add_row(str(number), f"{other['score']:.4f}", escape(other["relation"]))
+        out.print(table)
     for name, value in (document.get("metrics") or {}).items():
         _line(f"{name:<28}", f"{value:.6g}" if isinstance(value, float) else str(value))
 
@@ -134,17 +140,14 @@ def show_pose(document: dict[str, Any]) -> None:
         out.print("   " + " ".join(f"{value: .6f}" for value in row))
     sigmas = document.get("uncertainty") or {}
     if (center := document.get("center_scene")) is not None:
-        _line("center", f"{' '.join(f'{value:.4f}' for value in center)} in the scene{_give_or_take(sigmas)}")
+        sure = f", ± {_numbers(sigmas['center_scene'])} scene units" if sigmas else ""
+        _line("center", f"{' '.join(f'{value:.4f}' for value in center)} in the scene{sure}")
     deviation = sigmas.get("scale_percent")
     give_or_take = "" if deviation is None else f", ± {deviation:.2g} %"
     _line("scale", f"{1.0 / transform['scale']:.6f} object units for each scene unit{give_or_take}")
     if sigmas:
         _line("rotation", f"± {_numbers(sigmas['rotation_deg'])} degrees about the object's x, y, z")
         _line("", "± is one standard deviation")
-
-
-def _give_or_take(sigmas: dict[str, Any]) -> str:
-    return f", ± {_numbers(sigmas['center_scene'])} scene units" if sigmas else ""
 
 
 def show_ranking(document: dict[str, Any], top: int) -> None:
@@ -177,22 +180,6 @@ def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     if symmetry["continuous"]:
         return f"any rotation{about}" + (", and upside down" if order > 1 else "")
     return "none found" if order == 1 else f"{order} rotations{about} look the same, the identity included"
-
-
-def _show_warnings(fields: dict[str, Any]) -> None:
-    """What the imports of scene and object have warned of."""
-    for name in ("scene", "object"):
-        for warning in (fields.get(name) or {}).get("warnings") or ():
-            _line("warning", f"{name}: {warning}")
-
-
-def _show_alternatives(alternatives: list[dict[str, Any]]) -> None:
-    if not alternatives:
-        return
-    table = Table("", "score", "relation to the result", title="alternatives", title_justify="left", box=None)
-    for number, other in enumerate(alternatives, 1):
-        table.add_row(str(number), f"{other['score']:.4f}", escape(other["relation"]))
-    out.print(table)
 
 
 def _line(name: str, value: str) -> None:

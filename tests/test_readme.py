@@ -28,8 +28,12 @@ def test_local_links_lead_somewhere(document: Path) -> None:
     assert not missing
 
 
-def test_readme_is_short() -> None:
+def test_the_readme_is_short_and_its_targets_exist() -> None:
     assert len(README.splitlines()) <= 120
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    named = set(re.findall(r"make (\w+)", README))
+    assert "demo" in named
+    assert named <= set(re.findall(r"^(\w+):", makefile, flags=re.M))
 
 
 def test_commands_named_in_the_readme_exist(
@@ -42,13 +46,6 @@ def test_commands_named_in_the_readme_exist(
         monkeypatch.setattr(sys, "argv", ["regnf", name, "--help"])
         assert command() == 0
         assert "Example" in capsys.readouterr().out or name in ("serve", "worker")
-
-
-def test_make_targets_named_in_the_readme_exist() -> None:
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    named = set(re.findall(r"make (\w+)", README))
-    assert "demo" in named
-    assert named <= set(re.findall(r"^(\w+):", makefile, flags=re.M))
 
 
 def test_python_of_the_readme_runs() -> None:

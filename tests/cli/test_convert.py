@@ -90,9 +90,7 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
     safe = tmp_path / "ball.safetensors"
     outcome = run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said)
     assert outcome.code == 0, outcome.stderr
-    told = "records which parts were observed"
-    assert told in run("inspect", safe).stdout
-    assert told not in run("inspect", DATA / "armchair.safetensors").stdout
+    assert "records which parts were observed" in run("inspect", safe).stdout
     observation = observation_of(open_field(safe))
     assert observation is not None
     assert observation.at(torch.tensor([[0.0, 0.0, 0.49], [0.0, 0.0, -0.49], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]

@@ -84,14 +84,11 @@ def test_a_port_that_is_taken() -> None:
     assert "--port" in str(found.hint)
 
 
-def test_a_storage_that_cannot_be_one(tmp_path: Path) -> None:
+def test_too_little_of_something_and_a_storage_that_cannot_be_one(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     found = list(doctor.check_service(Settings(state_dir=tmp_path / "file" / "state")))[1]
     assert (found.subject, found.state) == ("storage", "error")
     assert "REGNF_STATE_DIR" in str(found.hint)
-
-
-def test_too_little_of_something(tmp_path: Path) -> None:
     meminfo = tmp_path / "meminfo"
     for kib, state in ((500_000, "error"), (2_000_000, "warning"), (9_000_000, "ok")):
         meminfo.write_text(f"MemTotal: 1 kB\nMemAvailable: {kib} kB\n")
@@ -99,10 +96,14 @@ def test_too_little_of_something(tmp_path: Path) -> None:
     assert [doctor._files(limit).state for limit in (20, 256, 65536)] == ["error", "warning", "ok"]
 
 
-def test_versions_are_compared_by_their_numbers() -> None:
+def test_versions_and_missing_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor._fault("numpy", ">=1.26") is None
     assert "expected <1.0" in str(doctor._fault("numpy", "<1.0"))
     assert doctor._fault("no-such-package", "") == "no-such-package not installed"
+    monkeypatch.setattr(doctor, "_requirements", lambda extra: [(f"no-{extra}", ">=1")])
+    found = {extra: doctor._extra(extra) for extra in ("rerun", "embedded")}
+    assert {extra: one.state for extra, one in found.items()} == {"rerun": "ok", "embedded": "warning"}
+    assert "pip install 'regnf[rerun]'" in found["rerun"].found
 
 
 def test_a_library_that_does_not_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,10 +111,3 @@ def test_a_library_that_does_not_load(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     found = doctor._load("broken")
     assert (found.state, found.hint) == ("error", "apt-get install libgl1")
-
-
-def test_an_extra_that_one_option_needs_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_requirements", lambda extra: [(f"no-{extra}", ">=1")])
-    found = {extra: doctor._extra(extra) for extra in ("rerun", "embedded")}
-    assert {extra: one.state for extra, one in found.items()} == {"rerun": "ok", "embedded": "warning"}
-    assert "pip install 'regnf[rerun]'" in found["rerun"].found

@@ -104,16 +104,13 @@ def test_symmetries_in_words(symmetry: dict[str, object], said: str) -> None:
     assert symmetry_in_words(symmetry).startswith(said)
 
 
-def test_a_result_is_a_start_for_the_next(run: Run, exact: list[object], tmp_path: Path) -> None:
+def test_a_given_start(run: Run, exact: list[object], tmp_path: Path) -> None:
     near = chair_pose().matrix()
     near[0, 3] += 0.02
     (tmp_path / "start.json").write_text(json.dumps({"T_object_scene": {"matrix": near.tolist()}}))
     outcome = run(*exact, "--json", "--initial-transform", tmp_path / "start.json")
     assert outcome.code == 0, outcome.stderr
     assert json.loads(outcome.stdout)["metrics"]["rotation_error_rad"] < 0.01
-
-
-def test_the_published_method_starts_from_nothing_given(run: Run, exact: list[object], tmp_path: Path) -> None:
     (tmp_path / "start.json").write_text(json.dumps(np.eye(4).tolist()))
     outcome = run(*exact, "--preset", "paper", "--initial-transform", tmp_path / "start.json")
     assert outcome.code == 2

@@ -67,10 +67,16 @@ def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) ->
     assert list(kept.parent.iterdir()) == [kept]
 
 
-def test_a_file_that_is_no_field_is_named(tmp_path: Path) -> None:
+def test_what_is_no_library(tmp_path: Path) -> None:
     (tmp_path / "chair.safetensors").write_bytes(b"\x10\0\0\0\0\0\0\0{")
     with pytest.raises(FieldFormatError, match=r"chair\.safetensors: "):
         object_model(find_source(tmp_path / "chair.safetensors"), RobustOptions())
+    head = (DATA / "armchair.safetensors").read_bytes()[:600]
+    for number in range(513):
+        (tmp_path / f"{number}.safetensors").write_bytes(head)
+    with pytest.raises(InvalidInputError) as caught:
+        library_files([tmp_path])
+    assert caught.value.reason == "LIBRARY_TOO_LARGE"
 
 
 def test_a_library_is_the_fields_of_its_folders_each_once(tmp_path: Path) -> None:
@@ -85,15 +91,6 @@ def test_a_library_is_the_fields_of_its_folders_each_once(tmp_path: Path) -> Non
     with pytest.raises(InvalidInputError) as caught:
         library_files([tmp_path / "more"])
     assert caught.value.reason == "LIBRARY_EMPTY"
-
-
-def test_a_library_has_its_limit(tmp_path: Path) -> None:
-    head = (DATA / "armchair.safetensors").read_bytes()[:600]
-    for number in range(513):
-        (tmp_path / f"{number}.safetensors").write_bytes(head)
-    with pytest.raises(InvalidInputError) as caught:
-        library_files([tmp_path])
-    assert caught.value.reason == "LIBRARY_TOO_LARGE"
 
 
 def test_the_published_method_searches_nothing(run: Run, tmp_path: Path) -> None:

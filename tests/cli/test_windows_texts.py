@@ -76,7 +76,7 @@ def test_lists_of_pairs(encode: Encode, tmp_path: Path) -> None:
         assert (pairs[0].request or {})["detection"]["size"] == [1, 1, 1]
 
 
-def test_settings_beside_a_checkpoint(encode: Encode) -> None:
+def test_settings_and_poses(encode: Encode) -> None:
     texts = {
         "config.yml": "# Größe\nwidth: 64\n",
         "a.json": '{"größe": 1,\n "width": 64}',
@@ -85,9 +85,6 @@ def test_settings_beside_a_checkpoint(encode: Encode) -> None:
     }
     files = tuple(SettingsFile(name, memoryview(encode(text))) for name, text in texts.items())
     assert [keys.find("width") for keys in read_documents(files).keys] == [64, 64, 64, 64]
-
-
-def test_poses(encode: Encode) -> None:
     poses = read_tum("groundtruth.txt", encode("# Größe\n0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n"))
     assert poses is not None
     assert poses[:, :3, 3].tolist() == [[1, 2, 3], [1, 2, 3]]

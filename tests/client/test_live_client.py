@@ -121,14 +121,11 @@ def test_events_as_they_come(client: Client) -> None:
     assert job.id in {one.id for one in client.jobs("successful")}
 
 
-def test_a_search_among_files(client: Client) -> None:
+def test_searches_and_batches_of_one_scene(client: Client) -> None:
     ranked = client.search(ROOM, [ROOM, CHAIR], BOX, UPRIGHT)
     assert ranked.candidates is not None
     assert ranked.source == ranked.candidates[0].source == str(CHAIR)
     assert {one.source for one in ranked.candidates} == {str(ROOM), str(CHAIR)}
-
-
-def test_each_detection_with_each_object(client: Client) -> None:
     outcomes = client.register_batch(ROOM, [BOX, FAR], [CHAIR], options=UPRIGHT, seed=4713)
     assert [(one.detection, one.object) for one in outcomes] == [(0, 0), (1, 0)]
     assert outcomes[0].result is not None

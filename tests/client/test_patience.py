@@ -27,10 +27,13 @@ def test_what_is_too_fast_is_asked_again_when_the_service_says(reason: str, slep
     assert all(3.0 <= wait <= 6.0 for wait in slept)
 
 
-def test_a_file_that_is_still_to_come_is_waited_for(slept: list[float]) -> None:
+def test_what_passes_is_waited_for(slept: list[float]) -> None:
     answers = [refusal(409, "ARTIFACT_NOT_READY", "1")] * 2 + [httpx.Response(200, content=b"points")]
     assert pretended(lambda _: answers.pop(0)).artifact("j", "scene_points.ply") == b"points"
     assert len(slept) == 2
+    answers = [refusal(503, "STORAGE_UNAVAILABLE", "7"), httpx.Response(200, json=JOB)]
+    pretended(lambda _: answers.pop(0)).job("j")
+    assert 7.0 <= slept[0] <= 14.0
 
 
 def test_patience_ends(slept: list[float]) -> None:
@@ -62,12 +65,6 @@ def test_a_service_that_is_away_for_a_moment_is_waited_for(status: int, slept: l
     assert pretended(lambda _: answers.pop(0)).job("j").id == "j"
     assert len(slept) == 4
     assert slept[-1] > slept[0]
-
-
-def test_its_own_word_on_when_to_come_back_counts(slept: list[float]) -> None:
-    answers = [refusal(503, "STORAGE_UNAVAILABLE", "7"), httpx.Response(200, json=JOB)]
-    pretended(lambda _: answers.pop(0)).job("j")
-    assert 7.0 <= slept[0] <= 14.0
 
 
 def test_nothing_that_answers_is_told_with_what_to_do(slept: list[float]) -> None:

@@ -41,11 +41,25 @@ def test_holds_exactly_these_services() -> None:
     }
 
 
-def test_the_gpu_is_for_its_own_profile() -> None:
+def test_what_the_programs_are_given() -> None:
     reserved = services()["worker-gpu"]["deploy"]["resources"]["reservations"]["devices"]
     assert reserved == [{"driver": "nvidia", "count": 1, "capabilities": ["gpu"]}]
     assert services()["worker-gpu"]["environment"]["REGNF_DEVICE"] == "cuda"
     assert "reservations" not in services()["worker"]["deploy"]["resources"]
+    environment = services()["api"]["environment"]
+    assert environment["REGNF_HOST"] == "0.0.0.0"
+    assert environment["REGNF_ALLOW_UNAUTHENTICATED"] == "${REGNF_ALLOW_UNAUTHENTICATED:-false}"
+    assert environment["REGNF_API_TOKENS"] == "${REGNF_API_TOKENS:-[]}"
+    memory = services()["worker"]["deploy"]["resources"]["limits"]["memory"]
+    assert int(memory.removesuffix("G")) * 2**30 > Settings.model_fields["import_memory_bytes"].default
+    texts = [path.read_text() for path in (COMPOSE, *DOCKERFILES)]
+    named = set(re.findall(r"REGNF_[A-Z_]*[A-Z]", "\n".join(texts)))
+    assert named - COMPOSE_ONLY <= settings_names()
+    document = compose()
+    used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
+    used = {name for name in used if not name.startswith((".", "$"))}
+    assert used == set(document["volumes"])
+    assert {network for service in services().values() for network in service["networks"]} == set(document["networks"])
 
 
 def test_what_watches_finds_what_it_watches() -> None:
@@ -107,14 +121,6 @@ def test_programs_wait_for_redis_share_the_state_and_are_built_here() -> None:
         assert (context / service["build"]["dockerfile"]).is_file()
 
 
-def test_volumes_and_networks_are_declared() -> None:
-    document = compose()
-    used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
-    used = {name for name in used if not name.startswith((".", "$"))}
-    assert used == set(document["volumes"])
-    assert {network for service in services().values() for network in service["networks"]} == set(document["networks"])
-
-
 def test_only_the_proxy_can_be_reached_and_only_from_this_machine() -> None:
     published = {name: service["ports"] for name, service in services().items() if "ports" in service}
     assert published == {
@@ -130,19 +136,6 @@ def test_only_the_proxy_can_be_reached_and_only_from_this_machine() -> None:
         assert "records" not in services()[name]["networks"], "it has no business with Redis"
 
 
-def test_no_tokens_is_nobodys_default() -> None:
-    environment = services()["api"]["environment"]
-    assert environment["REGNF_HOST"] == "0.0.0.0"
-    assert environment["REGNF_ALLOW_UNAUTHENTICATED"] == "${REGNF_ALLOW_UNAUTHENTICATED:-false}"
-    assert environment["REGNF_API_TOKENS"] == "${REGNF_API_TOKENS:-[]}"
-
-
-def test_every_variable_is_a_setting() -> None:
-    texts = [path.read_text() for path in (COMPOSE, *DOCKERFILES)]
-    named = set(re.findall(r"REGNF_[A-Z_]*[A-Z]", "\n".join(texts)))
-    assert named - COMPOSE_ONLY <= settings_names()
-
-
 def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """The environment that compose hands over by default is one that Settings understands."""
     for name in ("api", "worker"):
@@ -153,8 +146,3 @@ def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch)
     assert settings.api_tokens == frozenset()
     assert settings.allow_unauthenticated is False
     assert settings.threads == 2
-
-
-def test_the_worker_can_hold_an_import() -> None:
-    memory = services()["worker"]["deploy"]["resources"]["limits"]["memory"]
-    assert int(memory.removesuffix("G")) * 2**30 > Settings.model_fields["import_memory_bytes"].default

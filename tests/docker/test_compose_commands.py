@@ -26,10 +26,13 @@ def settings_of(service: Service, monkeypatch: pytest.MonkeyPatch) -> Settings:
     return Settings()
 
 
-def test_the_documentation_prints_commands() -> None:
+def test_the_documentation_prints_commands_and_the_front_end_knows_its_port() -> None:
     sources = {command.source for command in COMMANDS}
     assert sources == {"README.md", "docs/deployment.md", "docker/compose.yaml"}
     assert {profile for command in COMMANDS for profile in command.profiles} == {"cpu", "gpu", "observability"}
+    for variables in ({}, {"REGNF_PUBLISH": "127.0.0.1:9000"}):
+        services = render(COMPOSE, variables)
+        assert services["proxy"]["ports"] == [f"{services['api']['environment']['REGNF_PUBLISH']}:8000"]
 
 
 @every_command
@@ -57,12 +60,6 @@ def test_published_to_others_it_does_not_start_without_tokens(publish: str, monk
     with pytest.raises(StartError) as caught:
         check_access(settings_of(services["api"], monkeypatch))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
-
-
-def test_the_front_end_knows_where_its_port_is_published() -> None:
-    for variables in ({}, {"REGNF_PUBLISH": "127.0.0.1:9000"}):
-        services = render(COMPOSE, variables)
-        assert services["proxy"]["ports"] == [f"{services['api']['environment']['REGNF_PUBLISH']}:8000"]
 
 
 @pytest.mark.parametrize(("password", "status"), [("", 1), ("a-password", 0)])

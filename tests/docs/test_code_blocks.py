@@ -96,9 +96,6 @@ def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
             assert block.language in ("bash", "python", "json", "console", "text"), page
             if block.language == "console":
                 assert ELSEWHERE.match(block.code), f"{page}: {block.code}"
-
-
-def test_there_are_blocks() -> None:
     assert {"tutorial.md", "batch.md", "verdicts.md", "units.md", "page.md"} <= {page.name for page in RUN}
 
 

@@ -77,15 +77,12 @@ def test_a_wrong_request(case: Case, world: World) -> None:
     case.check(json.dumps(told, ensure_ascii=False))
 
 
-def test_a_result_that_is_not_there_yet(world: World) -> None:
+def test_what_is_not_ready(world: World) -> None:
     job = world.submit()
     answer = world.client.get(f"/jobs/{job}/result")
     problem = assert_refused(answer, 409, "JOB_NOT_READY")
     Case("", "", 409, job, "no result yet", "Retry after").check(json.dumps(problem))
     assert answer.headers["retry-after"]
-
-
-def test_a_rejected_field(world: World) -> None:
     scene = world.rejected_field("bad")
     problem = assert_refused(
         world.client.post("/register", json=world.valid_request() | {"scene": scene}), 422, "FIELD_REJECTED"

@@ -76,25 +76,22 @@ def test_without_a_compiler_there_is_a_reason(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_such_library_is_not_used(tmp_path: Path) -> None:
+def test_what_is_no_library_is_not_used_nor_any_by_the_switch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert library.load(tmp_path / "none.so").fault == library.NOT_BUILT
     (tmp_path / "text.so").write_text("not code")
     found = library.load(tmp_path / "text.so")
     assert (found.variants, found.fastest) == ((), None)
     assert "does not load" in str(found.fault)
+    monkeypatch.setenv(library.SWITCH, "0")
+    assert library.variant() is None
+    monkeypatch.delenv(library.SWITCH)
+    assert library.variant() is library.load().fastest
 
 
 def test_a_library_of_another_layout_is_not_used(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     other = built.rename(built.with_name("other.so"))
     monkeypatch.setattr(library, "_LAYOUT", 0)
     assert library.load(other).fastest is None
-
-
-def test_the_switch_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(library.SWITCH, "0")
-    assert library.variant() is None
-    monkeypatch.delenv(library.SWITCH)
-    assert library.variant() is library.load().fastest
 
 
 def test_fields_are_evaluated_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
