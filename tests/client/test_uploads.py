@@ -144,12 +144,15 @@ def test_settings_and_description_go_with_the_pieces(world: World, transport: Ap
     assert not [key for key in world.blobs.blobs if key.startswith("uploads/")]
 
 
-def test_a_field_that_is_refused_says_why(world: World, transport: AppTransport, room: Path) -> None:
+def test_a_field_held_as_another_function_is_refused(world: World, transport: AppTransport, room: Path) -> None:
     send(client(transport), room)
     imported(world)
     with pytest.raises(ServiceError, match=r"room\.safetensors: the service holds") as caught:
         client(transport).upload(room, {"level_mask": 3})
     assert caught.value.reason == "FIELD_DESCRIPTION_DIFFERS"
+
+
+def test_a_refused_field_is_told_with_its_reason(world: World, transport: AppTransport, room: Path) -> None:
     send(client(transport), room)
     error = {"reason": "FIELD_SHAPES_MISMATCH", "title": "Shapes", "status": 422, "detail": "the shapes do not fit"}
     world.records.update_field(NAME, attempt=1, state="rejected", error=error)

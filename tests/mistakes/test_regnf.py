@@ -45,7 +45,7 @@ CASES = [
     Case("no box", "INVALID_DETECTION", 0, "detection is null", "expected an object with a box", '"min"', registered(detection=None)),
     Case("box without a size", "INVALID_DETECTION", 0, "detection.size", "is missing", '"min"', registered(detection={"center": [0, 0, 0]})),
     Case("quaternion of unknown order", "INVALID_DETECTION", 0, "detection.rotation", "unknown order", "xyzw.*wxyz", registered(detection={"center": [0, 0, 0], "size": [1, 1, 1], "rotation": [0, 0, 0, 1]})),
-    Case("JSON text for a box", "INVALID_DETECTION", 0, "detection is a text", "expected an object", '"min"', registered(detection='{"min": [0, 0, 0]}')),
+    Case("JSON text for a box", "INVALID_DETECTION", 0, "detection is a text", "expected an object", '"min"', lambda: wrong.OrientedBox.from_dict('{"min": [0, 0, 0]}')),
     Case("a point for a box", "INVALID_DETECTION", 0, "detection", "expected", '"min"', registered(detection=[0.1, 0.2, 0.3])),
     Case("corners swapped", "INVALID_DETECTION", 0, r"detection\[1\]\[0\]", "expected more than min", "look swapped", registered(detection=([1, 1, 1], [0, 0, 0]))),
     Case("box in millimeters", "DETECTION_OUTSIDE_SCENE", 0, "units from the scene", "the scene reaches from", "millimeters", registered(detection={"center": [-560, -280, -240], "size": [550, 600, 510]})),
