@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,15 +22,17 @@ from regnf_cli.batch_file import FilePair, ResultsFile, read_pairs
 from regnf_cli.guard import require
 from regnf_cli.options import Server, Token, WorkerTimeout, client_of
 from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, progress, tell
+from regnf_core.detections import parse_detection, require_in_scene
 from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.field_source import find_source
+from regnf_core.options import RegistrationOptions, RobustOptions
 from regnf_core.pairs import short_result
 from regnf_core.processes import die_with_parent
 
 if TYPE_CHECKING:
     from regnf_client import Client, PairResult
     from regnf_core.fields.observation import SdfField
-    from regnf_core.library import LibraryObject, ObjectModel
-    from regnf_core.options import RegistrationOptions
+    from regnf_core.library import ObjectModel
 
 
 # Registering many pairs here: processes that keep fields and object models open from one pair to the next.
@@ -117,12 +120,10 @@ def failure(error: RegnfError) -> dict[str, Any]:
 
 
 def _document(pair: FilePair) -> dict[str, Any]:
-    from regnf_core.detections import parse_detection, require_in_scene
     from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import WarmStart, register, search_library
-    from regnf_core.options import RegistrationOptions
+    from regnf_core.library import LibraryObject, WarmStart, register, search_library
 
     request = pair.request or {}
     options = RegistrationOptions.from_dict(request["options"])
@@ -133,19 +134,18 @@ def _document(pair: FilePair) -> dict[str, Any]:
     start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
     if pair.is_search:
         _require_nothing_of_one_object(request)
-        library = [_candidate(one, options) for one in pair.objects]
+        samples = options.robust.object_samples
+        library = [LibraryObject(one, partial(_field, one, "object"), _model(one, samples)) for one in pair.objects]
         found = search_library(scene, box, library, options, request["seed"], clouds=False)
         ranking = ranking_document(found.ranking, {})
-        document: dict[str, Any] = result_document(found.result, object_name=found.ranking[0].name, candidates=ranking)
-        return document
+        return dict(result_document(found.result, object_name=found.ranking[0].name, candidates=ranking))
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
     warm = WarmStart(None if start is None else Sim3.from_matrix(start), model)
     # errors against a truth are those of the clouds' points
     clouds = truth is not None
     result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=clouds)
-    told: dict[str, Any] = result_document(result, None if truth is None else Sim3.from_matrix(truth))
-    return told
+    return dict(result_document(result, None if truth is None else Sim3.from_matrix(truth)))
 
 
 def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
@@ -160,7 +160,6 @@ def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
 
 @lru_cache(_FIELDS_OPEN)
 def _field(path: str, role: Any) -> SdfField:
-    from regnf_core.field_source import find_source
     from regnf_core.loading import load_field
 
     return load_field(find_source(Path(path), role=role)).field
@@ -168,19 +167,9 @@ def _field(path: str, role: Any) -> SdfField:
 
 @lru_cache(_MODELS_HELD)
 def _model(path: str, samples: int) -> ObjectModel:
-    from dataclasses import replace
-
-    from regnf_core.field_source import find_source
     from regnf_core.object_models import object_model
-    from regnf_core.options import RobustOptions
 
     return object_model(find_source(Path(path), role="object"), replace(RobustOptions(), object_samples=samples))
-
-
-def _candidate(path: str, options: RegistrationOptions) -> LibraryObject:
-    from regnf_core.library import LibraryObject
-
-    return LibraryObject(path, lambda: _field(path, "object"), _model(path, options.robust.object_samples))
 
 
 Results = Annotated[
