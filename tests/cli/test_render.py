@@ -53,7 +53,18 @@ def test_an_edit_names_its_files_from_its_own_folder(fields: Path, tmp_path: Pat
 def test_a_command_that_is_terminated_leaves_nothing_behind(fields: Path, tmp_path: Path) -> None:
     """SIGTERM is what schedulers and service managers send."""
     output = tmp_path / "out"
-    said = ("render", str(fields / "room.safetensors"), "--size", "96x72", "--frames", "5000", "--output", str(output))
+    said = (
+        "render",
+        str(fields / "room.safetensors"),
+        "--mode",
+        "volume",
+        "--size",
+        "192x144",
+        "--frames",
+        "500",
+        "--output",
+        str(output),
+    )
     with subprocess.Popen([sys.executable, "-m", "regnf_cli.main", *said], stderr=subprocess.PIPE) as command:
         eventually(lambda: output.is_dir() and any(path.suffix == ".png" for path in below(output)), "the first frame")
         command.terminate()
