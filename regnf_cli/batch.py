@@ -141,7 +141,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
     from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import WarmStart, register, search_library
+    from regnf_core.library import register, search_library
     from regnf_core.options import RegistrationOptions
 
     request = pair.request or {}
@@ -160,10 +160,11 @@ def _document(pair: FilePair) -> dict[str, Any]:
         return document
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
-    warm = WarmStart(None if start is None else Sim3.from_matrix(start), model)
+    initial = None if start is None else Sim3.from_matrix(start)
     # errors against a truth are those of the clouds' points
     clouds = truth is not None
-    result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=clouds)
+    obj = _field(name, "object")
+    result = register(scene, obj, box, options, request["seed"], None, initial, model, clouds)
     told: dict[str, Any] = result_document(result, None if truth is None else Sim3.from_matrix(truth))
     return told
 

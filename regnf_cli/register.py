@@ -114,7 +114,6 @@ def _register_here(
     from regnf_core.document import result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import WarmStart
     from regnf_core.library import register as run
     from regnf_core.loading import import_smallest_first, load_field
 
@@ -134,7 +133,7 @@ def _register_here(
             options,
             request["seed"],
             report,
-            WarmStart(T_object_scene=start),
+            initial_transform=start,
             clouds=files.wanted,
         )
         report("exporting", 1.0)

@@ -225,9 +225,9 @@ def _refuse_other_types(given: Mapping[str, Any], read: Any, place: str = "optio
         if isinstance(value, Mapping):
             _refuse_other_types(value, taken, f"{place}.{name}")
         elif isinstance(value, str | bool) and type(value) is not type(taken):
-            what, hint = (
-                ("a text", "Remove the quotation marks.") if isinstance(value, str) else ("true or false", None)
-            )
+            what, hint = "true or false", None
+            if isinstance(value, str):
+                what, hint = "a text", "Remove the quotation marks."
             wanted = "true or false" if isinstance(taken, bool) else "a number"
             raise InvalidOptionsError(f"{place}.{name}: is {what}, expected {wanted}", hint=hint)
 

@@ -38,7 +38,7 @@ CASES = [
     Case("option in the wrong group", "INVALID_OPTIONS", 0, "options.rotations", "no such option", "did you mean `robust.rotations`", registered(options={"rotations": 100})),
     Case("axis in upper case", "INVALID_OPTIONS", 0, "options.up_axis", "'x', 'y' or 'z'", "docs/api.md", registered(options={"up_axis": "Z"})),
     Case("preset misspelled", "INVALID_OPTIONS", 0, "options.preset", "'paper' or 'robust'", "docs/api.md", registered(options={"preset": "robst"})),
-    Case("start under another preset", "INITIAL_TRANSFORM_UNSUPPORTED", 0, "given transform", "only the preset `robust`", "paper", registered(room(chair_pose()), chair(), options={"preset": "paper"}, warm_start=regnf.WarmStart(T_object_scene=chair_pose()))),
+    Case("start under another preset", "INITIAL_TRANSFORM_UNSUPPORTED", 0, "given transform", "only the preset `robust`", "paper", registered(room(chair_pose()), chair(), options={"preset": "paper"}, initial_transform=chair_pose())),
     Case("no box", "INVALID_DETECTION", 0, "detection is null", "expected an object with a box", '"min"', registered(detection=None)),
     Case("a point for a box", "INVALID_DETECTION", 0, "detection", "expected", '"min"', registered(detection=[0.1, 0.2, 0.3])),
     Case("corners swapped", "INVALID_DETECTION", 0, r"detection\[1\]\[0\]", "expected more than min", "look swapped", registered(detection=([1, 1, 1], [0, 0, 0]))),

@@ -106,7 +106,7 @@ def test_latents_cannot_leave_the_ranges() -> None:
 def _learn(residuals: torch.Tensor) -> AdaptiveKernel:
     kernel = AdaptiveKernel()
     adam = torch.optim.Adam([kernel.latents], lr=0.05)
-    for _ in range(400):
+    for _ in range(250):
         adam.zero_grad()
         kernel.negative_log_likelihood((residuals,)).backward()  # type: ignore[no-untyped-call]
         adam.step()

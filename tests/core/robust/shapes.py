@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -97,19 +95,4 @@ def pose_distance(T: Sim3, truth: Sim3, result: RegistrationResult) -> float:
 def run(
     scene: object, obj: object, box: OrientedBox, options: RegistrationOptions = ROBUST, seed: int = 0
 ) -> RegistrationResult:
-    return register(scene, obj, box, options, seed=seed)  # type: ignore[arg-type]
-
-
-__all__: Sequence[str] = (
-    "ROBUST",
-    "can",
-    "can_room",
-    "detection",
-    "placement_error",
-    "pose_distance",
-    "random_pose",
-    "reframed",
-    "run",
-    "slab_table",
-    "table_room",
-)
+    return register(scene, obj, box, options, seed=seed, clouds=False)  # type: ignore[arg-type]

@@ -69,12 +69,12 @@ def verdict_on(
 def test_coarse_agreement_by_hand() -> None:
     # Scene: 8 of 10 near ones within 0.03, one too far to count. Object: 9 of 10 within, one of all 10 in free space.
     found = evidence_of([0.02] * 8 + [0.05] * 2 + [0.4], [0.025] * 9 + [0.06])
-    assert float(found.coarse[0]) == pytest.approx(0.8 - 0.1)
+    assert float(found.numbers["coarse_agreement"][0]) == pytest.approx(0.8 - 0.1)
 
 
 def test_matter_around_the_object_is_no_free_space() -> None:
     # 2 of 10 within matter: no agreement, but none of the 8 others lies in free space.
-    assert float(evidence_of([0.0] * 10, [0.0] * 8 + [-0.2] * 2).coarse[0]) == pytest.approx(0.8)
+    assert float(evidence_of([0.0] * 10, [0.0] * 8 + [-0.2] * 2).numbers["coarse_agreement"][0]) == pytest.approx(0.8)
 
 
 FREE = evidence_of([0.0] * 10, [0.0] * 7 + [0.1] * 3)

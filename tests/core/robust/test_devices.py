@@ -139,7 +139,7 @@ def test_evidence_and_features_stay_on_the_device(neural: RegistrationProblem, m
         evidence = gather_evidence(r, T.scale, OPTIONS)
         found = pose_features(problem, T, r, T.scale)
     assert list(found) == list(SPEAKS_FOR)
-    assert {one.device for one in found.values()} == {evidence.scores.device} == {ELSEWHERE}
+    assert {one.device for one in found.values()} == {evidence.numbers["score"].device} == {ELSEWHERE}
     assert set(border.copies) <= {"torch.Tensor.new_tensor"}  # two quantiles, by their numbers
 
 

@@ -124,7 +124,7 @@ def test_a_scene_sample_that_nobody_saw_from_its_front_counts_only_where_the_obj
     found = residuals(SurfacePair(Slab(), Slab(), scene, sheet), Sim3.identity().expand(1))
     assert found.unobserved is not None
     assert found.unobserved[0].tolist() == [False, True, False, False]
-    narrower = scene[torch.tensor([2, 1])].to("cpu")
+    narrower = scene[torch.tensor([2, 1])].on("cpu")
     assert narrower.hidden is not None
     assert narrower.hidden.tolist() == [True, True]
 

@@ -90,12 +90,6 @@ def test_the_last_stages_alone_leave_them_out() -> None:
 # Convergence of the batched Levenberg-Marquardt from perturbed starts, on exact fields.
 
 
-def test_weights_are_those_of_geman_and_mcclure() -> None:
-    # (w^2 / (w^2 + r^2))^2: 1 at zero, 1/4 at one width, 1/25 at two
-    r = torch.tensor([0.0, 0.1, 0.2])
-    torch.testing.assert_close(geman_mcclure_weight(r, 0.1), torch.tensor([1.0, 0.25, 0.04]))
-
-
 def test_weight_and_curvature_are_the_derivatives_of_the_loss() -> None:
     r, width = torch.tensor([0.0, 0.02, 0.1, 0.25], dtype=torch.float64, requires_grad=True), 0.1
     loss = geman_mcclure_loss(r, width)

@@ -127,13 +127,3 @@ def test_where_next_to_nothing_was_observed_the_weight_is_bounded() -> None:
     assert observed_weight(hidden).tolist() == [[1.0 / REFINEMENT.min_observed_share]]  # type: ignore[union-attr]
     everything = Residuals(r.values, r.jacobian, r.cosines, 3)
     assert observed_weight(everything) is None
-
-
-def test_samples_without_a_share_do_not_count_as_observed() -> None:
-    """Pairs that are worked on together have as many samples each; those that fill up have no share."""
-    r = partly_observed()
-    filled = torch.cat([r.values, torch.zeros(1, 2, dtype=D)], 1)
-    shares = torch.tensor([[1 / 3] * 3 + [1 / 4] * 4 + [0.0] * 2], dtype=D)
-    unobserved = torch.cat([r.unobserved, torch.zeros(1, 2, dtype=torch.bool)], 1)  # type: ignore[list-item]
-    together = Residuals(filled, torch.zeros(1, 9, 7, dtype=D), torch.ones(1, 9, dtype=D), 3, unobserved, None, shares)
-    torch.testing.assert_close(observed_weight(together), observed_weight(r))
