@@ -213,9 +213,8 @@ class RegistrationOptions:
     def require_robust(self, feature: str, reason: str = InvalidOptionsError.reason) -> None:
         """Raises InvalidOptionsError with ``reason`` under another preset. feature: what only `robust` can do."""
         if self.preset != "robust":
-            raise InvalidOptionsError(
-                f"only the preset `robust` {feature}; the options name `{self.preset}`", reason=reason
-            )
+            message = f"only the preset `robust` {feature}; the options name `{self.preset}`"
+            raise InvalidOptionsError(message, reason=reason)
 
 
 def _refuse_other_types(given: Mapping[str, Any], read: Any, place: str = "options") -> None:

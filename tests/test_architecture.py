@@ -32,7 +32,7 @@ FORBIDDEN = {
 }
 
 
-MAX_PARAMETERS = 8
+MAX_PARAMETERS = 10
 
 
 @cache

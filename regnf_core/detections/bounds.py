@@ -179,11 +179,8 @@ def number(value: Any, place: Place, limit: float = MAX_COORDINATE) -> float:
         hint = "Remove the quotation marks." if isinstance(value, str) else None
         raise fault(place, f"is {shown(value)}, expected a number", hint)
     if isinstance(value, float) and not math.isfinite(value):
-        raise fault(
-            place,
-            f"is {shown(value)}, expected a finite number",
-            "A detector writes this for a box that it could not place: leave such boxes out.",
-        )
+        hint = "A detector writes this for a box that it could not place: leave such boxes out."
+        raise fault(place, f"is {shown(value)}, expected a finite number", hint)
     if abs(value) > limit:
         message = f"is {shown(value)}, expected at most {limit:g} either way"
         raise fault(place, message, "Move the origin of scene and box nearer.")

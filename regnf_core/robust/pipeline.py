@@ -156,8 +156,7 @@ def search_poses(
 def refine_poses(
     problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
 ) -> PoseCandidates:
-    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them for the last stages. Best
-    first.
+    """Poses T (H,) refined on the fields, best first; the best one's symmetry equivalents join for the last stages.
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """

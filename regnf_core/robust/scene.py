@@ -189,8 +189,7 @@ def support_planes(
 def _best_plane(
     surface: SmoothedSurface, generator: torch.Generator, edges: Tensor | None, outside: Tensor | None
 ) -> Tensor | None:
-    """(N,) bool: points on and behind the support plane with the most points, or with the most of those outside; None
-    when there is none."""
+    """(N,) bool: points on and behind the support plane with the most points, or most outside; None: there is none."""
     c = SUPPORT_PLANES
     basis = surface if outside is None else surface[outside.nonzero().squeeze(-1)]
     if len(basis.points) < c.min_points:

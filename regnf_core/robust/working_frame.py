@@ -326,8 +326,7 @@ def sample_scene_surface(
 
 
 def _samples_near(field: WorkingField, cells: Cells, limit: int, generator: torch.Generator) -> Samples:
-    """At most ``limit`` samples: one Newton step from the cells' centers to the surface, value and normal at its
-    end."""
+    """At most ``limit`` samples: one Newton step from cells' centers to the surface, value and normal at its end."""
     close = (cells.values.abs() <= SAMPLING.max_cell_distance * cells.edge).nonzero().squeeze(-1)
     if close.numel() > limit:
         close = close[torch.randperm(close.numel(), generator=generator)[:limit]]

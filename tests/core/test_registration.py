@@ -113,7 +113,7 @@ def test_what_only_robust_takes_is_refused_before_any_work(known: dict[str, Any]
 
 def test_a_wrong_object_is_never_registered() -> None:
     T = chair_pose()
-    result = register(room(T), table(), chair_box(T), OPTIONS)
+    result = register(room(T), table(), chair_box(T), OPTIONS, clouds=False)
     assert result.verdict == "rejected"
     assert result.verdict_reason in {"LOW_OVERLAP", "LARGE_RESIDUAL"}
 
@@ -145,7 +145,7 @@ def test_the_same_seed_gives_the_same_result_in_another_process_too() -> None:
 def test_it_stops_early_once_the_residuals_are_small() -> None:
     T = chair_pose(scale=1.0)
     options = RegistrationOptions.from_dict({**QUICK, "optimization": {"stop_residual": 0.01}})
-    result = register(room(T), chair(), chair_box(T), options, seed=1)
+    result = register(room(T), chair(), chair_box(T), options, seed=1, clouds=False)
     assert result.metrics["converged"] == 1.0
     last = result.trace[-1]
     assert len(result.trace) < 200
@@ -171,7 +171,7 @@ def test_a_field_that_breaks_down_on_the_way_is_reported() -> None:
 
 def test_golden_chair_with_published_options() -> None:
     T = chair_pose(0.8)
-    result = register(room(T), chair(), chair_box(T), RegistrationOptions(preset="paper"), seed=2)
+    result = register(room(T), chair(), chair_box(T), RegistrationOptions(preset="paper"), seed=2, clouds=False)
     errors = errors_against_truth(result.T_object_scene, T, result.object_samples.points)
     assert result.verdict == "registered"
     assert errors["rotation_error_rad"] < 0.03
@@ -187,5 +187,5 @@ def test_an_oriented_detection_serves_as_well_as_an_upright_one() -> None:
         torch.tensor([0.56, 0.52, 0.84], dtype=torch.float64),
         back.rotation,
     )
-    result = register(room(T), chair(), box, OPTIONS, seed=1)
+    result = register(room(T), chair(), box, OPTIONS, seed=1, clouds=False)
     assert result.verdict == "registered"

@@ -14,6 +14,8 @@ from regnf_core.options import RegistrationOptions
 from tests.core.analytic import AnalyticField, boxes, chair, chair_box, chair_pose, room, seen_from, union
 
 ROBUST = RegistrationOptions(preset="robust")
+ONE_SEARCH = RegistrationOptions.from_dict({"robust": {"feature_draws": 0}})
+"""Where an answer is rejected, no second search is made for another."""
 
 
 def detection() -> OrientedBox:

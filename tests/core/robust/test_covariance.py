@@ -41,7 +41,7 @@ def disturbed(r: Residuals, errors: Tensor) -> tuple[Residuals, Tensor]:
     return Residuals(left[None].float(), r.jacobian, r.cosines, n), step
 
 
-@pytest.mark.parametrize("length", [0.0, 0.05, 0.15, 0.4])
+@pytest.mark.parametrize("length", [0.0, 0.15])
 def test_errors_of_any_length_lie_inside_the_ellipsoid(length: float) -> None:
     """Smooth errors with a tenth of their size in roughness; a length of 0 is roughness alone."""
     r, places = at_the_truth(250)

@@ -101,7 +101,7 @@ def test_weight_and_curvature_are_the_derivatives_of_the_loss() -> None:
     torch.testing.assert_close(2 / width**2 * geman_mcclure_curvature(r, width, weight), bend)
 
 
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("scale", [0.1, 10.0])
 def test_many_perturbed_starts_come_back_at_once(scale: float) -> None:
     truth = random_pose(3, scale)
     generator = torch.Generator().manual_seed(0)

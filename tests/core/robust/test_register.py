@@ -16,6 +16,7 @@ from regnf_core.robust import pipeline
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, table
 from tests.core.robust.shapes import (
+    ONE_SEARCH,
     ROBUST,
     can,
     can_room,
@@ -45,7 +46,7 @@ def found(reports: list[tuple[str, float]]) -> RegistrationResult:
 @pytest.fixture(scope="module")
 def wrong() -> RegistrationResult:
     """A table in its place."""
-    return run(room(chair_pose()), table(), detection())
+    return run(room(chair_pose()), table(), detection(), ONE_SEARCH)
 
 
 OVER = Sim3.from_quaternion(1.0, [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -186,7 +187,7 @@ def test_an_initial_transform_is_refined_and_a_wrong_one_does_no_harm() -> None:
 def test_a_given_pose_is_refined_whatever_the_search_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = PoseCandidates.start(Sim3.cat([random_pose(seed, 1.0) for seed in range(3)]))
     monkeypatch.setattr(pipeline, "search_poses", lambda *_: wrong)
-    assert run(room(chair_pose()), chair(), detection()).verdict == "rejected"
+    assert run(room(chair_pose()), chair(), detection(), ONE_SEARCH).verdict == "rejected"
     start = perturbed(chair_pose(), torch.tensor([0.02, -0.02, 0.03, 0.01, 0.01, -0.01, 0.02]))
     result = register(room(chair_pose()), chair(), detection(), ROBUST, initial_transform=start, clouds=False)
     assert result.verdict == "registered"
