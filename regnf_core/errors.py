@@ -169,12 +169,7 @@ class FieldFormatError(InvalidInputError):
     said: Said | None = None
 
     def __init__(
-        self,
-        message: str,
-        *,
-        reason: str | None = None,
-        hint: str | None = None,
-        candidates: Sequence[Candidate] = (),
+        self, message: str, *, reason: str | None = None, hint: str | None = None, candidates: Sequence[Candidate] = ()
     ) -> None:
         super().__init__(message, reason=reason, hint=hint)
         self.candidates = tuple(candidates)

@@ -102,10 +102,7 @@ class FieldSource:
 
 
 def find_source(
-    path: Path,
-    description: Mapping[str, Any] | None = None,
-    settings: SettingsChoice = None,
-    role: Role | None = None,
+    path: Path, description: Mapping[str, Any] | None = None, settings: SettingsChoice = None, role: Role | None = None
 ) -> FieldSource:
     """What a path stands for. role: what the field will be used as.
 

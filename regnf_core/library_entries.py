@@ -86,12 +86,7 @@ class EntryNotes:
 
     @classmethod
     def checked(
-        cls,
-        name: str,
-        tags: Sequence[str] = (),
-        unit: str | None = None,
-        note: str | None = None,
-        symmetry: Any = None,
+        cls, name: str, tags: Sequence[str] = (), unit: str | None = None, note: str | None = None, symmetry: Any = None
     ) -> EntryNotes:
         """Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
         if unit is not None and unit not in UNITS:

@@ -221,11 +221,7 @@ def paper_errors(estimate: Sim3, truth: Sim3) -> dict[str, float]:
 
 
 def errors_against_truth(
-    estimate: Sim3,
-    truth: Sim3,
-    points: Tensor,
-    symmetries: Symmetries | None = None,
-    center: Tensor | None = None,
+    estimate: Sim3, truth: Sim3, points: Tensor, symmetries: Symmetries | None = None, center: Tensor | None = None
 ) -> dict[str, float]:
     """The errors by name that do not depend on where the scene's origin is, the smallest over the symmetries.
 

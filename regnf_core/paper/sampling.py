@@ -53,11 +53,7 @@ def sample_scene(
 
 
 def sample_object(
-    obj: SdfField,
-    options: SamplingOptions,
-    turn: float = 0.0,
-    extent: OrientedBox | None = None,
-    up_axis: Axis = "z",
+    obj: SdfField, options: SamplingOptions, turn: float = 0.0, extent: OrientedBox | None = None, up_axis: Axis = "z"
 ) -> SurfaceSamples:
     """Points of the object's surface. Object frame, object units.
 

@@ -41,11 +41,7 @@ class RegistrationProblem(Bundle):
 
 
 def make_problem(
-    view: SceneView,
-    model: ObjectModel,
-    scene: SdfField,
-    obj: SdfField,
-    options: RobustOptions,
+    view: SceneView, model: ObjectModel, scene: SdfField, obj: SdfField, options: RobustOptions
 ) -> RegistrationProblem:
     """Divide the samples of both surfaces into those to fit and those to hold out, on the device of the scene's field.
 

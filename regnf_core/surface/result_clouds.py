@@ -99,11 +99,7 @@ _TOLERANCE_SHARE = 0.05  # of a typical gap: largest |S| at a new point
 
 
 def upsample(
-    field: SdfField,
-    samples: SurfaceSamples,
-    count: int,
-    generator: torch.Generator,
-    inside: Callable[[Tensor], Tensor],
+    field: SdfField, samples: SurfaceSamples, count: int, generator: torch.Generator, inside: Callable[[Tensor], Tensor]
 ) -> SurfaceSamples:
     """The samples and new ones, about ``count`` in all: old points shifted along the surface, then projected onto it.
 

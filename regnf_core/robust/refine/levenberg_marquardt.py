@@ -96,11 +96,7 @@ def _rate(T: Sim3, start: Tensor, r: Residuals) -> Tensor:
 
 
 def _step(
-    r: Residuals,
-    kernel: tuple[Tensor, Tensor | None],
-    damping: Tensor,
-    scale: Tensor,
-    settings: Settings,
+    r: Residuals, kernel: tuple[Tensor, Tensor | None], damping: Tensor, scale: Tensor, settings: Settings
 ) -> Tensor:
     """(H, 7) or, with an offset, (H, 8) steps of (omega, dt, log scale, offset). kernel: its width, and what observed
     object samples weigh."""

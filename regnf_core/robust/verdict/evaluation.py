@@ -117,11 +117,7 @@ _MOST = 6
 
 
 def considered_poses(
-    problem: RegistrationProblem,
-    candidates: PoseCandidates,
-    held_out: HeldOut,
-    answer: Answer,
-    options: RobustOptions,
+    problem: RegistrationProblem, candidates: PoseCandidates, held_out: HeldOut, answer: Answer, options: RobustOptions
 ) -> Considered:
     """The best of the candidates that differ, the likeliest first."""
     points = problem.model.extremal_points
@@ -199,10 +195,7 @@ class Evaluation:
 
 
 def evaluate_candidates(
-    problem: RegistrationProblem,
-    candidates: PoseCandidates,
-    options: RegistrationOptions,
-    known: HeldOut | None = None,
+    problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions, known: HeldOut | None = None
 ) -> Evaluation:
     """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
 
