@@ -33,7 +33,7 @@ from regnf_core.texts import json_value
 def field_path(text: str) -> Path:
     """The path of a field: of a file, a training run's folder or an archive. Raises what ``find_source`` does."""
     path = Path(text)
-    find_source(path, settings=False)
+    find_source(path, config=False)
     return path
 
 

@@ -42,7 +42,7 @@ class LoadedField:
 def open_field(
     path: str | os.PathLike[str] | object,
     description: Mapping[str, Any] | None = None,
-    settings: SettingsChoice = None,
+    config: SettingsChoice = None,
     device: str = "cpu",
     cache_dir: Path | None = None,
 ) -> SdfField:
@@ -50,7 +50,7 @@ def open_field(
 
     A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``.
     In place of a path, a mesh or a cloud of trimesh or Open3D is taken as a file of it would be. ``description`` says
-    what the file does not carry, see UploadDescription. ``settings`` names the trainer's settings: a file, or an
+    what the file does not carry, see UploadDescription. ``config`` names the trainer's settings: a file, or an
     archive of several; None takes those beside the checkpoint, False none. A warning of the import is issued as a
     FieldWarning.
 
@@ -61,7 +61,7 @@ def open_field(
         from regnf_core.fields.build import usable_device
 
         return field_of(path, description=description).to(usable_device(device))
-    loaded = load_field(find_source(Path(path), description, settings), device, cache_dir)
+    loaded = load_field(find_source(Path(path), description, config), device, cache_dir)
     for warning in loaded.notes.warnings:
         warnings.warn(f"{path}: {warning}", FieldWarning, stacklevel=2)
     return loaded.field
