@@ -9,7 +9,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.refine.levenberg_marquardt import minimize
-from regnf_core.robust.refine.loss import normal_equations, observed_weight, robust_cost
+from regnf_core.robust.refine.loss import normal_equations, observed_weight
 from regnf_core.robust.residuals import Residuals, SurfacePair
 from regnf_core.robust.working_frame import Samples
 from tests.core.robust.shapes import random_pose
@@ -88,14 +88,13 @@ def test_the_frames_and_their_units_do_not_matter(frame: int) -> None:
     assert float(there.scale * S.scale) == pytest.approx(float(here.scale), rel=1e-6)
 
 
-def partly_observed(step: Tensor | None = None) -> Residuals:
+def partly_observed() -> Residuals:
     """Of seven samples, three of them the scene's; one of the four of the object was observed."""
     generator = torch.Generator().manual_seed(0)
     values = 0.02 * torch.randn(1, 7, generator=generator, dtype=D)
     J = torch.randn(1, 7, 7, generator=generator, dtype=D)
-    moved = values if step is None else values + J @ step
     unobserved = torch.tensor([[False, False, True, False, True, True, True]])
-    return Residuals(moved, J, torch.ones(1, 7, dtype=D), 3, unobserved)
+    return Residuals(values, J, torch.ones(1, 7, dtype=D), 3, unobserved)
 
 
 def test_observed_samples_weigh_as_if_all_had_been_observed() -> None:
@@ -109,16 +108,6 @@ def test_observed_samples_weigh_as_if_all_had_been_observed() -> None:
     J, value = r.jacobian[0, 3], r.values[0, 3]
     one = J[:, None] * J[None] / (1 + (value / width) ** 2) ** 2 / 4
     torch.testing.assert_close((weighted - plain)[0], 3 * one)
-
-
-def test_the_normal_equations_are_the_gradient_of_the_weighted_cost() -> None:
-    width, r = 0.03, partly_observed()
-    weight = observed_weight(r)
-    step = torch.zeros(7, dtype=D, requires_grad=True)
-    cost = robust_cost(partly_observed(step), width, weight=weight)
-    (gradient,) = torch.autograd.grad(cost.sum(), step)
-    _, b = normal_equations(r, width, weight=weight)
-    torch.testing.assert_close(b[0] / width**2, gradient)
 
 
 def test_where_next_to_nothing_was_observed_the_weight_is_bounded() -> None:

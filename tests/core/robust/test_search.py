@@ -117,15 +117,13 @@ def test_the_boxs_own_axes_count() -> None:
 
 
 def test_a_pose_that_fills_the_box_is_not_penalized() -> None:
-    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0))])
-    exact, tight, small, large, beside = bound(1.0).penalty(poses).tolist()
+    """And by half of the weight where every face is one kernel width off."""
+    off = placed(1.0 + 2.0 * SEARCH.box_width)
+    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0)), off])
+    exact, tight, small, large, beside, half = bound(1.0).penalty(poses).tolist()
     assert exact == pytest.approx(0.0, abs=1e-12)
     assert exact < tight < beside < small < large < SEARCH.box_weight
-
-
-def test_the_penalty_is_half_its_weight_where_every_face_is_one_kernel_width_off() -> None:
-    pose = placed(1.0 + 2.0 * SEARCH.box_width)
-    assert float(bound(1.0).penalty(pose)) == pytest.approx(SEARCH.box_weight / 2)
+    assert half == pytest.approx(SEARCH.box_weight / 2)
 
 
 @pytest.mark.parametrize(

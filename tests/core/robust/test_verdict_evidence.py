@@ -91,10 +91,9 @@ def samples(*rows: tuple[float, float, float]) -> Samples:
     return Samples(points, torch.zeros(len(rows)), normals)
 
 
-def share(A: Samples, right: float, T: Sim3 | None = None) -> float:
+def share(A: Samples, right: float) -> float:
     """Of the samples near the plane z = 0 as object, in a scene whose matter reaches to ``right`` above x = 5."""
-    surfaces = SurfacePair(Floor(0.0, right), Floor(0.0, 0.0), A, A)
-    return share_of(surfaces, (Sim3.identity() if T is None else T)[None])
+    return share_of(SurfacePair(Floor(0.0, right), Floor(0.0, 0.0), A, A), Sim3.identity()[None])
 
 
 def share_of(surfaces: SurfacePair, T: Sim3) -> float:
@@ -105,24 +104,27 @@ def share_of(surfaces: SurfacePair, T: Sim3) -> float:
     return float(found.sum() / near.sum().clamp_min(1))
 
 
-def test_what_lies_on_the_object_is_unexplained() -> None:
-    A = samples(*[(float(x), 0.0, 1.0) for x in range(5)], (6.0, 0.06, 1.0), (7.0, 0.06, 1.0), (8.0, 0.5, 1.0))
-    assert share(A, 0.06) == pytest.approx(2 / 7)  # the last is too far off to be near
+ON = tuple((float(x), 0.0, 1.0) for x in range(5))
+ACROSS = (*((float(x), 0.0, 1.0) for x in range(8)), (6.0, 0.06, -1.0), (7.0, 0.06, -1.0))
 
 
-def test_what_faces_the_object_across_a_gap_is_not() -> None:
-    A = samples(*[(float(x), 0.0, 1.0) for x in range(8)], (6.0, 0.06, -1.0), (7.0, 0.06, -1.0))
-    assert share(A, 0.0) == 0.0
-    assert share(A, 0.06) == pytest.approx(0.2)  # the same, but what it faces is not there
-
-
-def test_only_what_is_asked_about_is_unexplained() -> None:
-    A = samples((0.0, 0.029, 1.0), (1.0, -0.06, 1.0), (2.0, 0.031, 1.0))
-    assert share(A, 0.0) == pytest.approx(1 / 3)
+@pytest.mark.parametrize(
+    ("rows", "right", "expected"),
+    [
+        # what lies on the object; the last is too far off to be near
+        ((*ON, (6.0, 0.06, 1.0), (7.0, 0.06, 1.0), (8.0, 0.5, 1.0)), 0.06, 2 / 7),
+        (ACROSS, 0.0, 0.0),  # what faces the object across a gap
+        (ACROSS, 0.06, 0.2),  # the same, but what it faces is not there
+        (((0.0, 0.029, 1.0), (1.0, -0.06, 1.0), (2.0, 0.031, 1.0)), 0.0, 1 / 3),  # only what is asked about
+        (((0.0, 3.0, 1.0),), 0.0, 0.0),  # nothing is near
+    ],
+)
+def test_what_is_unexplained_by_hand(rows: Any, right: float, expected: float) -> None:
+    assert share(samples(*rows), right) == pytest.approx(expected)
 
 
 def test_it_is_the_same_in_every_frame() -> None:
-    A = samples(*[(float(x), 0.0, 1.0) for x in range(5)], (6.0, 0.06, 1.0))
+    A = samples(*ON, (6.0, 0.06, 1.0))
     T = Sim3.from_quaternion(2.0, [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
     half = Samples(A.points / 2.0, A.values, A.normals)
 
@@ -264,15 +266,15 @@ def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> No
     assert float(found.probability[2]) == pytest.approx(float(found.probability_alone[2])), "it is not listed"
 
 
-def test_poses_that_place_other_surface_compete_though_both_are_listed() -> None:
-    found = answer([0.0, 0.6], [0.2, 0.21])
-    assert (found.winner, found.rivals) == (0, [1])
-    assert torch.equal(found.probability, found.probability_alone)
-
-
-def test_without_rivals_both_probabilities_are_the_same() -> None:
-    found = answer([0.0, 0.03, 0.6], [0.2, 0.21, 0.5])
-    assert found.rivals == []
+@pytest.mark.parametrize(
+    ("shifts", "scores", "rivals"), [([0.0, 0.6], [0.2, 0.21], [1]), ([0.0, 0.03, 0.6], [0.2, 0.21, 0.5], [])]
+)
+def test_poses_that_place_other_surface_compete_though_both_are_listed(
+    shifts: list[float], scores: list[float], rivals: list[int]
+) -> None:
+    """And without rivals both probabilities are the same too."""
+    found = answer(shifts, scores)
+    assert (found.winner, found.rivals) == (0, rivals)
     assert torch.equal(found.probability, found.probability_alone)
 
 
