@@ -61,12 +61,7 @@ SLAB_BOX = OrientedBox.from_corners([-0.55, -0.5, -0.02], [0.15, 0.2, 0.36])
 
 
 def plain(
-    name: str,
-    scene: Any,
-    obj: Any,
-    box: OrientedBox,
-    options: dict[str, Any] | None = None,
-    start: Sim3 | None = None,
+    name: str, scene: Any, obj: Any, box: OrientedBox, options: dict[str, Any] | None = None, start: Sim3 | None = None
 ) -> Case:
     """A registration of two fields, with seed 1."""
     wanted = RegistrationOptions.from_dict(options or {})

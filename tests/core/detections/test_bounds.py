@@ -101,11 +101,7 @@ def test_the_distance_of_upright_boxes_is_exact(center: Vector, apart: float) ->
             "units from the scene's bounds",
             "in millimeters? Divided by 1000",
         ),
-        (
-            Detection((-56.2, -28.3, 20.0), (54.6, 59.8, 51.1)),
-            "units from",
-            "centimeters or inches? Divided by 100 or",
-        ),
+        (Detection((-56.2, -28.3, 20.0), (54.6, 59.8, 51.1)), "units from", "centimeters or inches? Divided by 100 or"),
         (Detection((39.37, 39.37, 39.37), (20, 20, 20)), "units from", "or inches?"),
         (
             Detection((20, 20, 20), (1, 1, 1)),

@@ -127,8 +127,7 @@ def test_a_pose_that_fills_the_box_is_not_penalized() -> None:
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "verdict", "reason"),
-    [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")],
+    ("tolerance", "verdict", "reason"), [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")]
 )
 def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str, reason: str) -> None:
     """Every edge of the box is 0.7 of the chair's. The search begins at the right pose, so it is the one judged."""
