@@ -93,7 +93,7 @@ class PoseBound(Bundle):
         placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
         low, high = placed.amin(-2), placed.amax(-2)
         reach = self.edges / 2 + self.tolerance * self._lengths
-        within = (low >= -reach).all(-1) & (high <= reach).all(-1)
+        within = (low >= -reach).all(-1) & (high <= reach).all(-1)  # the box's center is 0
         size = ((high - low) / self._lengths).amax(-1)
         return within & (size >= SEARCH.min_share_of_detection)
 
@@ -165,6 +165,7 @@ def _from_moments(
     scene_center, object_center = scene_points.mean(0), object_points.mean(0)
     ratio = _radius(object_points - object_center) / _radius(scene_points - scene_center)
     tried = (ratio * scales.double()).clamp(bound.low, bound.high)
+    # Factors that the bound holds back are the same scale: each is tried once.
     tried = tried if bound.is_open else tried.new_tensor(sorted(set(tried.tolist())))
     s = tried[:, None].expand(-1, rotations.shape[0]).reshape(-1)
     R = rotations.repeat(len(tried), 1, 1)
@@ -186,7 +187,7 @@ def _from_extents(
 def _object_extents(object_points: Tensor, rotations: Tensor, box_axes: Tensor) -> tuple[Tensor, Tensor]:
     """Lowest and highest coordinates (K, 3) of the object along the box's axes, for every rotation."""
     parts = -(-len(rotations) * len(object_points) // _POINTS_AT_ONCE)
-    rows = object_points.T.contiguous()
+    rows = object_points.T.contiguous()  # long rows: the lowest and the highest along one are found at once
     turns = (rotations @ box_axes).mT  # (K, 3, 3)
     found = [part.bmm(rows.expand(len(part), -1, -1)).aminmax(dim=2) for part in turns.tensor_split(max(1, parts))]
     return torch.cat([ends.min for ends in found]), torch.cat([ends.max for ends in found])

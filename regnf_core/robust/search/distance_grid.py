@@ -51,6 +51,7 @@ class DistanceGrid(Bundle):
         places = points.T.contiguous()
         inside = torch.minimum(torch.maximum(places, self.low), self.high)
         cell = ((inside - self.low) / self.edge).int().clamp_(0, _CELLS - 1)
+        # Planes are four numbers each, one after the other: the index moves on by one from number to number.
         index = cell[0].mul_(_CELLS).add_(cell[1]).mul_(_CELLS).add_(cell[2]).mul_(4)
         value = self.planes.index_select(0, index)
         gradient = torch.empty_like(places)
@@ -99,6 +100,7 @@ def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, que
     n = normals[nearest]
     height = (offset * n).sum(-1)
     sign = torch.where(height >= 0, 1.0, -1.0)
+    # Between samples the nearest one is farther than the surface, and its tangent plane is not.
     close = far < SEARCH.tangent_spacings * spacing
     value = torch.where(close, height, sign * far)
     gradient = torch.where(close[:, None], n, sign[:, None] * offset / far.clamp_min(1e-9)[:, None])
