@@ -20,7 +20,7 @@ from regnf_core.importing.observing.trajectory import Array, Axes, Intrinsics, T
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_core.surface.observing import observe_by_cameras
 
-POINTS = 500_000
+POINTS = 1_500_000
 
 
 def room() -> UnionField:
