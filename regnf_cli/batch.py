@@ -123,7 +123,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
     from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import LibraryObject, WarmStart, register, search_library
+    from regnf_core.library import LibraryObject, register, search_library
 
     request = pair.request or {}
     options = RegistrationOptions.from_dict(request["options"])
@@ -141,10 +141,11 @@ def _document(pair: FilePair) -> dict[str, Any]:
         return dict(result_document(found.result, object_name=found.ranking[0].name, candidates=ranking))
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
-    warm = WarmStart(None if start is None else Sim3.from_matrix(start), model)
+    initial = None if start is None else Sim3.from_matrix(start)
     # errors against a truth are those of the clouds' points
     clouds = truth is not None
-    result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=clouds)
+    obj = _field(name, "object")
+    result = register(scene, obj, box, options, request["seed"], None, initial, model, clouds)
     return dict(result_document(result, None if truth is None else Sim3.from_matrix(truth)))
 
 

@@ -55,7 +55,7 @@ def _no_folder(path: Path) -> None:
 file = _parser(require_file)
 folder = _parser(_no_folder, folders=True)
 existing = _parser(require_file, folders=True)
-field_path = _parser(lambda path: find_source(path, settings=False))
+field_path = _parser(lambda path: find_source(path, config=False))
 """Of a field: a file, a training run's folder or an archive."""
 library_path = _parser(require_field_file, folders=True)
 """A folder of fields, or a field."""

@@ -97,7 +97,7 @@ def register_here(scene: FieldSource, objects: Objects, request: dict[str, Any],
     from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import WarmStart, register, search_library
+    from regnf_core.library import register, search_library
     from regnf_core.loading import import_smallest_first, load_field, safe_field
 
     options = RegistrationOptions.from_dict(request["options"])
@@ -122,9 +122,9 @@ def register_here(scene: FieldSource, objects: Objects, request: dict[str, Any],
             opened = load_field(scene)
             check_box(scene.named, detection, _bounds_of(opened.field), _bounds_of(obj.field))
             start, truth = request["initial_transform"], request["ground_truth"]
-            warm = WarmStart(T_object_scene=Sim3.from_matrix(start) if start else None)
+            initial = Sim3.from_matrix(start) if start else None
             said["truth"] = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
-            result = register(opened.field, obj.field, box, options, seed, report, warm, clouds=wanted)
+            result = register(opened.field, obj.field, box, options, seed, report, initial, clouds=wanted)
             name, notes = str(objects.named), obj.notes
         report("exporting", 1.0)
     said |= {"object_name": name, "fields": {"scene": opened.notes, "object": notes}}

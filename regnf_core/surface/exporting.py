@@ -14,14 +14,11 @@ from trimesh.exchange.gltf import export_glb
 from regnf_core.errors import InvalidInputError, atomic_path
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import SdfField
-from regnf_core.surface.isosurface import Floats, Lattice, Surface, extract_surface
+from regnf_core.surface.isosurface import Floats, Lattice, Progress, Surface, extract_surface
 
 MESH_FORMATS = ("glb", "ply")
 _SLAB_POINTS = 1 << 18
 _MAX_NODES = 1 << 28
-
-Progress = Callable[[int], None]
-"""Called with the number of points evaluated so far."""
 
 
 def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Progress | None = None) -> int:

@@ -92,13 +92,13 @@ def test_what_was_imported_is_kept_for_the_same_file_settings_and_description(ga
     for _ in range(2):
         opened(run_folder)
     assert len(gate.asked) == 1
-    opened(run_folder, settings=False)
+    opened(run_folder, config=False)
     opened(run_folder, description={"sign": -1})
     (run_folder / "config.yml").write_text("method: neus-facto\n")
     opened(run_folder)
     other = run_folder.parent / "other.yml"
     other.write_text("method: neus-facto\n")
-    opened(run_folder, settings=other)
+    opened(run_folder, config=other)
     assert [(one["description"], one["settings"]) for one in gate.asked[1:]] == [
         (None, None),
         ({"sign": -1}, b"method: neus\n"),

@@ -33,7 +33,7 @@ def test_each_pair_ends_as_it_would_alone_and_a_faulty_one_spoils_no_other() -> 
     assert [(one.detection, one.object) for one in outcomes] == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert [one.error.reason if one.error else None for one in outcomes] == ["NO_SURFACE_IN_DETECTION"] * 2 + [None] * 2
     for outcome, obj in zip(outcomes[2:], (chair(), table()), strict=True):
-        alone = register(scene, obj, detection(), ROBUST, seed=3)
+        alone = register(scene, obj, detection(), ROBUST, seed=3, clouds=False)
         assert outcome.result is not None
         assert outcome.result.verdict == alone.verdict
         torch.testing.assert_close(
@@ -47,9 +47,9 @@ def test_what_pairs_share_is_made_once() -> None:
     scene, obj = CountingField(room(chair_pose())), CountingField(chair())
     register_batch(scene, [detection()], [obj], options=ROBUST, clouds=False)
     of_scene, of_object = scene.evaluations, obj.evaluations
-    register_batch(scene, [detection()], [obj, obj], pairs=[(0, 0), (0, 0), (0, 0)], options=ROBUST, clouds=False)
-    assert scene.evaluations - of_scene < 2.8 * of_scene
-    assert obj.evaluations - of_object < 2.8 * of_object
+    register_batch(scene, [detection()], [obj, obj], pairs=[(0, 0), (0, 0)], options=ROBUST, clouds=False)
+    assert scene.evaluations - of_scene < 1.9 * of_scene
+    assert obj.evaluations - of_object < 1.9 * of_object
 
 
 def test_a_model_that_was_made_earlier_saves_making_it() -> None:

@@ -31,11 +31,18 @@ HAVE_IT_IN_THEIR_MESSAGE = {"EXTRA_MISSING", "USAGE", "CANCELLED"}
 
 
 @cache
+def trees() -> list[tuple[Path, ast.Module]]:
+    """Every module of the code."""
+    paths = [path for top in (*PACKAGES, "service") for path in sorted((ROOT / top).rglob("*.py"))]
+    return [(path, ast.parse(path.read_text(encoding="utf-8"))) for path in paths]
+
+
+@cache
 def texts() -> list[tuple[Path, str]]:
     """Every literal text of the code that is a hint: of the table, or given by the name ``hint``."""
     found = [(ROOT / "regnf_core/errors.py", text) for text in (*HINTS.values(), *_FAMILIES.values())]
-    for path in (path for top in (*PACKAGES, "service") for path in sorted((ROOT / top).rglob("*.py"))):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path, tree in trees():
+        for node in ast.walk(tree):
             is_hint = isinstance(node, ast.keyword) and node.arg == "hint"
             is_kept = isinstance(node, ast.Assign) and "hint" in ast.unparse(node.targets[0]).lower()
             if isinstance(node, ast.keyword | ast.Assign) and (is_hint or is_kept):
@@ -45,16 +52,16 @@ def texts() -> list[tuple[Path, str]]:
 
 
 def reasons() -> Iterator[str]:
-    for path in (path for top in PACKAGES for path in (ROOT / top).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path, tree in trees():
+        for node in ast.walk(tree) if ROOT / "service" not in path.parents else ():
             if isinstance(node, ast.keyword) and node.arg == "reason" and isinstance(node.value, ast.Constant):
                 yield str(node.value.value)
 
 
 def constants() -> Iterator[tuple[ast.AST, str]]:
     """Every literal text of the code, with what it stands in."""
-    for path in (path for top in (*PACKAGES, "service") for path in (ROOT / top).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for _, tree in trees():
+        for node in ast.walk(tree):
             for child in ast.iter_child_nodes(node):
                 if isinstance(child, ast.Constant) and isinstance(child.value, str):
                     yield node, child.value
@@ -72,8 +79,8 @@ def reasons_of_classes() -> Iterator[str]:
 def hinted_on_the_spot() -> set[str]:
     """Reasons of which each use of the code gives a hint of its own."""
     always: dict[str, bool] = {}
-    for path in (path for top in PACKAGES for path in (ROOT / top).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for path, tree in trees():
+        for node in ast.walk(tree) if ROOT / "service" not in path.parents else ():
             if isinstance(node, ast.Call):
                 said = {one.arg: one.value for one in node.keywords}
                 reason = said.get("reason")

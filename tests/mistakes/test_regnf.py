@@ -41,7 +41,7 @@ CASES = [
     Case("spelling of earlier versions", "INVALID_OPTIONS", 0, "options.optimisation", "no such option", "did you mean `optimization`", registered(options={"optimisation": {}})),
     Case("option of another type", "INVALID_OPTIONS", 0, "options.robust.rotations", "valid integer", "docs/api.md", registered(options={"robust": {"rotations": "many"}})),
     Case("preset misspelled", "INVALID_OPTIONS", 0, "options.preset", "'paper' or 'robust'", "docs/api.md", registered(options={"preset": "robst"})),
-    Case("start under another preset", "INITIAL_TRANSFORM_UNSUPPORTED", 0, "given transform", "only the preset `robust`", "paper", registered(room(chair_pose()), chair(), options={"preset": "paper"}, warm_start=regnf.WarmStart(T_object_scene=chair_pose()))),
+    Case("start under another preset", "INITIAL_TRANSFORM_UNSUPPORTED", 0, "given transform", "only the preset `robust`", "paper", registered(room(chair_pose()), chair(), options={"preset": "paper"}, initial_transform=chair_pose())),
     Case("no box", "INVALID_DETECTION", 0, "detection is null", "expected an object with a box", '"min"', registered(detection=None)),
     Case("box without a size", "INVALID_DETECTION", 0, "detection.size", "is missing", '"min"', registered(detection={"center": [0, 0, 0]})),
     Case("quaternion of unknown order", "INVALID_DETECTION", 0, "detection.rotation", "unknown order", "xyzw.*wxyz", registered(detection={"center": [0, 0, 0], "size": [1, 1, 1], "rotation": [0, 0, 0, 1]})),

@@ -23,7 +23,7 @@ def test_the_request_reaches_the_engine(
 ) -> None:
     calls: list[Any] = []
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
-    monkeypatch.setattr("regnf_core.library.register", lambda *given, clouds: calls.append((*given, clouds)))
+    monkeypatch.setattr("regnf_core.library.register", lambda *given: calls.append(given))
     written: list[Any] = []
 
     def write_result(result: Any, folder: Path, **said: Any) -> list[str]:
@@ -36,13 +36,13 @@ def test_the_request_reaches_the_engine(
     files = Path("scene"), Path("object")
     notes = {"scene": FieldNotes("neus", None, ("SIGN_UNCERTAIN: perhaps",))}
     made = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
-    ((scene, obj, box, options, seed, _, warm, clouds),) = calls
-    assert (scene, obj, seed, warm.object_model, clouds) == ("scene", "object", 3, "the model", False)
+    ((scene, obj, box, options, seed, _, initial, model, clouds),) = calls
+    assert (scene, obj, seed, model, clouds) == ("scene", "object", 3, "the model", False)
     assert (made.names, "preview.png" in made.to_come) == (["result.json"], pictures)
     assert written == [{"scene": notes["scene"], "object": FieldNotes()}]
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
-    assert (None if warm.T_object_scene is None else warm.T_object_scene.matrix().tolist()) == start
+    assert (None if initial is None else initial.matrix().tolist()) == start
 
 
 @pytest.mark.parametrize("pictures", [True, False])

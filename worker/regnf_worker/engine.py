@@ -149,16 +149,16 @@ class CoreEngine:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
-        from regnf_core.library import WarmStart, register, with_late_clouds
+        from regnf_core.library import register, with_late_clouds
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         _one_thread()
         start, truth = request.initial_transform, request.ground_truth
         fields = open_field(scene, self.device), open_field(object_, self.device)
         box, options = OrientedBox.from_quaternion(**asdict(request.detection)), request.options
-        warm = WarmStart(Sim3.from_matrix(start) if start else None, model)
+        initial = Sim3.from_matrix(start) if start else None
         # errors against a truth are those of the clouds' points
-        result = register(*fields, box, options, request.seed, report, warm, clouds=bool(truth))
+        result = register(*fields, box, options, request.seed, report, initial, model, bool(truth))
         T_true = Sim3.from_matrix(truth) if truth else None
         said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object)}
         names = write_result(result, folder, truth=T_true, **said)

@@ -61,7 +61,7 @@ def test_exact_transforms_pass_in_the_spelling_of_documents() -> None:
 def test_the_engine_takes_whatever_passes() -> None:
     generator = torch.Generator().manual_seed(0)
     passed = refused = 0
-    for _ in range(400):
+    for _ in range(150):
         T = Sim3.exp(torch.randn(7, generator=generator, dtype=torch.float64))
         matrix = T.matrix()
         noise = torch.randn(3, 3, generator=generator, dtype=torch.float64)
@@ -71,7 +71,7 @@ def test_the_engine_takes_whatever_passes() -> None:
             Sim3.from_matrix(matrix)
         else:
             refused += 1
-    assert min(passed, refused) > 50  # the line runs through the cases
+    assert min(passed, refused) > 20  # the line runs through the cases
 
 
 def test_what_the_engine_refuses_does_not_pass() -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from regnf_core.errors import NoSurfaceError
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import SamplingOptions
@@ -16,7 +17,7 @@ from regnf_core.paper.sampling import sample_scene
 from regnf_core.surface.sphere_tracing import surface_bounds
 from tests.core.analytic import chair, chair_box, chair_pose, room, table
 
-OPTIONS = SamplingOptions()
+OPTIONS = SamplingOptions(pixel_stride=16)
 
 
 def residuals(near: int, far: int, distance: float) -> torch.Tensor:
@@ -68,9 +69,8 @@ def test_no_surface_for_the_verdict_is_said_in_the_end() -> None:
     assert caught.value.reason == "NO_SURFACE_IN_DETECTION"
 
 
-def verdict_of(T: Sim3, obj_name: str = "chair") -> Verification:
-    truth = chair_pose()
-    obj = chair() if obj_name == "chair" else table()
+def verdict_of(T: Sim3, obj: SdfField | None = None) -> Verification:
+    truth, obj = chair_pose(), obj or chair()
     return verify(room(truth), obj, chair_box(truth), surface_bounds(obj), T, OPTIONS, 1.1)
 
 
@@ -80,7 +80,7 @@ def test_the_truth_is_accepted() -> None:
     assert found.metrics["residual_rms"] < INLIER_DISTANCE / 3
 
 
-@pytest.mark.parametrize("k", range(7))
+@pytest.mark.parametrize("k", [1, 4, 6])
 def test_a_transform_off_by_0_15_is_refused(k: int) -> None:
     tangent = torch.zeros(7, dtype=torch.float64)
     tangent[k] = 0.15
@@ -93,4 +93,4 @@ def test_collapsing_the_scene_to_a_point_of_the_surface_is_refused() -> None:
 
 
 def test_another_object_in_the_chairs_place_is_refused() -> None:
-    assert verdict_of(chair_pose(), "table").verdict == "rejected"
+    assert verdict_of(chair_pose(), table()).verdict == "rejected"

@@ -41,7 +41,7 @@ def disturbed(r: Residuals, errors: Tensor) -> tuple[Residuals, Tensor]:
     return Residuals(left[None].float(), r.jacobian, r.cosines, n), step
 
 
-@pytest.mark.parametrize("length", [0.0, 0.05, 0.15, 0.4])
+@pytest.mark.parametrize("length", [0.0, 0.15])
 def test_errors_of_any_length_lie_inside_the_ellipsoid(length: float) -> None:
     """Smooth errors with a tenth of their size in roughness; a length of 0 is roughness alone."""
     r, places = at_the_truth(250)
@@ -62,23 +62,6 @@ def test_errors_of_any_length_lie_inside_the_ellipsoid(length: float) -> None:
     middle = sorted(squares)[len(squares) // 2] / chi2.median(7)
     assert inside >= 0.85
     assert 0.3 < middle < 2.0
-
-
-def test_white_errors_give_the_textbook_covariance() -> None:
-    """In the mean over draws. A few hundred samples do not rule out that faces are off on their own: what they leave
-    open makes it up to twice as wide."""
-    r, places = at_the_truth(120)  # all of them are looked at
-    generator = torch.Generator().manual_seed(6)
-    sigma = 0.002
-    J = r.jacobian[0].double()
-    expected = sigma**2 * torch.linalg.inv(J.T @ J)
-    ratios = []
-    for _ in range(10):
-        left, _ = disturbed(r, sigma * torch.randn(len(places), generator=generator, dtype=torch.float64))
-        ratios.append((covariance(left, WIDTH[0], places).diagonal() / expected.diagonal()).sqrt())
-    ratio = torch.stack(ratios).mean(0)
-    assert ratio.min() > 0.9
-    assert ratio.max() < 2.0
 
 
 def test_faces_that_are_off_on_their_own_lie_inside_the_ellipsoid() -> None:

@@ -15,13 +15,13 @@ def sphere(count: int = 1500) -> torch.Tensor:
 
 def made() -> tuple[torch.Tensor, DistanceGrid]:
     normals = sphere()
-    return normals, DistanceGrid(0.5 * normals, normals, 0.05, SEARCH.grid_margin)
+    return normals, DistanceGrid.of(0.5 * normals, normals, 0.05, SEARCH.grid_margin)
 
 
 def test_holds_the_samples_distance_at_the_cells_centers() -> None:
     normals, grid = made()
     numbers = torch.randint(SEARCH.grid_cells, (200, 3), generator=torch.Generator().manual_seed(1))
-    centers = grid.low + (numbers + 0.5) * grid.edge
+    centers = grid.low[:, 0] + (numbers + 0.5) * grid.edge[:, 0]
     value, gradient = grid.value_and_gradient(centers)
     expected, slope = nearest_sample_distance(0.5 * normals, normals, 0.05, centers)
     torch.testing.assert_close(value, expected, rtol=0, atol=1e-6)
@@ -30,9 +30,9 @@ def test_holds_the_samples_distance_at_the_cells_centers() -> None:
 
 def test_goes_on_from_the_center_along_the_gradient() -> None:
     _, grid = made()
-    center = grid.low + 10.5 * grid.edge
+    center = grid.low[:, 0] + 10.5 * grid.edge[:, 0]
     value, gradient = grid.value_and_gradient(center[None])
-    step = 0.4 * grid.edge * torch.tensor([1.0, -1.0, 0.5])
+    step = 0.4 * grid.edge[:, 0] * torch.tensor([1.0, -1.0, 0.5])
     moved, same = grid.value_and_gradient((center + step)[None])
     torch.testing.assert_close(same, gradient)
     torch.testing.assert_close(moved, value + (gradient[0] @ step)[None], rtol=0, atol=1e-6)
@@ -40,7 +40,7 @@ def test_goes_on_from_the_center_along_the_gradient() -> None:
 
 def test_adds_the_distance_to_the_grid_beyond_it() -> None:
     _, grid = made()
-    border = torch.stack([grid.high, torch.tensor([0.0, 0.0, float(grid.low[2])])])
+    border = torch.stack([grid.high[:, 0], torch.tensor([0.0, 0.0, float(grid.low[2, 0])])])
     outside = border + torch.tensor([[0.3, 0.4, 0.0], [0.0, 0.0, -2.0]])
     value, gradient = grid.value_and_gradient(outside)
     at_border, _ = grid.value_and_gradient(border)

@@ -83,10 +83,6 @@ def test_poses_of_one_answer_lead_over_what_is_apart_from_all_of_them() -> None:
     assert found.tolist() == pytest.approx([1.5, 1.4, -0.2, -1.5])
 
 
-def test_a_single_answer_has_the_largest_lead() -> None:
-    assert leads(torch.tensor([-3.0]), torch.tensor([[False]])).tolist() == [6.0]
-
-
 def test_of_poses_that_are_about_as_likely_the_better_score_has_the_merit() -> None:
     found = merits(torch.tensor([1.0, 0.5, -3.0]).double(), torch.tensor([0.40, 0.35, 0.35]))
     assert found.argmax() == 1

@@ -49,16 +49,16 @@ def placed(T: Sim3, points: Tensor) -> Tensor:
     return ((T.inverse().apply(points.double()) - center) / 2.0).float()
 
 
-POSES = {
-    "the grid's own frame": Sim3.identity(),
-    "another frame": Sim3.identity().perturb(torch.tensor([0.4, -0.9, 0.3, 0.5, -0.2, 0.7, 0.8], dtype=torch.float64)),
-}
+IN_FRAMES = pytest.mark.parametrize(
+    "T",
+    [Sim3.identity(), Sim3.identity().perturb(torch.tensor([0.4, -0.9, 0.3, 0.5, -0.2, 0.7, 0.8]).double())],
+    ids=["the grid's own frame", "another frame"],
+)
 
 
-@pytest.mark.parametrize("name", POSES)
+@IN_FRAMES
 @pytest.mark.parametrize("margin", [0, 1])
-def test_what_faces_free_space_may_have_been_seen(name: str, margin: int) -> None:
-    T = POSES[name]
+def test_what_faces_free_space_may_have_been_seen(T: Sim3, margin: int) -> None:
     seen = in_frame(wall_seen_from_above(margin), T)
     points = placed(T, torch.tensor([[0.03, -0.21, 0.05], [0.5, 0.3, 0.05], [0.03, -0.21, 0.05]]))
     normals = turned(T, torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.6, 0.0, -0.8]]))
@@ -66,9 +66,8 @@ def test_what_faces_free_space_may_have_been_seen(name: str, margin: int) -> Non
     assert not seen.unobserved(points, torch.zeros(3)).any(), "a surface was measured there"
 
 
-@pytest.mark.parametrize("name", POSES)
-def test_states_in_a_working_frame_are_those_of_the_observation(name: str) -> None:
-    T = POSES[name]
+@IN_FRAMES
+def test_states_in_a_working_frame_are_those_of_the_observation(T: Sim3) -> None:
     observation = wall_seen_from_above()
     seen = in_frame(observation, T)
     generator = torch.Generator().manual_seed(0)
@@ -124,7 +123,7 @@ def test_a_scene_sample_that_nobody_saw_from_its_front_counts_only_where_the_obj
     found = residuals(SurfacePair(Slab(), Slab(), scene, sheet), Sim3.identity().expand(1))
     assert found.unobserved is not None
     assert found.unobserved[0].tolist() == [False, True, False, False]
-    narrower = scene[torch.tensor([2, 1])].to("cpu")
+    narrower = scene[torch.tensor([2, 1])].on("cpu")
     assert narrower.hidden is not None
     assert narrower.hidden.tolist() == [True, True]
 
@@ -138,10 +137,8 @@ def plate_seen_from_above() -> ObservedField:
 
 
 def test_a_view_knows_which_of_its_samples_nobody_saw_from_their_front() -> None:
-    view = view_scene(
-        plate_seen_from_above(), OrientedBox.from_corners([-0.7, -0.7, -0.2], [0.7, 0.7, 0.3]), RobustOptions()
-    )
-    foreground = view.foreground
+    box = OrientedBox.from_corners([-0.7, -0.7, -0.2], [0.7, 0.7, 0.3])
+    foreground = view_scene(plate_seen_from_above(), box, RobustOptions()).foreground
     assert foreground.hidden is not None
     up, down = foreground.normals[:, 2] > 0.9, foreground.normals[:, 2] < -0.9
     assert min(int(up.sum()), int(down.sum())) > 100

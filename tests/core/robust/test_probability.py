@@ -114,9 +114,3 @@ def test_the_shipped_models_use_what_they_must(observed: bool) -> None:
     for logits in (odds.alone.logit(worst), odds.log_odds(worst, alike, single)):
         assert float(logits[0].sigmoid()) < 1e-4
     assert float(odds.log_odds(best, alike, several)[0].sigmoid()) < likely
-
-
-@OBSERVED
-def test_a_perfect_pose_alone_is_as_likely(observed: bool) -> None:
-    best = {name: torch.tensor([1e3 if better else -1e3]).double() for name, better in SPEAKS_FOR.items()}
-    assert float(pose_odds(observed).alone.logit(best)[0].sigmoid()) > 0.98

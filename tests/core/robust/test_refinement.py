@@ -11,7 +11,7 @@ from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT, SEARCH
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
-from regnf_core.robust.refine.loss import disagreement, normal_equations, robust_cost
+from regnf_core.robust.refine.loss import disagreement, normal_equations, observed_weight, robust_cost
 from regnf_core.robust.residuals import (
     Residuals,
     SurfacePair,
@@ -30,37 +30,50 @@ from tests.core.robust.shapes import random_pose
 D = torch.float64
 
 
-def residuals_with(cosines: list[float], step: torch.Tensor | None = None) -> Residuals:
+WIDTH = 0.03
+COSINES = [0.9, 0.2, -0.7, 1.0, 0.5]
+
+
+def residuals_with(
+    cosines: list[float] = COSINES, step: torch.Tensor | None = None, unobserved: list[bool] | None = None
+) -> Residuals:
     """Of five samples, two of them the scene's, moved by a step (7,) of the pose; their cosines do not change."""
     generator = torch.Generator().manual_seed(0)
     values = 0.02 * torch.randn(1, 5, generator=generator, dtype=D)
     J = torch.randn(1, 5, 7, generator=generator, dtype=D)
     moved = values if step is None else values + J @ step
-    return Residuals(moved, J, torch.tensor([cosines], dtype=D), 2)
+    return Residuals(
+        moved, J, torch.tensor([cosines], dtype=D), 2, None if unobserved is None else torch.tensor([unobserved])
+    )
 
 
 @pytest.mark.parametrize("normals", [True, False])
-def test_the_normal_equations_are_the_gradient_of_the_cost_at_fixed_normals(normals: bool) -> None:
-    cosines, width = [0.9, 0.2, -0.7, 1.0, 0.5], 0.03
+@pytest.mark.parametrize("unobserved", [None, [False, True, False, True, True]])
+def test_the_normal_equations_are_the_gradient_of_the_cost_at_fixed_normals(
+    normals: bool, unobserved: list[bool] | None
+) -> None:
+    """Also where kernels are narrower and weights are larger, because a part was not observed."""
+    r = residuals_with(unobserved=unobserved)
+    weight = observed_weight(r)
     step = torch.zeros(7, dtype=D, requires_grad=True)
-    (gradient,) = torch.autograd.grad(robust_cost(residuals_with(cosines, step), width, normals).sum(), step)
-    _, b = normal_equations(residuals_with(cosines), width, normals)
-    torch.testing.assert_close(b[0] / width**2, gradient)
+    cost = robust_cost(residuals_with(step=step, unobserved=unobserved), WIDTH, normals, weight)
+    (gradient,) = torch.autograd.grad(cost.sum(), step)
+    _, b = normal_equations(r, WIDTH, normals, weight)
+    torch.testing.assert_close(b[0] / WIDTH**2, gradient)
+    if unobserved is not None:
+        assert float(robust_cost(r, WIDTH, normals)) < float(robust_cost(residuals_with(), WIDTH, normals))
 
 
 def test_a_sample_that_faces_away_costs_the_most_and_pulls_nothing() -> None:
-    width = 0.03
-    H, b = normal_equations(residuals_with([-0.1] * 5), width)
-    assert float(H.abs().max()) == 0.0
-    assert float(b.abs().max()) == 0.0
-    assert robust_cost(residuals_with([-0.1] * 5), width).tolist() == [1.0]
+    H, b = normal_equations(residuals_with([-0.1] * 5), WIDTH)
+    assert float(H.abs().max()) == float(b.abs().max()) == 0.0
+    assert robust_cost(residuals_with([-0.1] * 5), WIDTH).tolist() == [1.0]
 
 
 def test_where_all_was_observed_the_cost_is_the_score() -> None:
-    r, width = residuals_with([0.9, 0.2, -0.7, 1.0, 0.5]), 0.03
-    torch.testing.assert_close(robust_cost(r, width), disagreement(r, width))
-    without = robust_cost(r, width, normals=False)
-    assert float(without) < float(robust_cost(r, width))
+    r = residuals_with()
+    torch.testing.assert_close(robust_cost(r, WIDTH), disagreement(r, WIDTH))
+    assert float(robust_cost(r, WIDTH, normals=False)) < float(robust_cost(r, WIDTH))
 
 
 def test_an_object_is_not_drawn_to_surface_that_faces_it() -> None:
@@ -90,12 +103,6 @@ def test_the_last_stages_alone_leave_them_out() -> None:
 # Convergence of the batched Levenberg-Marquardt from perturbed starts, on exact fields.
 
 
-def test_weights_are_those_of_geman_and_mcclure() -> None:
-    # (w^2 / (w^2 + r^2))^2: 1 at zero, 1/4 at one width, 1/25 at two
-    r = torch.tensor([0.0, 0.1, 0.2])
-    torch.testing.assert_close(geman_mcclure_weight(r, 0.1), torch.tensor([1.0, 0.25, 0.04]))
-
-
 def test_weight_and_curvature_are_the_derivatives_of_the_loss() -> None:
     r, width = torch.tensor([0.0, 0.02, 0.1, 0.25], dtype=torch.float64, requires_grad=True), 0.1
     loss = geman_mcclure_loss(r, width)
@@ -107,7 +114,7 @@ def test_weight_and_curvature_are_the_derivatives_of_the_loss() -> None:
     torch.testing.assert_close(2 / width**2 * geman_mcclure_curvature(r, width, weight), bend)
 
 
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("scale", [0.1, 10.0])
 def test_many_perturbed_starts_come_back_at_once(scale: float) -> None:
     truth = random_pose(3, scale)
     generator = torch.Generator().manual_seed(0)

@@ -12,7 +12,6 @@ from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.robust.scene import support_planes
 from regnf_core.robust.search.bounds import super_fibonacci, turns_about
-from regnf_core.robust.search.distance_grid import DistanceGrid
 from regnf_core.robust.working_frame import sample_object_surface, sample_scene_surface
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
 from tests.core.robust.shapes import detection, random_pose
@@ -75,18 +74,6 @@ def test_an_empty_box_and_a_box_elsewhere_are_refused() -> None:
     with pytest.raises(InvalidDetectionError) as elsewhere:
         sample_scene_surface(room(chair_pose()), OrientedBox.from_corners([5, 5, 5], [6, 6, 6]), 500, generator())
     assert elsewhere.value.reason == "DETECTION_OUTSIDE_SCENE"
-
-
-def test_the_distance_grid_is_the_distance_to_within_the_spacing() -> None:
-    found = sample_object_surface(sphere(0.5), 3000, generator())
-    grid = DistanceGrid(found.samples.on_surface(), found.samples.normals, found.spacing, 0.2)
-    points = 1.4 * torch.rand(4000, 3, generator=generator()) - 0.7
-    value, gradient = grid.value_and_gradient(points)
-    exact = points.norm(dim=-1) - 0.5
-    assert (value - exact).abs().quantile(0.95) < 0.5 * found.spacing
-    shell = exact.abs() < 0.1
-    cosine = (gradient * points / points.norm(dim=-1, keepdim=True)).sum(-1)
-    assert cosine[shell].quantile(0.1) > 0.9
 
 
 def test_rotations_are_proper_and_cover_all_of_them() -> None:

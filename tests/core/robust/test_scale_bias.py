@@ -9,7 +9,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.refine.levenberg_marquardt import minimize
-from regnf_core.robust.refine.loss import normal_equations, observed_weight, robust_cost
+from regnf_core.robust.refine.loss import normal_equations, observed_weight
 from regnf_core.robust.residuals import Residuals, SurfacePair
 from regnf_core.robust.working_frame import Samples
 from tests.core.robust.shapes import random_pose
@@ -88,14 +88,13 @@ def test_the_frames_and_their_units_do_not_matter(frame: int) -> None:
     assert float(there.scale * S.scale) == pytest.approx(float(here.scale), rel=1e-6)
 
 
-def partly_observed(step: Tensor | None = None) -> Residuals:
+def partly_observed() -> Residuals:
     """Of seven samples, three of them the scene's; one of the four of the object was observed."""
     generator = torch.Generator().manual_seed(0)
     values = 0.02 * torch.randn(1, 7, generator=generator, dtype=D)
     J = torch.randn(1, 7, 7, generator=generator, dtype=D)
-    moved = values if step is None else values + J @ step
     unobserved = torch.tensor([[False, False, True, False, True, True, True]])
-    return Residuals(moved, J, torch.ones(1, 7, dtype=D), 3, unobserved)
+    return Residuals(values, J, torch.ones(1, 7, dtype=D), 3, unobserved)
 
 
 def test_observed_samples_weigh_as_if_all_had_been_observed() -> None:
@@ -111,29 +110,9 @@ def test_observed_samples_weigh_as_if_all_had_been_observed() -> None:
     torch.testing.assert_close((weighted - plain)[0], 3 * one)
 
 
-def test_the_normal_equations_are_the_gradient_of_the_weighted_cost() -> None:
-    width, r = 0.03, partly_observed()
-    weight = observed_weight(r)
-    step = torch.zeros(7, dtype=D, requires_grad=True)
-    cost = robust_cost(partly_observed(step), width, weight=weight)
-    (gradient,) = torch.autograd.grad(cost.sum(), step)
-    _, b = normal_equations(r, width, weight=weight)
-    torch.testing.assert_close(b[0] / width**2, gradient)
-
-
 def test_where_next_to_nothing_was_observed_the_weight_is_bounded() -> None:
     r = partly_observed()
     hidden = Residuals(r.values, r.jacobian, r.cosines, 3, torch.ones(1, 7, dtype=torch.bool))
     assert observed_weight(hidden).tolist() == [[1.0 / REFINEMENT.min_observed_share]]  # type: ignore[union-attr]
     everything = Residuals(r.values, r.jacobian, r.cosines, 3)
     assert observed_weight(everything) is None
-
-
-def test_samples_without_a_share_do_not_count_as_observed() -> None:
-    """Pairs that are worked on together have as many samples each; those that fill up have no share."""
-    r = partly_observed()
-    filled = torch.cat([r.values, torch.zeros(1, 2, dtype=D)], 1)
-    shares = torch.tensor([[1 / 3] * 3 + [1 / 4] * 4 + [0.0] * 2], dtype=D)
-    unobserved = torch.cat([r.unobserved, torch.zeros(1, 2, dtype=torch.bool)], 1)  # type: ignore[list-item]
-    together = Residuals(filled, torch.zeros(1, 9, 7, dtype=D), torch.ones(1, 9, dtype=D), 3, unobserved, None, shares)
-    torch.testing.assert_close(observed_weight(together), observed_weight(r))

@@ -108,12 +108,6 @@ def test_the_offset_is_taken_out_of_both_directions() -> None:
     torch.testing.assert_close(moved.jacobian, plain.jacobian)
 
 
-def test_the_offsets_column_is_the_derivative_of_the_values() -> None:
-    r = some_residuals(0.0)
-    column = r.jacobian_with_offset()[0, :, 7]
-    assert column.tolist() == [-1.0] * 4 + [1.0] * 5
-
-
 def test_the_gradient_is_that_of_the_cost() -> None:
     # b is w^2 times the derivative of the robust cost: here by the offset, its prior included, by finite differences.
     width, h = 0.02, 1e-6
@@ -164,7 +158,3 @@ def test_a_thick_rough_scene_is_registered_at_its_scale_and_says_so() -> None:
     assert float(result.T_object_scene.scale / truth.scale) == pytest.approx(1.0, abs=0.01)
     diameters = 0.012 * float(truth.scale) / result.metrics["object_diameter"]
     assert result.metrics["surface_offset"] == pytest.approx(diameters, abs=0.005)
-
-
-def test_a_smooth_scene_has_no_offset() -> None:
-    assert run(room(chair_pose()), chair(), detection()).metrics["surface_offset"] == 0.0

@@ -15,7 +15,6 @@ from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.model import model_object
-from regnf_core.robust.pipeline import WarmStart
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.search import bounds
 from regnf_core.robust.search.bounds import PoseBound, super_fibonacci
@@ -63,12 +62,6 @@ def test_copies_are_about_as_far_off_as_the_spread_says() -> None:
         angle = ((turn - 1.0) / 2.0).clamp(-1.0, 1.0).acos()
         assert 0.045 < float(growth.std()) < 0.055
         assert 0.09 < float((angle.square().mean() / 3.0).sqrt()) < 0.11
-
-
-def test_no_copies_leave_all_as_it_is() -> None:
-    own = candidates()
-    found = own.with_copies(0, (0.1, 0.03, 0.05), torch.Generator().manual_seed(0))
-    torch.testing.assert_close(found.T.matrix(), own.T.matrix(), rtol=0, atol=0)
 
 
 # What a detection allows: by hand, for a cube of edge 1 in a box of edge 2, scaled to a diagonal of 1.
@@ -119,35 +112,29 @@ def test_the_boxs_own_axes_count() -> None:
     turn = torch.tensor([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     poses = Sim3.cat([placed(0.70), placed(0.71)])
     assert bound(0.0, turn).admits(poses).tolist() == [True, False]
+    assert bound(0.0, turn).loosened(2.0).admits(poses).tolist() == [True, False], "twice nothing"
+    assert [one.admits(placed(1.3)).item() for one in (bound(0.1), bound(0.1).loosened(2.0))] == [False, True]
 
 
 def test_a_pose_that_fills_the_box_is_not_penalized() -> None:
-    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0))])
-    exact, tight, small, large, beside = bound(1.0).penalty(poses).tolist()
+    """And by half of the weight where every face is one kernel width off."""
+    off = placed(1.0 + 2.0 * SEARCH.box_width)
+    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0)), off])
+    exact, tight, small, large, beside, half = bound(1.0).penalty(poses).tolist()
     assert exact == pytest.approx(0.0, abs=1e-12)
     assert exact < tight < beside < small < large < SEARCH.box_weight
-
-
-def test_the_penalty_is_half_its_weight_where_every_face_is_one_kernel_width_off() -> None:
-    pose = placed(1.0 + 2.0 * SEARCH.box_width)
-    assert float(bound(1.0).penalty(pose)) == pytest.approx(SEARCH.box_weight / 2)
-
-
-def test_loosened() -> None:
-    assert not bound(0.1).admits(placed(1.3)).item()
-    assert bound(0.1).loosened(2.0).admits(placed(1.3)).item()
+    assert half == pytest.approx(SEARCH.box_weight / 2)
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "verdict", "reason"),
-    [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")],
+    ("tolerance", "verdict", "reason"), [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")]
 )
 def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str, reason: str) -> None:
     """Every edge of the box is 0.7 of the chair's. The search begins at the right pose, so it is the one judged."""
     scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
     part = OrientedBox(box.center, 0.7 * box.size, box.rotation)
     options = RegistrationOptions.from_dict({"robust": {"box_tolerance": tolerance}})
-    found = register(scene, obj, part, options, seed=0, warm_start=WarmStart(T_object_scene=truth), clouds=False)
+    found = register(scene, obj, part, options, seed=0, initial_transform=truth, clouds=False)
     assert (found.verdict, found.verdict_reason) == (verdict, reason)
     assert float(found.T_object_scene.scale) == pytest.approx(float(truth.scale), rel=1e-3)
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core import RegistrationResult, WarmStart, register
+from regnf_core import RegistrationResult, register
 from regnf_core.fields.composite import TransformedField
 from regnf_core.geometry.metrics import center_covariance, uncertainty
 from regnf_core.geometry.sim3 import Sim3
@@ -97,9 +97,9 @@ def registered(far: float) -> RegistrationResult:
     """The chair in its room, which stands that far from the scene's origin; the search begins near by."""
     move = Sim3.from_translation(torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64) * far)
     T = chair_pose() @ move.inverse()
-    start = WarmStart(Sim3.from_quaternion(1.0, [0.01, 0.0, 0.02, 1.0], [0.01, 0.0, -0.01]) @ T)
+    start = Sim3.from_quaternion(1.0, [0.01, 0.0, 0.02, 1.0], [0.01, 0.0, -0.01]) @ T
     scene = TransformedField(room(chair_pose()), move.inverse())
-    return register(scene, chair(), chair_box(T), warm_start=start, clouds=False)
+    return register(scene, chair(), chair_box(T), initial_transform=start, clouds=False)
 
 
 @pytest.mark.parametrize("far", [7.0, 60.0])
