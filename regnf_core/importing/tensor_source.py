@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
-from regnf_core.importing.containers.legacy_container import Entry
+from regnf_core.importing.containers.zip_members import Member
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder, StorageRef, TensorRef
 
 _STORED: dict[str, np.dtype[Any]] = {
@@ -29,7 +29,7 @@ class Archive(Protocol):
     """A container of torch.save: its storages' bytes under ``data/<key>``."""
 
     @property
-    def entries(self) -> Mapping[str, Entry]:
+    def entries(self) -> Mapping[str, Member]:
         """Where the entries lie, by name."""
         ...
 
@@ -69,15 +69,17 @@ class TensorSource:
 
     def _values(self, name: str, ref: TensorRef, stored: np.dtype[Any]) -> npt.NDArray[Any]:
         count = math.prod(ref.shape)
-        self._spend(name, 4 * count)
-        raw = self._storage(name, ref.storage, stored, count)
-        _check_dense(name, ref, count)
-        return _in_shape(_aligned(np.frombuffer(raw, dtype=stored)), ref)
-
-    def _spend(self, name: str, size: int) -> None:
-        self._budget -= size
+        self._budget -= 4 * count
         if self._budget < 0:
             raise tensor_error(f"with {name} the tensors exceed the limit", "TENSOR_TOO_LARGE")
+        raw = self._storage(name, ref.storage, stored, count)
+        _check_dense(name, ref, count)
+        flat = np.frombuffer(raw, dtype=stored)
+        if flat.ctypes.data % _ALIGNMENT:  # torch crashes over the odd addresses that other writers' entries have
+            flat = flat.copy()
+        order = sorted(range(len(ref.shape)), key=lambda axis: (-ref.strides[axis], ref.shape[axis] == 1))
+        in_file = flat.reshape([ref.shape[axis] for axis in order])
+        return in_file.transpose(np.argsort(order)) if order else in_file
 
     def _storage(self, name: str, storage: StorageRef, stored: np.dtype[Any], count: int) -> memoryview:
         entry = self._archive.entries.get(f"data/{storage.key}")
@@ -128,14 +130,3 @@ def _check_dense(name: str, ref: TensorRef, count: int) -> None:
         expected *= extent
     if ref.offset:
         raise tensor_error(f"{name} begins at element {ref.offset} of its storage", "TENSOR_STORAGE_MISMATCH")
-
-
-def _aligned(flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The array where wide loads may read it: torch crashes over the odd addresses that other writers' entries have."""
-    return flat.copy() if flat.ctypes.data % _ALIGNMENT else flat
-
-
-def _in_shape(flat: npt.NDArray[Any], ref: TensorRef) -> npt.NDArray[Any]:
-    order = sorted(range(len(ref.shape)), key=lambda axis: (-ref.strides[axis], ref.shape[axis] == 1))
-    stored = flat.reshape([ref.shape[axis] for axis in order])
-    return stored.transpose(np.argsort(order)) if order else stored

@@ -7,7 +7,6 @@ imports. There are no checksums; but every byte must be accounted for, so the fi
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,17 +22,6 @@ from regnf_core.importing.pickle.pickle_reader import LeadingPickle, read_leadin
 # every entry can be mapped where it lies.
 
 MAX_PICKLE_BYTES = 32 * 1024 * 1024
-_CRC_CHUNK = 1 << 24
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One stored entry: ``size`` bytes at ``offset`` of the file, with the CRC-32 the directory claims."""
-
-    name: str
-    offset: int
-    size: int
-    crc32: int
 
 
 @dataclass(frozen=True)
@@ -41,18 +29,11 @@ class TorchArchive:
     """The entries by their name below the archive's folder: "data.pkl", "data/0" ..."""
 
     data: memoryview
-    entries: dict[str, Entry]
+    entries: Mapping[str, Member]
 
     def read(self, name: str) -> memoryview:
         """The entry's bytes, not copied, after checking their CRC. Raises FieldFormatError (ARCHIVE_CRC_MISMATCH)."""
-        entry = self.entries[name]
-        view = self.data[entry.offset : entry.offset + entry.size]
-        crc32 = 0
-        for start in range(0, entry.size, _CRC_CHUNK):
-            crc32 = zlib.crc32(view[start : start + _CRC_CHUNK], crc32)
-        if crc32 != entry.crc32:
-            raise malformed(f"the bytes of {name} are damaged (CRC)", "ARCHIVE_CRC_MISMATCH")
-        return view
+        return self.entries[name].content(self.data)
 
 
 def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> TorchArchive:
@@ -60,14 +41,12 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
 
     Raises FieldFormatError: FILE_TRUNCATED, PICKLE_TOO_LARGE and the ARCHIVE_* reasons of docs/import-gate.md.
     """
-    try:
-        listed = read_members(data)
-    except FieldFormatError as error:
-        if error.reason == "ARCHIVE_COMPRESSED_ENTRY" and _is_program(_names_anyway(data)):
-            raise _program() from error
-        raise
+    listed = read_members(data, (STORED, DEFLATED))
     if _is_program(member.name for member in listed):
-        raise _program()
+        message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
+        raise malformed(message, "ARCHIVE_TORCHSCRIPT")
+    if any(member.method != STORED for member in listed):
+        raise malformed("an entry is compressed in a way that is not taken", "ARCHIVE_COMPRESSED_ENTRY")
     members = _below_one_folder(listed)
     if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in members) > 1:
         raise malformed("more than one data.pkl", "ARCHIVE_DUPLICATE_ENTRY")
@@ -81,37 +60,19 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
     return archive
 
 
-def _names_anyway(data: memoryview) -> list[str]:
-    """The entries' names, compressed ones among them; none where the container is faulty as well."""
-    try:
-        return [member.name for member in read_members(data, (STORED, DEFLATED))]
-    except FieldFormatError:
-        return []
-
-
 def _is_program(names: Iterable[str]) -> bool:
     inner = [name.partition("/")[2] for name in names]
     return any(name == "constants.pkl" or name.startswith("code/") for name in inner)
 
 
-def _program() -> FieldFormatError:
-    message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
-    return malformed(message, "ARCHIVE_TORCHSCRIPT")
-
-
-def _below_one_folder(members: list[Member]) -> dict[str, Entry]:
+def _below_one_folder(members: list[Member]) -> dict[str, Member]:
     """Entries by their name below the one folder all of them share."""
-    entries = {}
-    folders = set()
-    for member in members:
-        folder, _, name = member.name.partition("/")
-        if not name:
-            raise malformed("an entry lies in no folder", "ARCHIVE_ENTRY_NAME")
-        folders.add(folder)
-        entries[name] = Entry(member.name, member.offset, member.size, member.crc32)
-    if len(folders) != 1:
+    parts = [(member.name.partition("/"), member) for member in members]
+    if not all(name for (_, _, name), _ in parts):
+        raise malformed("an entry lies in no folder", "ARCHIVE_ENTRY_NAME")
+    if len({folder for (folder, _, _), _ in parts}) != 1:
         raise malformed("entries lie in several folders", "ARCHIVE_ENTRY_NAME")
-    return entries
+    return {name: member for (_, _, name), member in parts}
 
 
 _MAGIC = 0x1950A86A20F9469CFC6C
@@ -119,18 +80,8 @@ _PROTOCOL = 1001
 _SMALL = PickleLimits(opcodes=1000, stack=100, marks=10, memo=100)
 _KEYS = PickleLimits(opcodes=4 * MAX_ENTRIES, stack=2 * MAX_ENTRIES, marks=10, memo=2 * MAX_ENTRIES)
 _COUNT_BYTES = 8
-_ELEMENT_BYTES = {
-    "float32": 4,
-    "float64": 8,
-    "float16": 2,
-    "bfloat16": 2,
-    "int64": 8,
-    "int32": 4,
-    "int16": 2,
-    "int8": 1,
-    "uint8": 1,
-    "bool": 1,
-}
+_ELEMENT_BYTES = {"float32": 4, "float64": 8, "float16": 2, "bfloat16": 2}
+_ELEMENT_BYTES |= {"int64": 8, "int32": 4, "int16": 2, "int8": 1, "uint8": 1, "bool": 1}
 
 
 @dataclass(frozen=True)
@@ -138,7 +89,7 @@ class LegacyArchive:
     """The storages by the names that the zip container gives them: "data/<key>"."""
 
     data: memoryview
-    entries: Mapping[str, Entry]
+    entries: Mapping[str, Member]
 
     def read(self, name: str) -> memoryview:
         """The entry's bytes, copied: they may begin at any byte, and numbers want an aligned place."""
@@ -181,7 +132,7 @@ def _checked_keys(keys: object) -> list[str]:
     return keys
 
 
-def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, StorageRef]) -> dict[str, Entry]:
+def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, StorageRef]) -> dict[str, Member]:
     """Where each storage lies, one behind the other from ``at`` to the end of the file."""
     entries = {}
     for key in keys:
@@ -199,7 +150,7 @@ def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, 
             message = f"a storage of {storage.count} elements has {count} in the file"
             raise FieldFormatError(message, reason="TENSOR_STORAGE_MISMATCH")
         at += _COUNT_BYTES
-        entries[f"data/{key}"] = Entry(f"data/{key}", at, size, crc32=0)
+        entries[f"data/{key}"] = Member(f"data/{key}", STORED, at, size, size, crc32=0)
         at += size
     if at != len(data):
         raise FieldFormatError("something lies behind the last storage", reason="ARCHIVE_TRAILING_DATA")

@@ -10,7 +10,6 @@ import io
 import math
 import tokenize
 import warnings
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -37,14 +36,8 @@ _READERS = {
 }
 _PLAIN_TYPES = frozenset(["<f2", "<f4", "<f8", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "|i1", "|u1", "|b1"])
 _PARSER_ERRORS = (
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    RecursionError,
-    SyntaxError,
-    tokenize.TokenError,
-    TypeError,
-    ValueError,
+    *(ArithmeticError, LookupError, MemoryError, RecursionError),
+    *(SyntaxError, tokenize.TokenError, TypeError, ValueError),
 )
 """What numpy and Python's parser of literals raise for headers that are malformed."""
 
@@ -120,43 +113,35 @@ class ArraySource:
         Raises FieldFormatError: TENSOR_MISSING, NPY_MALFORMED, NPY_OBJECT_ARRAY, TENSOR_DTYPE, TENSOR_SHAPE,
         TENSOR_TOO_LARGE, TENSOR_NOT_FINITE, TENSOR_STORAGE_MISMATCH, ARCHIVE_DEFLATE_MALFORMED or ARCHIVE_CRC_MISMATCH.
         """
-        values = self._read(name)
-        if values.dtype.kind != "f":
-            raise tensor_error(f"{name} holds {values.dtype.name}; real numbers are needed", "TENSOR_DTYPE")
-        return finite_float32(name, values)
+        return finite_float32(name, self._read(name, "f", "real numbers"))
 
     def integers(self, name: str) -> npt.NDArray[np.int64]:
         """The whole numbers of an array. Raises what :meth:`array` raises."""
-        values = self._read(name)
-        if values.dtype.kind not in "iu" or values.dtype == np.uint64:
-            raise tensor_error(f"{name} holds {values.dtype.name}; whole numbers are needed", "TENSOR_DTYPE")
+        values = self._read(name, "iu", "whole numbers")
+        if values.dtype == np.uint64:
+            raise tensor_error(f"{name} holds uint64; whole numbers are needed", "TENSOR_DTYPE")
         return np.ascontiguousarray(values, dtype=np.int64)
 
     def weights(self, name: str) -> Float32Array:
         """An array's numbers, of either sort, none below zero. Raises what :meth:`array` raises."""
-        values = self._read(name)
-        if values.dtype.kind not in "iuf":
-            raise tensor_error(f"{name} holds {values.dtype.name}; numbers are needed", "TENSOR_DTYPE")
-        return np.maximum(finite_float32(name, values), np.float32(0.0))
+        return np.maximum(finite_float32(name, self._read(name, "iuf", "numbers")), np.float32(0.0))
 
     def numbers(self, name: str) -> npt.NDArray[np.float64]:
         """A few numbers of either sort, in double precision, in their own shape. Raises what :meth:`array` raises."""
-        values = self._read(name, _FEW)
-        if values.dtype.kind not in "iuf":
-            raise tensor_error(f"{name} holds {values.dtype.name}; numbers are needed", "TENSOR_DTYPE")
-        few = np.asarray(values, dtype=np.float64)
+        few = np.asarray(self._read(name, "iuf", "numbers", _FEW), dtype=np.float64)
         if not np.isfinite(few).all():
             raise tensor_error(f"{name} holds a number that is not finite", "TENSOR_NOT_FINITE")
         return few
 
-    def _read(self, name: str, most: int | None = None) -> npt.NDArray[Any]:
+    def _read(self, name: str, kinds: str, needed: str, most: int | None = None) -> npt.NDArray[Any]:
+        """The array, of one of numpy's kinds of numbers."""
         member = self._members.get(name)
         if member is None:
             raise tensor_error(f"{name} is missing", "TENSOR_MISSING")
         self._unpacked -= member.size
         if self._unpacked < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
-        raw = _unpack(name, self._data[member.offset : member.offset + member.packed_size], member)
+        raw = member.content(self._data)
         header = read_npy_header(name, raw)
         require_possible(name, header.shape)
         count = math.prod(header.shape)
@@ -167,7 +152,10 @@ class ArraySource:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
         if len(raw) - header.data_at != count * header.dtype.itemsize:
             raise tensor_error(f"{name} has another size than its shape {header.shape}", "TENSOR_STORAGE_MISMATCH")
-        return _array(raw, header)
+        if header.dtype.kind not in kinds:
+            raise tensor_error(f"{name} holds {header.dtype.name}; {needed} are needed", "TENSOR_DTYPE")
+        flat = np.frombuffer(raw[header.data_at :], dtype=header.dtype)
+        return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
 
 
 def _named(members: list[Member]) -> Mapping[str, Member]:
@@ -177,28 +165,3 @@ def _named(members: list[Member]) -> Mapping[str, Member]:
             raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
         named[member.name.removesuffix(_SUFFIX)] = member
     return named
-
-
-def _unpack(name: str, packed: memoryview, member: Member) -> memoryview:
-    """The entry's content. Never more than one byte beyond the claimed size is made."""
-    content = packed
-    if member.method == DEFLATED:
-        inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-        try:
-            content = memoryview(inflater.decompress(packed, member.size + 1))
-        except zlib.error as error:
-            raise _faulty_deflate(name) from error
-        if len(content) != member.size or not inflater.eof or inflater.unused_data:
-            raise _faulty_deflate(name)
-    if zlib.crc32(content) != member.crc32:
-        raise FieldFormatError(f"the bytes of {name} are damaged (CRC)", reason="ARCHIVE_CRC_MISMATCH")
-    return content
-
-
-def _faulty_deflate(name: str) -> FieldFormatError:
-    return malformed(f"{name} does not inflate to what the archive claims", "ARCHIVE_DEFLATE_MALFORMED")
-
-
-def _array(raw: memoryview, header: NpyHeader) -> npt.NDArray[Any]:
-    flat = np.frombuffer(raw[header.data_at :], dtype=header.dtype)
-    return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
