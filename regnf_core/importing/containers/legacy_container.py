@@ -7,7 +7,8 @@ imports. There are no checksums; but every byte must be accounted for, so the fi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,12 +42,16 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
 
     Raises FieldFormatError: FILE_TRUNCATED, PICKLE_TOO_LARGE and the ARCHIVE_* reasons of docs/import-gate.md.
     """
-    listed = read_members(data, (STORED, DEFLATED))
-    if _is_program(member.name for member in listed):
-        message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
-        raise malformed(message, "ARCHIVE_TORCHSCRIPT")
-    if any(member.method != STORED for member in listed):
-        raise malformed("an entry is compressed in a way that is not taken", "ARCHIVE_COMPRESSED_ENTRY")
+    try:
+        listed = read_members(data)
+    except FieldFormatError as error:
+        if error.reason == "ARCHIVE_COMPRESSED_ENTRY":
+            inflatable: list[Member] = []
+            with suppress(FieldFormatError):
+                inflatable = read_members(data, (STORED, DEFLATED))
+            _refuse_programs(inflatable)
+        raise
+    _refuse_programs(listed)
     members = _below_one_folder(listed)
     if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in members) > 1:
         raise malformed("more than one data.pkl", "ARCHIVE_DUPLICATE_ENTRY")
@@ -60,9 +65,11 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
     return archive
 
 
-def _is_program(names: Iterable[str]) -> bool:
-    inner = [name.partition("/")[2] for name in names]
-    return any(name == "constants.pkl" or name.startswith("code/") for name in inner)
+def _refuse_programs(members: list[Member]) -> None:
+    inner = [member.name.partition("/")[2] for member in members]
+    if any(name == "constants.pkl" or name.startswith("code/") for name in inner):
+        message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
+        raise malformed(message, "ARCHIVE_TORCHSCRIPT")
 
 
 def _below_one_folder(members: list[Member]) -> dict[str, Member]:
