@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Protocol, Self, TypeVar, runtime_checkable
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.observation import ColorFunction, SdfField, field_repr
+from regnf_core.fields.observation import ColorFunction, OnDevice, SdfField, field_repr
 
 PointFunction = Callable[[Tensor], Any]
 """Signed distance (N,) or (N, 1) at points (N, 3) float32: a tensor or a numpy array of real numbers."""
@@ -43,25 +43,20 @@ class UserField:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU."""
         return self._bounds
 
     @property
     def device(self) -> torch.device:
-        """That of the field."""
         return torch.device(self.field.device)
 
     def to(self, device: torch.device | str) -> UserField:
-        """The same field on another device."""
         return UserField(self.field.to(device))
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         given = points.to(device=self.device, dtype=torch.float32)
         return _values("signed_distance", self.field.signed_distance(given), (len(points),), self.device)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         given, name = points.to(device=self.device, dtype=torch.float32), "signed_distance_and_gradient"
         found = self.field.signed_distance_and_gradient(given)
         if not isinstance(found, tuple | list) or len(found) != 2:
@@ -100,7 +95,6 @@ class FunctionOfPoints:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU."""
         return self._bounds
 
     def to(self, device: torch.device | str) -> FunctionOfPoints:
@@ -111,13 +105,11 @@ class FunctionOfPoints:
 
     @torch.no_grad()
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         given = points.to(device=self.device, dtype=torch.float32)
         parts = [self._asked(part) for part in torch.split(given, _CHUNK)]
         return torch.cat(parts) if parts else given.new_zeros(0)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         given = points.to(device=self.device, dtype=torch.float32).detach()
         parts = [self._with_gradient(part) for part in torch.split(given, _CHUNK)]
         distance, gradient = (torch.cat(some) for some in zip(*parts, strict=True))
@@ -211,8 +203,20 @@ _FUNCTION_CHUNK = 1 << 10  # the layers' outputs at so many points fit a core's 
 _CHUNK_ACCELERATOR = 1 << 18
 
 
-class SdfFunction(Protocol):
-    """What a kind of field has to write: the distance, its gradient in closed form, and a move to another device."""
+class Evaluator(Protocol):
+    """What evaluates a function's present parameters, without a graph."""
+
+    def value(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) at points (N, 3) float32, both on the function's device."""
+        ...
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
+        ...
+
+
+class SdfFunction(Evaluator, Protocol):
+    """What a kind of field has to write."""
 
     @property
     def device(self) -> torch.device:
@@ -221,26 +225,6 @@ class SdfFunction(Protocol):
 
     def to(self, device: torch.device | str) -> Self:
         """The same function with its parameters on another device."""
-        ...
-
-    def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3) float32, both on ``device``."""
-        ...
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them."""
-        ...
-
-
-class Evaluator(Protocol):
-    """What evaluates a function's present parameters, without a graph."""
-
-    def value(self, points: Tensor) -> Tensor:
-        """As :meth:`SdfFunction.value`."""
-        ...
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`SdfFunction.value_and_gradient`."""
         ...
 
 
@@ -287,16 +271,13 @@ class FunctionField(Generic[F]):
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, own frame."""
         return self._bounds
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.function.device
 
     def to(self, device: torch.device | str) -> Self:
-        """The same field with its parameters on another device."""
         return type(self)(self.function.to(device), self._bounds, self.chunk, self.inverse_deviation)
 
     def with_inverse_deviation(self, inverse_deviation: float | None) -> Self:
@@ -305,7 +286,6 @@ class FunctionField(Generic[F]):
 
     @torch.no_grad()
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         distance, evaluator = self._empty(len(points)), self._evaluator()
         for at, part in _chunks(points, self.chunk, self.device):
             distance[at] = evaluator.value(part)
@@ -313,7 +293,6 @@ class FunctionField(Generic[F]):
 
     @torch.no_grad()
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         distance, gradient, evaluator = self._empty(len(points)), self._empty(len(points), 3), self._evaluator()
         for at, part in _chunks(points, self.chunk, self.device):
             distance[at], gradient[at] = evaluator.value_and_gradient(part)
@@ -349,7 +328,7 @@ def _chunked_color(
 
 
 @dataclass(frozen=True)
-class BoxExtension(Generic[F]):
+class BoxExtension(OnDevice, Generic[F]):
     """g in the box; outside, g at the box's nearest point plus the distance to it. Continuous and finite everywhere.
 
     What lies outside is taken for free space: the true distance is at most so large, and at least the distance to the
@@ -364,12 +343,7 @@ class BoxExtension(Generic[F]):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.function.device
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same function with its parameters on another device."""
-        return replace(self, function=self.function.to(device), low=self.low.to(device), high=self.high.to(device))
 
     def value(self, points: Tensor) -> Tensor:
         """g (N,) at points (N, 3), extended."""
@@ -390,7 +364,6 @@ class BoxExtension(Generic[F]):
 
     @property
     def has_color(self) -> bool:
-        """Whether :meth:`color` may be asked."""
         return isinstance(self.function, ColoredFunction) and self.function.has_color
 
     def color(self, points: Tensor, directions: Tensor) -> Tensor:
