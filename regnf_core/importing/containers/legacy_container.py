@@ -15,7 +15,7 @@ from typing import Any
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.zip_members import DEFLATED, MAX_ENTRIES, STORED, Member, malformed, read_members
 from regnf_core.importing.pickle.pickle_machine import PickleLimits, StorageRef
-from regnf_core.importing.pickle.pickle_reader import LeadingPickle, read_leading_pickle
+from regnf_core.importing.pickle.pickle_reader import read_leading_pickle
 
 # The zip container of torch.save, checked against its own rules instead of a lenient reader's.
 #
@@ -110,24 +110,24 @@ def read_legacy(data: memoryview) -> tuple[Any, LegacyArchive]:
     Raises FieldFormatError: FILE_TRUNCATED, LEGACY_MALFORMED, ARCHIVE_BYTE_ORDER, ARCHIVE_TOO_MANY_ENTRIES,
     ARCHIVE_TRAILING_DATA, TENSOR_DTYPE, TENSOR_STORAGE_MISSING, TENSOR_STORAGE_MISMATCH and the PICKLE_* reasons.
     """
-    magic, at = _leading(data, 0, _SMALL)
-    protocol, at = _leading(data, at, _SMALL)
-    machine, at = _leading(data, at, _SMALL)
-    if magic.value != _MAGIC or protocol.value != _PROTOCOL or not isinstance(machine.value, dict):
+    magic, at, _ = _leading(data, 0, _SMALL)
+    protocol, at, _ = _leading(data, at, _SMALL)
+    machine, at, _ = _leading(data, at, _SMALL)
+    if magic != _MAGIC or protocol != _PROTOCOL or not isinstance(machine, dict):
         raise _malformed("the file's head is not torch.save's")
-    if machine.value.get("little_endian") is not True:
+    if machine.get("little_endian") is not True:
         raise FieldFormatError("the tensors are not little-endian", reason="ARCHIVE_BYTE_ORDER")
-    values, at = _leading(data, at, PickleLimits())
-    keys, at = _leading(data, at, _KEYS)
-    return values.value, LegacyArchive(data, _entries(data, at, _checked_keys(keys.value), values.storages))
+    values, at, storages = _leading(data, at, PickleLimits())
+    keys, at, _ = _leading(data, at, _KEYS)
+    return values, LegacyArchive(data, _entries(data, at, _checked_keys(keys), storages))
 
 
-def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[LeadingPickle, int]:
-    """The pickle at ``at``, and where it ends."""
+def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[Any, int, dict[str, StorageRef]]:
+    """The value of the pickle at ``at``, where it ends, and the storages it names."""
     if at >= len(data):
         raise FieldFormatError("the file was cut short", reason="FILE_TRUNCATED")
-    pickle = read_leading_pickle(data[at : at + MAX_PICKLE_BYTES], limits)
-    return pickle, at + pickle.length
+    value, length, storages = read_leading_pickle(data[at : at + MAX_PICKLE_BYTES], limits)
+    return value, at + length, storages
 
 
 def _checked_keys(keys: object) -> list[str]:

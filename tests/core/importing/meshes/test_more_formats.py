@@ -17,11 +17,10 @@ import trimesh
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
-from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import read_mesh
 from regnf_core.importing.meshes.point_files import unpack_lzf
 from regnf_core.importing.upload_description import UploadDescription
-from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.archives import assert_refused
 from tests.core.importing.in_process import convert
 from tests.core.importing.meshes.mesh_files import (
     BALL,
@@ -103,13 +102,6 @@ def test_clouds_give_the_points_and_normals_they_were_written_from(data: bytes) 
     np.testing.assert_allclose(found.vertices, 0.5 * AROUND, atol=1e-6)
     assert found.normals is not None
     np.testing.assert_allclose(found.normals, AROUND, atol=1e-6)
-
-
-def test_a_cloud_goes_through_the_gate(tmp_path: Path) -> None:
-    around = directions(2000)
-    report = import_field(saved(tmp_path, pcd(0.5 * around, around, "binary")), tmp_path / "out")
-    assert report.family == "point_cloud"
-    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
