@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
-from regnf_core.importing.containers.zip_members import Member
+from regnf_core.importing.containers.legacy_container import TorchArchive
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder, StorageRef, TensorRef
 
 _STORED: dict[str, np.dtype[Any]] = {
@@ -25,19 +25,6 @@ _DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
 _ALIGNMENT = 16
 
 
-class Archive(Protocol):
-    """A container of torch.save: its storages' bytes under ``data/<key>``."""
-
-    @property
-    def entries(self) -> Mapping[str, Member]:
-        """Where the entries lie, by name."""
-        ...
-
-    def read(self, name: str) -> memoryview:
-        """An entry's bytes. Raises FieldFormatError where they are damaged."""
-        ...
-
-
 class TensorSource:
     """Materializes tensors of one archive. Float32 tensors are views of the map where they lie aligned, as torch writes
     them; nothing else of the file is touched.
@@ -45,7 +32,7 @@ class TensorSource:
     ``budget`` caps the bytes of all tensors together, as float32.
     """
 
-    def __init__(self, archive: Archive, budget: int) -> None:
+    def __init__(self, archive: TorchArchive, budget: int) -> None:
         self._archive = archive
         self._budget = budget
 

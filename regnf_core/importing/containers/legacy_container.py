@@ -27,13 +27,15 @@ MAX_PICKLE_BYTES = 32 * 1024 * 1024
 
 @dataclass(frozen=True)
 class TorchArchive:
-    """The entries by their name below the archive's folder: "data.pkl", "data/0" ..."""
+    """The entries by their name below the archive's folder: "data.pkl", "data/0" ... Those of the older container are
+    its storages, by the names that they have in a zip.
+    """
 
     data: memoryview
     entries: Mapping[str, Member]
 
     def read(self, name: str) -> memoryview:
-        """The entry's bytes, not copied, after checking their CRC. Raises FieldFormatError (ARCHIVE_CRC_MISMATCH)."""
+        """The entry's bytes, not copied, their CRC checked. Raises FieldFormatError (ARCHIVE_CRC_MISMATCH)."""
         return self.entries[name].content(self.data)
 
 
@@ -91,20 +93,7 @@ _ELEMENT_BYTES = {"float32": 4, "float64": 8, "float16": 2, "bfloat16": 2}
 _ELEMENT_BYTES |= {"int64": 8, "int32": 4, "int16": 2, "int8": 1, "uint8": 1, "bool": 1}
 
 
-@dataclass(frozen=True)
-class LegacyArchive:
-    """The storages by the names that the zip container gives them: "data/<key>"."""
-
-    data: memoryview
-    entries: Mapping[str, Member]
-
-    def read(self, name: str) -> memoryview:
-        """The entry's bytes, copied: they may begin at any byte, and numbers want an aligned place."""
-        entry = self.entries[name]
-        return memoryview(bytes(self.data[entry.offset : entry.offset + entry.size]))
-
-
-def read_legacy(data: memoryview) -> tuple[Any, LegacyArchive]:
+def read_legacy(data: memoryview) -> tuple[Any, TorchArchive]:
     """The values that were saved, and the storages of their tensors. ``data`` is the whole file.
 
     Raises FieldFormatError: FILE_TRUNCATED, LEGACY_MALFORMED, ARCHIVE_BYTE_ORDER, ARCHIVE_TOO_MANY_ENTRIES,
@@ -119,7 +108,7 @@ def read_legacy(data: memoryview) -> tuple[Any, LegacyArchive]:
         raise FieldFormatError("the tensors are not little-endian", reason="ARCHIVE_BYTE_ORDER")
     values, at, storages = _leading(data, at, PickleLimits())
     keys, at, _ = _leading(data, at, _KEYS)
-    return values, LegacyArchive(data, _entries(data, at, _checked_keys(keys), storages))
+    return values, TorchArchive(data, _entries(data, at, _checked_keys(keys), storages))
 
 
 def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[Any, int, dict[str, StorageRef]]:
@@ -157,7 +146,7 @@ def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, 
             message = f"a storage of {storage.count} elements has {count} in the file"
             raise FieldFormatError(message, reason="TENSOR_STORAGE_MISMATCH")
         at += _COUNT_BYTES
-        entries[f"data/{key}"] = Member(f"data/{key}", STORED, at, size, size, crc32=0)
+        entries[f"data/{key}"] = Member(f"data/{key}", STORED, at, size, size, crc32=None)
         at += size
     if at != len(data):
         raise FieldFormatError("something lies behind the last storage", reason="ARCHIVE_TRAILING_DATA")

@@ -10,8 +10,6 @@ import io
 import math
 import tokenize
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,45 +40,25 @@ _PARSER_ERRORS = (
 """What numpy and Python's parser of literals raise for headers that are malformed."""
 
 
-@dataclass(frozen=True)
-class NpyHeader:
-    """An array's element type and shape, and where its numbers begin, bytes."""
-
-    dtype: np.dtype[np.generic]
-    shape: tuple[int, ...]
-    fortran_order: bool
-    data_at: int
-
-
-def read_npy_header(name: str, data: memoryview) -> NpyHeader:
-    """The header of the array ``name``, whose file begins with ``data``.
-
-    Raises FieldFormatError: NPY_MALFORMED, NPY_OBJECT_ARRAY (pickled objects) or TENSOR_DTYPE (no plain little-endian
-    numbers).
-    """
+def _header(name: str, data: memoryview) -> tuple[np.dtype[np.generic], tuple[int, ...], bool, int]:
+    """Of the array ``name``: its type, its shape, whether it is in Fortran's order, and where its numbers begin."""
     file = io.BytesIO(data[: npy.MAGIC_LEN + 4 + _MAX_HEADER])
+    malformed_header = FieldFormatError(f"{name} has no valid header of an array of numbers", reason="NPY_MALFORMED")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # headers that Python 2 wrote
             read = _READERS[npy.read_magic(file)]
             shape, fortran_order, dtype = read(file, max_header_size=_MAX_HEADER)
     except _PARSER_ERRORS as error:
-        raise _malformed(name) from error
+        raise malformed_header from error
     if dtype.hasobject:
         raise FieldFormatError(f"{name} holds pickled Python objects, not numbers", reason="NPY_OBJECT_ARRAY")
-    if dtype.names is not None or len(shape) > _MAX_DIMENSIONS or not all(_is_extent(extent) for extent in shape):
-        raise _malformed(name)
+    sound = len(shape) <= _MAX_DIMENSIONS and all(type(n) is int and 0 <= n < _MAX_EXTENT for n in shape)
+    if dtype.names is not None or not sound:
+        raise malformed_header
     if dtype.str not in _PLAIN_TYPES:
         raise FieldFormatError(f"{name} is stored as {dtype.str}; plain numbers are needed", reason="TENSOR_DTYPE")
-    return NpyHeader(dtype, shape, fortran_order, file.tell())
-
-
-def _is_extent(value: object) -> bool:
-    return type(value) is int and 0 <= value < _MAX_EXTENT
-
-
-def _malformed(name: str) -> FieldFormatError:
-    return FieldFormatError(f"{name} has no valid header of an array of numbers", reason="NPY_MALFORMED")
+    return dtype, shape, fortran_order, file.tell()
 
 
 MAX_UNPACKED_BYTES = 2 << 30
@@ -95,7 +73,11 @@ class ArraySource:
 
     def __init__(self, data: memoryview, budget: int) -> None:
         self._data = data
-        self._members = _named(read_members(data, (STORED, DEFLATED)))
+        self._members: dict[str, Member] = {}
+        for member in read_members(data, (STORED, DEFLATED)):
+            if "/" in member.name or not member.name.endswith(_SUFFIX):
+                raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
+            self._members[member.name.removesuffix(_SUFFIX)] = member
         self._budget = budget
         self._unpacked = MAX_UNPACKED_BYTES
 
@@ -142,26 +124,17 @@ class ArraySource:
         if self._unpacked < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
         raw = member.content(self._data)
-        header = read_npy_header(name, raw)
-        require_possible(name, header.shape)
-        count = math.prod(header.shape)
+        dtype, shape, fortran_order, data_at = _header(name, raw)
+        require_possible(name, shape)
+        count = math.prod(shape)
         if most is not None and count > most:
             raise tensor_error(f"{name} has {count} numbers, expected a few", "TENSOR_SHAPE")
         self._budget -= 4 * count
         if self._budget < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
-        if len(raw) - header.data_at != count * header.dtype.itemsize:
-            raise tensor_error(f"{name} has another size than its shape {header.shape}", "TENSOR_STORAGE_MISMATCH")
-        if header.dtype.kind not in kinds:
-            raise tensor_error(f"{name} holds {header.dtype.name}; {needed} are needed", "TENSOR_DTYPE")
-        flat = np.frombuffer(raw[header.data_at :], dtype=header.dtype)
-        return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
-
-
-def _named(members: list[Member]) -> Mapping[str, Member]:
-    named = {}
-    for member in members:
-        if "/" in member.name or not member.name.endswith(_SUFFIX):
-            raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
-        named[member.name.removesuffix(_SUFFIX)] = member
-    return named
+        if len(raw) - data_at != count * dtype.itemsize:
+            raise tensor_error(f"{name} has another size than its shape {shape}", "TENSOR_STORAGE_MISMATCH")
+        if dtype.kind not in kinds:
+            raise tensor_error(f"{name} holds {dtype.name}; {needed} are needed", "TENSOR_DTYPE")
+        flat = np.frombuffer(raw[data_at:], dtype)
+        return flat.reshape(shape, order="F" if fortran_order else "C")

@@ -41,13 +41,8 @@ def malformed(message: str, reason: str = "ARCHIVE_MALFORMED") -> FieldFormatErr
     return FieldFormatError(message, reason=reason)
 
 
-@dataclass(frozen=True)
-class Directory:
-    """Where the central directory lies (bytes from the file's start) and how many entries it claims."""
-
-    offset: int
-    end: int
-    count: int
+_Directory = tuple[int, int, int]
+"""Where the central directory begins and ends (bytes from the file's start), and how many entries it claims."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,7 @@ class Header:
     mode: int = 0
 
 
-def _directory_end(data: memoryview) -> Directory:
+def _directory_end(data: memoryview) -> _Directory:
     """The end-of-central-directory record, which must be the file's last 22 bytes, and its zip64 companion if any.
 
     Raises FieldFormatError: ARCHIVE_MALFORMED, or ARCHIVE_MULTI_DISK for a part of a split archive.
@@ -77,8 +72,8 @@ def _directory_end(data: memoryview) -> Directory:
         raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
     locator_at = at - _LOCATOR64.size
     if locator_at >= 0 and data[locator_at : locator_at + 4] == _LOCATOR64_SIGNATURE:
-        wide = __directory_end64(data, locator_at)
-        narrow = ((count, wide.count, _MAX16), (size, wide.end - wide.offset, _MAX32), (offset, wide.offset, _MAX32))
+        wide = start, end, entries = _directory_end64(data, locator_at)
+        narrow = ((count, entries, _MAX16), (size, end - start, _MAX32), (offset, start, _MAX32))
         if any(short not in (long, sentinel) for short, long, sentinel in narrow):
             raise malformed("the two directory records disagree")
         return wide
@@ -86,10 +81,10 @@ def _directory_end(data: memoryview) -> Directory:
         raise malformed("the zip64 directory record is missing")
     if offset + size != at:
         raise malformed("the central directory does not end where the record says")
-    return Directory(offset, at, count)
+    return offset, at, count
 
 
-def __directory_end64(data: memoryview, locator_at: int) -> Directory:
+def _directory_end64(data: memoryview, locator_at: int) -> _Directory:
     _, disk, end64_at, disks = _LOCATOR64.unpack_from(data, locator_at)
     if disk or disks != 1:
         raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
@@ -100,7 +95,7 @@ def __directory_end64(data: memoryview, locator_at: int) -> Directory:
         raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
     if record != _END64.size - 12 or offset + size != end64_at:
         raise malformed("the central directory does not end where the zip64 record says")
-    return Directory(offset, end64_at, count)
+    return offset, end64_at, count
 
 
 def _central_header(data: memoryview, at: int, limit: int) -> Header:
@@ -183,7 +178,8 @@ class Member:
     offset: int
     packed_size: int
     size: int
-    crc32: int
+    crc32: int | None
+    """None: there is no checksum."""
 
     def content(self, data: memoryview, join: Callable[[Iterator[bytes], int], memoryview] | None = None) -> memoryview:
         """The member's bytes in the zip file ``data``: a view of what is stored, else what they inflate to.
@@ -198,7 +194,7 @@ class Member:
         crc32 = 0
         for start in range(0, len(content), _PIECE):
             crc32 = zlib.crc32(content[start : start + _PIECE], crc32)
-        if crc32 != self.crc32:
+        if self.crc32 not in (None, crc32):
             raise malformed(f"the bytes of {self.name} are damaged (CRC)", "ARCHIVE_CRC_MISMATCH")
         return content
 
@@ -234,7 +230,7 @@ def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders
     """
     _check_ends(data)
     directory = _directory_end(data)
-    return _tile(data, _central_headers(data, directory, methods), directory.offset, folders)
+    return _tile(data, _central_headers(data, directory, methods), directory[0], folders)
 
 
 def _check_ends(data: memoryview) -> None:
@@ -251,17 +247,17 @@ def _check_ends(data: memoryview) -> None:
     raise FieldFormatError("the archive's end is missing: the file was cut short", reason="FILE_TRUNCATED")
 
 
-def _central_headers(data: memoryview, directory: Directory, methods: Collection[int]) -> list[Header]:
-    if not 0 < directory.count <= MAX_ENTRIES:
-        raise malformed(f"{directory.count} entries; at most {MAX_ENTRIES} are read", "ARCHIVE_TOO_MANY_ENTRIES")
+def _central_headers(data: memoryview, directory: _Directory, methods: Collection[int]) -> list[Header]:
+    at, end, count = directory
+    if not 0 < count <= MAX_ENTRIES:
+        raise malformed(f"{count} entries; at most {MAX_ENTRIES} are read", "ARCHIVE_TOO_MANY_ENTRIES")
     headers = []
-    at = directory.offset
-    for _ in range(directory.count):
-        header = _central_header(data, at, directory.end)
-        _check_header(header, directory.offset, methods)
+    for _ in range(count):
+        header = _central_header(data, at, end)
+        _check_header(header, directory[0], methods)
         headers.append(header)
         at = header.end
-    if at != directory.end:
+    if at != end:
         raise malformed("the central directory holds more than its entries")
     if len({header.name for header in headers}) != len(headers):
         raise malformed("two entries share a name", "ARCHIVE_DUPLICATE_ENTRY")
