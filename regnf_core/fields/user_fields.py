@@ -173,7 +173,8 @@ def _values(name: str, found: Any, shape: tuple[int, ...], device: torch.device)
     """Real numbers of this shape as float32; a column of one counts as a row."""
     if not isinstance(found, Tensor | np.ndarray):
         raise _unusable(f"{name} returns a {type(found).__name__}, expected a tensor or an array of numbers")
-    values = torch.from_numpy(np.array(found)) if _is_plain(found) else found
+    plain = isinstance(found, np.ndarray) and found.dtype.kind in "fiu"
+    values = torch.from_numpy(np.array(found)) if plain else found
     if not isinstance(values, Tensor) or values.is_complex() or values.dtype == torch.bool:
         raise _unusable(f"{name} returns numbers of the kind {found.dtype}, expected real ones")
     if tuple(values.shape) == (*shape, 1):
@@ -181,10 +182,6 @@ def _values(name: str, found: Any, shape: tuple[int, ...], device: torch.device)
     if tuple(values.shape) != shape:
         raise _unusable(f"{name} returns the shape {tuple(values.shape)} for {shape[0]} points, expected {shape}")
     return values.to(device=device, dtype=torch.float32)
-
-
-def _is_plain(found: Any) -> bool:
-    return isinstance(found, np.ndarray) and found.dtype.kind in "fiu"
 
 
 def _device_of(function: PointFunction) -> torch.device | str:

@@ -211,7 +211,9 @@ def placed_meshes(document: dict[str, Any], accessors: Accessors) -> Iterator[Pl
     if len(nodes) > _MAX_NODES:
         raise malformed(f"a glTF scene of {len(nodes)} nodes")
     center = _translation(document.get("extensions", {}).get(CENTER, {}).get("center", (0.0, 0.0, 0.0)))
-    drawn = dict(_visited(nodes, _roots(document, nodes), center))
+    scenes = document.get("scenes", [])
+    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(nodes)
+    drawn = dict(_visited(nodes, roots, center))
     poses = dict(drawn)
     if any("skin" in nodes[number] for number in drawn):  # a joint may stand in no scene, or be invisible
         poses |= dict(_visited(nodes, _without_parent(nodes), center, hidden=True))
@@ -242,14 +244,6 @@ def _visited(
         matrix = above @ _pose(node)
         yield number, matrix
         waiting.extend((child, matrix) for child in node.get("children", []))
-
-
-def _roots(document: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
-    scenes = document.get("scenes", [])
-    if scenes:
-        roots: list[int] = scenes[document.get("scene", 0)].get("nodes", [])
-        return roots
-    return _without_parent(nodes)
 
 
 def _without_parent(nodes: list[dict[str, Any]]) -> list[int]:
