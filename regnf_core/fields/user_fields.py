@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.observation import ColorFunction, OnDevice, SdfField, field_repr
+from regnf_core.fields.observation import ColorFunction, FieldView, OnDevice, SdfField, field_repr
 
 PointFunction = Callable[[Tensor], Any]
 """Signed distance (N,) or (N, 1) at points (N, 3) float32: a tensor or a numpy array of real numbers."""
@@ -25,17 +25,16 @@ _HINT = (
 )
 
 
-class UserField:
+class UserField(FieldView):
     """An SdfField of the user's own: it is given float32 points on its device, and what it returns is checked.
 
     Raises FieldFormatError (FUNCTION_UNUSABLE) where a value is missing, no number or of another shape.
     """
 
     def __init__(self, field: SdfField) -> None:
-        self.field = field
-        for name in ("color", "observation", "inverse_deviation", "part_at"):
-            if hasattr(field, name):
-                setattr(self, name, getattr(field, name))
+        super().__init__(field)
+        if hasattr(field, "part_at"):
+            self.part_at = field.part_at
         self._bounds = checked_bounds(field.bounds)
 
     def __repr__(self) -> str:

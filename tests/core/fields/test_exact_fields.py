@@ -64,26 +64,6 @@ def test_gradient_on_the_surface_is_the_normal() -> None:
     torch.testing.assert_close(gradient, torch.tensor([[0.0, 0.0, 1.0]]))
 
 
-def test_mesh_with_a_hole_still_has_an_inside() -> None:
-    whole = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    field = MeshField(whole.vertices, whole.faces[10:])
-    assert field.signed_distance(torch.zeros(1, 3)).item() < -0.49
-    assert field.signed_distance(torch.tensor([[0.0, 0.0, 0.9]])).item() > 0.39
-
-
-def test_mesh_loads_a_scene_graph(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    for x in (-1.0, 1.0):
-        pose = np.eye(4)
-        pose[0, 3] = x
-        scene.add_geometry(trimesh.creation.box((0.2, 0.2, 0.2)), transform=pose)
-    (tmp_path / "pair.glb").write_bytes(trimesh.exchange.gltf.export_glb(scene))  # type: ignore[no-untyped-call]
-    field = load_mesh(tmp_path / "pair.glb")
-    torch.testing.assert_close(field.bounds, torch.tensor([[-1.1, -0.1, -0.1], [1.1, 0.1, 0.1]], dtype=torch.float64))
-    points = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
-    torch.testing.assert_close(field.signed_distance(points), torch.tensor([-0.1, 0.9, 0.2]))
-
-
 def test_mesh_moves() -> None:
     matrix = np.eye(4)
     matrix[:3, :3] = 0.5 * Rotation.from_rotvec([0.2, 0.4, 0.6]).as_matrix()

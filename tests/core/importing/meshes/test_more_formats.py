@@ -5,9 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
-import zipfile
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,6 @@ from regnf_core.importing.meshes import read_mesh
 from regnf_core.importing.meshes.point_files import unpack_lzf
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused
-from tests.core.importing.in_process import convert
 from tests.core.importing.meshes.mesh_files import (
     BALL,
     PLY_TRIANGLE,
@@ -144,18 +141,6 @@ def test_compressed_points_unpack_to_exactly_what_is_claimed() -> None:
         (b"\x00a", 1 << 40),
     ):
         assert_refused(partial(unpack_lzf, memoryview(faulty), size), "MESH_INVALID")
-
-
-def test_gltf_and_its_parts_come_in_one_archive(tmp_path: Path) -> None:
-    document, parts = glb_parts()
-    upload = tmp_path / "chair.zip"
-    with zipfile.ZipFile(upload, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("chair/scene.gltf", document)
-        for name, data in parts.items():
-            archive.writestr(f"chair/{name}", bytes(data))
-    report = convert(upload, tmp_path / "out")
-    assert report["family"] == "mesh"
-    assert "watertight" in report["why"]
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl_ascii"])
