@@ -23,6 +23,12 @@ def _sound_box(box: list[list[float]]) -> list[list[float]]:
     return box
 
 
+def _whole_sign(sign: int) -> int:
+    if sign not in (1, -1):
+        raise ValueError("should be 1 or -1")
+    return sign
+
+
 def _similarity(rows: list[list[float]]) -> list[list[float]]:
     require_similarity(rows)
     return rows
@@ -132,7 +138,7 @@ class UploadDescription:
     """Lowest and highest corner of the region where the field has meaning, in its own frame, after ``world_scale``."""
     world_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
     """Length, in the unit overrides, of one unit of the checkpoint's coordinates; distances scale with it."""
-    sign: Literal[1, -1] | None = None
+    sign: Annotated[int, Ge(-1), Le(1), AfterValidator(_whole_sign)] | None = None
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Which axis of the field points up. Kept with the field, changes nothing about it."""
