@@ -73,13 +73,8 @@ def test_chunks_change_nothing() -> None:
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
     assert parted.signed_distance(points).shape == (1000,)
-    assert parted.signed_distance(points[:0]).shape == (0,)
-
-
-def test_no_points_give_no_values() -> None:
-    field = small_field()
-    distance, gradient = field.signed_distance_and_gradient(torch.zeros(0, 3))
-    assert field.signed_distance(torch.zeros(0, 3)).shape == distance.shape == (0,)
+    distance, gradient = parted.signed_distance_and_gradient(points[:0])
+    assert parted.signed_distance(points[:0]).shape == distance.shape == (0,)
     assert gradient.shape == (0, 3)
 
 

@@ -127,34 +127,10 @@ def test_tensors_that_do_not_fit_the_description(faulty: Tensors, tmp_path: Path
     assert reason_of(lambda: open_field(path)) == "FIELD_SHAPES_MISMATCH"
 
 
-def with_family() -> dict[str, Any]:
-    """A description as version 1 of the format has it: ``family`` in place of ``kind``."""
-    values = description()
-    return {"family": values.pop("kind"), **values}
-
-
-def test_a_file_of_version_1_is_still_read(tmp_path: Path) -> None:
-    path = tmp_path / "field.safetensors"
-    write_safe_field(path, description(), tensors())
-    new = open_field(path).signed_distance(torch.zeros(1, 3))
-    save_file(tensors(), path, {"regnf": "1", "field": json.dumps(with_family())})
-    assert read_description(path)["kind"] == "neus_facto"
-    torch.testing.assert_close(open_field(path).signed_distance(torch.zeros(1, 3)), new)
-
-
-def test_other_names_of_version_1(tmp_path: Path) -> None:
-    path = tmp_path / "field.safetensors"
-    network = {"layers.0.weight": np.ones((4, 3)), "layers.1.weight": np.ones((1, 4)), "norms.0.weight": np.ones(4)}
-    network |= {"layers.0.bias": np.zeros(4), "layers.1.bias": np.zeros(1), "norms.0.bias": np.zeros(4)}
-    values = {"family": "mlp", "bounds": description()["bounds"], "activation": "sine", "normalised": [0]}
-    arrays = {name: array.astype(np.float32) for name, array in network.items()}
-    save_file(arrays, path, {"regnf": "1", "field": json.dumps(values)})
-    assert read_description(path)["normalized"] == [0]
-
-
 def test_the_old_name_of_an_entry_is_told(tmp_path: Path) -> None:
+    values = description()
     with pytest.raises(FieldFormatError, match="did you mean `kind`"):
-        write_safe_field(tmp_path / "field.safetensors", with_family(), tensors())
+        write_safe_field(tmp_path / "field.safetensors", {"family": values.pop("kind"), **values}, tensors())
 
 
 def test_numbers_that_are_not_finite(tmp_path: Path) -> None:
@@ -167,7 +143,6 @@ def test_numbers_that_are_not_finite(tmp_path: Path) -> None:
     ("values", "reason"),
     [
         (description(kind="pin_slam"), "FIELD_KIND_UNKNOWN"),
-        (with_family(), "FIELD_KIND_UNKNOWN"),
         (description(contraction="sphere"), "SAFE_FORMAT_INVALID"),
         (description(bounds=[[0, 0, 0], [1, 1, 0]]), "SAFE_FORMAT_INVALID"),
         (description(bounds=[[0, 0, 0], [1, 1, float("inf")]]), "SAFE_FORMAT_INVALID"),

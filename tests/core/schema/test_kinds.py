@@ -23,8 +23,7 @@ def small_field(**changes: Any) -> SdfField:
     return build_field(parse_description(description(**changes)), parameters)
 
 
-def test_a_description_of_the_first_version_opens_unchanged() -> None:
-    """Entries that came later have defaults."""
+def test_entries_that_all_kinds_share_have_defaults() -> None:
     parsed = parse_description(description())
     assert (parsed.world_scale, parsed.sign, parsed.up_axis) == (1.0, 1, None)
     assert parse_description(description_to_dict(parsed)) == parsed

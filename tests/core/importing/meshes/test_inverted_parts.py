@@ -32,7 +32,7 @@ def table(inverted: tuple[int, ...] = ()) -> trimesh.Trimesh:
     return together(*pieces)
 
 
-@pytest.mark.parametrize("inverted", [one for count in (1, 2, 3) for one in combinations(range(5), count)])
+@pytest.mark.parametrize("inverted", [one for count in (1, 3) for one in combinations(range(5), count)])
 def test_any_parts_may_be_inside_out(inverted: tuple[int, ...]) -> None:
     found = converted(table(inverted), **{"as": "object"})
     expected = distance(converted(table()), PROBES)

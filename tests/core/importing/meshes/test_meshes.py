@@ -102,13 +102,6 @@ def test_obj_counts_from_either_end_and_passes_over_the_rest() -> None:
     assert (inside, outside) == pytest.approx((-0.1, 0.5), abs=1e-6)
 
 
-def test_inverted_faces_are_turned_round() -> None:
-    inverted = trimesh.Trimesh(BALL.vertices, BALL.faces[:, ::-1], process=False)
-    found = converted(inverted.export(file_type="stl"))
-    assert [warning.split(":")[0] for warning in found.warnings] == ["MESH_INSIDE_OUT"]
-    assert field_of(found).signed_distance(torch.zeros(1, 3)).item() < -0.4
-
-
 def test_holes_are_reported_and_have_an_inside_nonetheless() -> None:
     found = converted(trimesh.Trimesh(BALL.vertices, BALL.faces[16:], process=False).export(file_type="ply"))
     assert found.why[1].startswith("not watertight, ")

@@ -5,9 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
-import zipfile
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +15,10 @@ import trimesh
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
-from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import read_mesh
 from regnf_core.importing.meshes.point_files import unpack_lzf
 from regnf_core.importing.upload_description import UploadDescription
-from tests.core.importing.archives import assert_refused, saved
-from tests.core.importing.in_process import convert
+from tests.core.importing.archives import assert_refused
 from tests.core.importing.meshes.mesh_files import (
     BALL,
     PLY_TRIANGLE,
@@ -105,13 +101,6 @@ def test_clouds_give_the_points_and_normals_they_were_written_from(data: bytes) 
     np.testing.assert_allclose(found.normals, AROUND, atol=1e-6)
 
 
-def test_a_cloud_goes_through_the_gate(tmp_path: Path) -> None:
-    around = directions(2000)
-    report = import_field(saved(tmp_path, pcd(0.5 * around, around, "binary")), tmp_path / "out")
-    assert report.family == "point_cloud"
-    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
@@ -152,18 +141,6 @@ def test_compressed_points_unpack_to_exactly_what_is_claimed() -> None:
         (b"\x00a", 1 << 40),
     ):
         assert_refused(partial(unpack_lzf, memoryview(faulty), size), "MESH_INVALID")
-
-
-def test_gltf_and_its_parts_come_in_one_archive(tmp_path: Path) -> None:
-    document, parts = glb_parts()
-    upload = tmp_path / "chair.zip"
-    with zipfile.ZipFile(upload, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("chair/scene.gltf", document)
-        for name, data in parts.items():
-            archive.writestr(f"chair/{name}", bytes(data))
-    report = convert(upload, tmp_path / "out")
-    assert report["family"] == "mesh"
-    assert "watertight" in report["why"]
 
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl_ascii"])
