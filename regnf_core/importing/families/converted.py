@@ -30,12 +30,6 @@ class Reading:
     """How a grid is interpolated: said or the only way of the family, or asked unless the weights tell."""
     scale: float | None = None
     """Natural logarithm of the finest resolution: how far two layouts are apart."""
-    is_written: bool = True
-    """Whether somebody would put its numbers into a configuration; others are only compared with."""
-
-    def has_sines_of(self, other: Reading) -> bool:
-        """Whether both divide the first layer's columns alike."""
-        return self.description.get("positional_encoding") == other.description.get("positional_encoding")
 
     def is_grid_of(self, other: Reading) -> bool:
         """Whether both have the same grid, but for the growth's last digits."""

@@ -1,9 +1,7 @@
 """Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-The reading is looked for whose levels do the most for the gradient, from the listed ones on to those beside the best.
-It is taken if it beats every other function that the tensors may stand for, one by one at the same points, and those
-beside it. Where no levels tell, only readings of the same resolutions, or without a grid, are weighed against each
-other. What stays open is refused, with the line to add to the description for each.
+The reading is taken whose gradient's norm is clearly nearest to 1, unless the grid's levels speak against it. What
+stays open is refused, with the line to add to the description for each.
 """
 
 from __future__ import annotations
@@ -13,34 +11,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from typing import Any
 
 from torch import Tensor
 
 from regnf_core.errors import MOST_CANDIDATES
 from regnf_core.importing.cost.mesh_work import (
-    CLIMB_POINTS,
     FINAL_POINTS,
     FINALISTS,
-    LAST_FINALISTS,
     LAST_POINTS,
-    MAX_CLIMBS,
     MAX_TRIED,
     TRIAL_POINTS,
-    TRIED_MORE,
-    TRIED_NEAR,
-    WRITTEN_NEAR,
 )
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, CLEARLY, LEAST, LEAST_SUPPORT, Evidence, Trial
 from regnf_core.importing.gate.plausibility import without_new_code
-from regnf_core.importing.gate.readings_beside import (
-    AmbiguousError,
-    OpenCandidate,
-    readings_beside,
-    readings_written_near,
-)
+from regnf_core.importing.gate.readings_beside import AmbiguousError, OpenCandidate
 from regnf_core.schema.hash_grid_config import Interpolation
 
 # Linear or smoothstep: how a hash grid was interpolated in training, told from the gradient within its cells.
@@ -186,11 +172,9 @@ def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]
     finest = Evidence(nearest.reading, FINAL_POINTS // share)
     chosen, fitting = chosen_by_misfit(trials, finest)
     if chosen is None or _is_doubtful(chosen, trials, finest):
-        trials = _searched(readings, trials, evidence)
         best = _best(trials)
-        if not best.is_telling:
-            raise _ambiguous([trial.reading for trial in fitting])
-        chosen = _proven(trials, best, share)
+        likely = [best] if best.is_telling and not any(trial.reading is best.reading for trial in fitting) else []
+        raise _ambiguous([trial.reading for trial in (*likely, *fitting)])
     if others := _over_other_cubes(chosen, readings, finest):
         raise _ambiguous([trial.reading for trial in (chosen, *others)])
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
@@ -209,9 +193,7 @@ def _is_doubtful(chosen: Trial, trials: Sequence[Trial], finest: Evidence) -> bo
     if mine.support < -LEAST_SUPPORT or not best.is_telling:
         return mine.support < -LEAST_SUPPORT
     other = finest.of(best.reading)
-    return not other.is_same(mine) and (
-        mine.support < LEAST_SUPPORT or other.support_over(mine) + other.usual_over(mine) > LEAST_SUPPORT
-    )
+    return not other.is_same(mine) and (mine.support < LEAST_SUPPORT or other.support_over(mine) > 0.0)
 
 
 def _over_other_cubes(chosen: Trial, readings: Sequence[Reading], finest: Evidence) -> list[Trial]:
@@ -224,99 +206,14 @@ def _over_other_cubes(chosen: Trial, readings: Sequence[Reading], finest: Eviden
     return [trial for trial in trials if mine.support - trial.support < CLEAR_SUPPORT]
 
 
-def _searched(readings: Sequence[Reading], trials: list[Trial], evidence: Evidence) -> list[Trial]:
-    """``trials``, and those of further readings: next to the best of them where it tells, else of the most usual."""
-    best, tried = _best(trials), {id(trial.reading) for trial in trials}
-    rest = [reading for reading in readings if id(reading) not in tried]
-    if not best.is_telling:
-        trials = trials + [evidence.of(reading) for reading in rest[:TRIED_MORE]]
-        best, rest = _best(trials), rest[TRIED_MORE:]
-    beside = [reading for reading in rest if _group(reading) == _group(best.reading)]
-    near = sorted(beside, key=lambda reading: abs((reading.scale or 0.0) - (best.reading.scale or 0.0)))
-    return trials + [evidence.of(reading) for reading in near[: TRIED_NEAR if best.is_telling else 0]]
-
-
 def _best(trials: Sequence[Trial]) -> Trial:
     """The best supported one; where no levels tell, the one nearest to a distance."""
     best = max(trials, key=lambda trial: (trial.is_telling, trial.support))
     return best if best.is_telling else min(trials, key=lambda trial: trial.mean)
 
 
-def _group(reading: Reading) -> object:
-    grid = reading.description.get("hash") or {}
-    names = ("levels", "features_per_level", "log2_table_size", "base_resolution")
-    return (reading.description.get("use_grid"), *(grid.get(name) for name in names))
-
-
-def _proven(trials: Sequence[Trial], best: Trial, share: int) -> Trial:
-    """The best reading if it beats every other one, at more points, and those beside it, too; or a refusal."""
-    tier = min(trial.reading.tier for trial in trials if trial.reading.has_sines_of(best.reading))
-    found = _climbed(best.reading, tier, Evidence(best.reading, CLIMB_POINTS // share))
-    finest = Evidence(best.reading, FINAL_POINTS // share)
-    rivals = [trial.reading for trial in _nearest(_standing(trials, best), best, FINALISTS)]
-    rivals = [rival for rival in rivals if not any(rival.is_grid_of(reading) for reading in found)]
-    again = [finest.of(reading) for reading in (*found, *rivals)]
-    chosen = _most_supported(again, again[0])
-    beside = [finest.of(reading) for reading in readings_beside(chosen.reading, tier)]
-    standing = _nearest(_standing((*again, *beside), chosen), chosen, LAST_FINALISTS)
-    if standing:
-        last, kind = Evidence(best.reading, LAST_POINTS // share), _likelier_interpolation(chosen, finest)
-        chosen, *rest = [last.of(_compared(trial.reading, kind)) for trial in (chosen, *standing)]
-        standing = _standing(rest, chosen)
-    if not standing and chosen.support < CLEAR_SUPPORT:
-        standing = _others(trials, best)
-    if standing or not chosen.reading.is_written:
-        raise _ambiguous([trial.reading for trial in (chosen, *_usual_first(standing))])
-    return chosen
-
-
-def _climbed(reading: Reading, tier: int, evidence: Evidence) -> list[Reading]:
-    """The better supported reading to which ``reading`` leads over those beside it, and the nearest to that.
-
-    Raises AmbiguousError: there are still better ones.
-    """
-    best = evidence.of(reading)
-    tried = [best]
-    for _ in range(MAX_CLIMBS):
-        near = (*islice(readings_written_near(best.reading, tier), WRITTEN_NEAR), *readings_beside(best.reading, tier))
-        tried += [evidence.of(other) for other in near if not any(t.reading.is_grid_of(other) for t in tried)]
-        better = _most_supported(tried, best)
-        if better is best:
-            written = [trial for trial in tried if trial.reading.is_written and trial is not best]
-            return [best.reading, *(trial.reading for trial in _nearest(written, best, LAST_FINALISTS))]
-        best = better
-    raise _ambiguous([trial.reading for trial in _nearest(tried, best, LAST_FINALISTS)])
-
-
-def _most_supported(trials: Sequence[Trial], best: Trial) -> Trial:
-    """The one of ``trials`` that is most ahead of ``best``, or ``best``."""
-    return max((best, *trials), key=lambda trial: trial.support_over(best) + trial.usual_over(best))
-
-
-def _nearest(rivals: Sequence[Trial], best: Trial, most: int) -> list[Trial]:
-    """The rivals that come nearest to the ``best`` one: who is behind these is behind it, too."""
-    return sorted(rivals, key=lambda rival: best.support_over(rival) + best.usual_over(rival))[:most]
-
-
-def _standing(trials: Sequence[Trial], best: Trial) -> list[Trial]:
-    """Those of ``trials`` that are another function than the ``best`` and not beaten by it."""
-    return [trial for trial in _others(trials, best) if not best.beats(trial)]
-
-
 def _others(trials: Sequence[Trial], best: Trial) -> list[Trial]:
     return [trial for trial in trials if not trial.is_same(best)]
-
-
-def _usual_first(trials: Sequence[Trial]) -> list[Trial]:
-    return sorted(trials, key=lambda trial: (trial.reading.tier, -trial.support))
-
-
-def _likelier_interpolation(trial: Trial, evidence: Evidence) -> Interpolation | None:
-    """The interpolation under which layouts are compared: the better supported one, unless it is known."""
-    if trial.reading.interpolation == "known":
-        return None
-    linear, smooth = (evidence.of(_with_interpolation(trial.reading, kind)) for kind in _KINDS)
-    return "linear" if linear.support_over(smooth) > 0.0 else "smoothstep"
 
 
 def _interpolated(reading: Reading, share: int, why: list[str]) -> tuple[Reading, list[str]]:
@@ -334,14 +231,6 @@ def _interpolated(reading: Reading, share: int, why: list[str]) -> tuple[Reading
     asked = [_with_interpolation(reading, kind) for kind in sorted(_KINDS, key=lambda kind: kind != habit)]
     # evidence that cannot tell the interpolation is no proof of the layout: whoever answers says both
     raise _ambiguous(asked, whole=True)
-
-
-def _compared(reading: Reading, kind: Interpolation | None) -> Reading:
-    """``reading`` as it is compared with others: under the likelier interpolation where that is open."""
-    if kind is None:
-        return reading
-    grid = {**reading.description["hash"], "interpolation": kind}
-    return replace(reading, description={**reading.description, "hash": grid})
 
 
 def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:

@@ -177,49 +177,11 @@ class Trial:
             return self.levels is other.levels
         return len(self.levels.gains) == len(other.levels.gains)
 
-    def has_resolutions_of(self, other: Trial) -> bool:
-        """Whether both differ at most in how rows are counted, or have no grid: misread, they are equally noisy.
-
-        Over another cube the cells have another length, and a misread grid another noise.
-        """
-        if self.levels is None or other.levels is None:
-            return self.levels is other.levels
-        radii = (trial.reading.description.get("grid_radius") for trial in (self, other))
-        return len(set(radii)) == 1 and torch.equal(self.levels.scales, other.levels.scales)
-
     def support_over(self, other: Trial) -> float:
         """The same against ``other``: level by level at the same points where both have as many levels."""
         if self.levels is None or other.levels is None or not self.has_levels_of(other):
             return self.support - other.support
         return self.levels.over(other.levels).support()
-
-    def usual_over(self, other: Trial) -> float:
-        """What usual numbers say for this reading against ``other``, as support. Strides are not anybody's numbers."""
-        if self.has_resolutions_of(other):
-            return 0.0
-        tiers = other.reading.tier - self.reading.tier
-        mine, others = self.reading.scale, other.reading.scale
-        if tiers and mine is not None and others is not None and abs(mine - others) < _ACCIDENT:
-            return math.copysign(LEAST_SUPPORT + _USUAL, tiers)
-        return _USUAL * tiers
-
-    def beats(self, other: Trial) -> bool:
-        """Whether the levels speak clearly for this reading and not for ``other``.
-
-        The misfit alone speaks only where both have the same resolutions: a misread grid of low resolution has less of
-        it than the right one. Readings of other numbers of levels have no levels in common: then more must speak for
-        this one. A reading without a grid is the simplest one: it stands where a grid's levels say nothing and only
-        worsen the misfit.
-        """
-        if other.misfit is None:
-            return self.misfit is not None
-        if self.levels is None and other.levels is not None:
-            return other.support < LEAST_SUPPORT and self.is_better(other, CLEARLY, LEAST)
-        if self.has_resolutions_of(other) and self.is_better(other, CLEARLY, LEAST):
-            return True
-        if self.has_levels_of(other):
-            return self.support_over(other) + self.usual_over(other) > _LIKELIER
-        return self.support_over(other) > CLEAR_SUPPORT
 
     def is_better(self, other: Trial, share: float, least: float = 0.0) -> bool:
         """Whether this one fits better than ``other`` by more than chance, ``share`` of its misfit and ``least``."""
@@ -240,15 +202,8 @@ class Trial:
 
 LEAST_SUPPORT = 15.0
 """Support is clear beyond so much: a likelihood ratio of three million."""
-_LIKELIER = 10.0
-"""What a reading needs against one of as many levels, usual numbers included: odds of twenty thousand. Levels that tell
-nothing add 3 to it by chance (the standard deviation of twelve)."""
-_USUAL = 5.0
-"""A tier of numbers is written this much more often than the next: 150 times, as a logarithm."""
-_ACCIDENT = 0.01
-"""Logarithm of finest resolutions within which a more usual number is no accident."""
 CLEAR_SUPPORT = 50.0
-"""What two readings need whose difference chance is not all of: readings of other levels, interpolations, nothing."""
+"""What two readings need whose difference chance is not all of: readings over other cubes, interpolations."""
 _DISTANCE = 0.4
 """A reading of a greater mean misfit is itself no distance, and speaks against no other."""
 CLEARLY, LEAST = 0.1, 0.01

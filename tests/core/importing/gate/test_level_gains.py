@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
-import pytest
 import torch
 from torch import Tensor
 
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.gate.choice import told_interpolation
 from regnf_core.importing.gate.evidence import LevelGains, Trial, level_gains
-from regnf_core.importing.gate.readings_beside import readings_beside, readings_written_near
-from regnf_core.schema.hash_grid_config import HashGridConfig
 
 POINTS = 4000
 
@@ -99,35 +94,3 @@ def test_an_untrained_level_leaves_the_interpolation_open() -> None:
     within = torch.rand(POINTS, 1, generator=torch.Generator().manual_seed(10))
     smoothly = elsewhere * 6.0 * within * (1.0 - within)
     assert told_interpolation(trial(elsewhere, unit - error), trial(smoothly, unit - error)) is None
-
-
-def flat(misfit: float, levels: LevelGains | None) -> Trial:
-    """A reading whose gradient's norm is off by ``misfit`` on average."""
-    values = misfit + 0.01 * torch.randn(POINTS, generator=torch.Generator().manual_seed(11))
-    return Trial(Reading("somebody's", {}, {}), values, values, values, levels)
-
-
-def test_no_grid_stands_beside_a_grid_whose_levels_say_nothing() -> None:
-    unit, error = unit_and_noise(12)
-    elsewhere = error[torch.randperm(POINTS, generator=torch.Generator().manual_seed(13))]
-    noise, told = gains_of(unit - error, elsewhere[None]), gains_of(unit - error, error[None])
-    assert flat(0.05, None).beats(flat(0.2, noise))
-    assert not flat(0.05, None).beats(flat(0.05, noise))
-    assert not flat(0.05, None).beats(flat(0.2, told))
-
-
-def test_without_a_grid_the_misfit_speaks() -> None:
-    assert flat(0.05, None).beats(flat(0.2, None))
-    assert not flat(0.2, None).beats(flat(0.05, None))
-
-
-def test_numbers_that_somebody_would_write_are_near_those_that_nobody_would() -> None:
-    small = {"levels": 16, "features_per_level": 2, "log2_table_size": 10, "base_resolution": 16}
-    grid = asdict(HashGridConfig.from_top_resolution(1611, **small))
-    reading = Reading("a grid", {"hash": grid}, {}, {"hash": {"levels": 16}})
-    near = {one.say["hash"]["top_resolution"]: one for one in readings_written_near(reading, 0)}
-    assert {1500, 1536, 1600, 1700} <= set(near)
-    assert 1611 not in near
-    assert all(one.is_written and one.tier == 1 for one in near.values())
-    assert HashGridConfig(**near[1500].description["hash"]).per_level_scale == pytest.approx((1500 / 16) ** (1 / 15))
-    assert not any(one.is_written for one in readings_beside(reading, 0))
