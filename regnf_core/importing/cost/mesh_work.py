@@ -176,9 +176,13 @@ def require_within(seconds: float, work_s: float) -> None:
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
 
 
-def require_room(needed: int, memory_bytes: int) -> None:
-    """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more bytes are estimated than libraries and upload leave."""
-    room = max(memory_bytes - _LIBRARIES, memory_bytes // 2)
+def free_room(memory_bytes: int) -> int:
+    """Bytes that libraries and upload leave of so many."""
+    return max(memory_bytes - _LIBRARIES, memory_bytes // 2)
+
+
+def require_room(needed: int, room: int) -> None:
+    """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more bytes are estimated than there are."""
     if needed > room:
         message = f"the field's values would take an estimated {needed >> 20} MiB at once; {room >> 20} MiB are free"
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
