@@ -51,7 +51,7 @@ def onnx_needs(
     Raises FieldFormatError (ONNX_GRAPH_INVALID) where the graph contradicts itself, MemoryError.
     """
     values = _given(description, tensors)
-    runs = sum(_runs(points, description.batch) for points in calls.values)
+    runs = float(sum(_runs(points, description.batch) for points in calls.values))
     runs += GRADIENT * sum(_runs(points, description.batch) for points in calls.gradients)
     last = last_uses(description.nodes, description.output)
     changing, kept = {description.input}, set[str]()

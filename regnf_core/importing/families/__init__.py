@@ -13,7 +13,6 @@ from regnf_core.importing.families import (
     neuralangelo,
     neus,
     pin_slam,
-    plain_network,
     sdfstudio,
     siren,
     unsupported,
@@ -30,7 +29,6 @@ but cannot be taken."""
 FAMILIES: tuple[Family, ...] = (
     sdfstudio.convert,
     neus.convert,
-    neus.convert_implicit,
     instant_nsr_pl.convert,
     neuralangelo.convert,
     deepsdf.convert,
@@ -38,7 +36,6 @@ FAMILIES: tuple[Family, ...] = (
     siren.convert,
     pin_slam.convert,
     unsupported.refuse,
-    plain_network.convert,
 )
 
 _SHOWN_KEYS = 8

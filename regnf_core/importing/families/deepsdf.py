@@ -7,7 +7,6 @@ shape is constant, so it is folded into the biases, and what remains is a field.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -27,16 +26,14 @@ from regnf_core.importing.families.layers import (
     shared_entries,
     strip_prefix,
 )
-from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
+from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, form_variant, network_field
 from regnf_core.importing.pickle.pickle_machine import TensorRef
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
-FAMILY, IGR = "deepsdf", "igr"
+FAMILY = "deepsdf"
 _PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
-_CLAMP = 0.1
-"""Where published configurations cut distances off."""
 
 
 def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
@@ -55,8 +52,13 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     names = layer_names(state, "lin")
     layers = read_layers(state, names, source, column=overrides.output_column or 0)
     norms = _norms(state, layers, source)
-    own = _is_deepsdfs(state, norms)
-    require_family(overrides, IGR if overrides.family == IGR and not own else FAMILY)
+    require_family(overrides, FAMILY)
+    if overrides.family is None and not norms and all(f"{name}.weight" in state for name in names[:-1]):
+        message = (
+            "a DeepSDF without weight normalization, or IGR's network, which has the same names: say"
+            ' {"family": "deepsdf"} if it is the first; of the other give the mesh'
+        )
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
     width = layers.input_width - 3
     if width < 0:
         raise tensor_error(f"lin0 has {layers.input_width} columns, expected 3 or more", "TENSOR_SHAPE")
@@ -70,33 +72,13 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
     )
     folded = Network(at_code(layers, latent, (0, *whole)), tuple(seeing), norms)
-    return network_field(folded, _forms(overrides, own), shared_entries(overrides, UNIT_CUBE), why)
-
-
-def _is_deepsdfs(state: dict[str, Any], norms: dict[str, Float32Array]) -> bool:
-    """IGR's network (Gropp et al. 2020) has the same names; DeepSDF's has normalized weights or normalized layers."""
-    return bool(norms) or not all(f"lin{i}.weight" in state for i in range(len(state) // 2 - 1))
-
-
-def _forms(overrides: UploadDescription, own: bool) -> list[OpenForm]:
-    """DeepSDF's, with one tanh at the end, or with ``use_tanh`` two; IGR's where the names leave it open."""
-    tanhs = (1, 2) if overrides.output_tanh is None else (overrides.output_tanh,)
-    forms = [
-        OpenForm(
-            told(output_tanh=n),
-            Form("relu", output_tanh=n).said(replace(overrides, output_tanh=n)),
-            FAMILY,
-            known_to=_CLAMP,
-        )
-        for n in tanhs
-    ]
-    igr = Form("softplus", skip_factor=math.sqrt(0.5)).said(overrides)
-    if overrides.family == IGR:
-        return [OpenForm(told(family=IGR), igr, IGR)]
-    if own or overrides.family == FAMILY:
-        return forms
-    named = (replace(one, name=told(family=FAMILY, output_tanh=one.form.output_tanh)) for one in forms)
-    return [OpenForm(told(family=IGR), igr, IGR), *named]
+    entries, form = shared_entries(overrides, UNIT_CUBE), Form("relu", output_tanh=1).said(overrides)
+    converted = network_field(folded, form, FAMILY, entries, why)
+    if overrides.output_tanh is not None:
+        return converted
+    forms = [replace(form, output_tanh=tanhs) for tanhs in (1, 2)]  # the second where ``use_tanh`` is set
+    untold = tuple(form_variant(folded, one, FAMILY, entries, output_tanh=one.output_tanh) for one in forms)
+    return replace(converted, untold=untold)
 
 
 def _refuse_codes_alone(checkpoint: dict[Any, Any]) -> None:

@@ -1,7 +1,7 @@
 """DeepSDF as widespread later code writes it: blocks ``net.*.0`` of a layer and ReLU, ``final_layer.0`` and one tanh.
 
 A narrower ``skip_layer.0``, behind which the network sees its input again, is in the file even where it is not used,
-and nothing says behind which block it is: every place that fits is tried.
+and nothing says behind which block it is: if several places fit, it is asked.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from regnf_core.importing.families.layers import (
     states,
     strip_prefix,
 )
-from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
+from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, form_variant, network_field
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
@@ -54,19 +54,23 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     latent, whence = latent_code(checkpoint, source, overrides, width)
     form = replace(Form("relu"), output_tanh=1 if overrides.output_tanh is None else overrides.output_tanh)
     form = form.said(overrides)
-    forms = [
-        OpenForm(told(skip_layer=place), form, FAMILY, Network(at_code(layers, latent, (0, *skips)), skips))
+    entries = shared_entries(overrides, UNIT_CUBE)
+    places = [
+        (place, Network(at_code(layers, latent, (0, *skips)), skips))
         for place, layers, skips in _readings(state, plain, source, overrides)
     ]
-    if not forms:
+    if not places:
         raise FieldFormatError("description.skip_layer: there is no such place", reason="INVALID_DESCRIPTION")
     why = (
         f"keys net.*.0 and final_layer.0, {len(blocks)} blocks",
         whence,
         "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
     )
-    first = forms[0].network or Network(plain)
-    return network_field(first, forms, shared_entries(overrides, UNIT_CUBE), why)
+    converted = network_field(places[0][1], form, FAMILY, entries, why)
+    if len(places) == 1:
+        return converted
+    untold = tuple(form_variant(network, form, FAMILY, entries, skip_layer=place) for place, network in places)
+    return replace(converted, untold=untold)
 
 
 def _readings(

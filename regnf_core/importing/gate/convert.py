@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Any
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.gate.picture import PICTURE_NAME
+from regnf_core.importing.cost.mesh_work import Calls
+from regnf_core.importing.families.converted import AmbiguousError
+from regnf_core.importing.gate.picture import PICTURE_NAME, candidate_name
 from regnf_core.importing.gate.reading import Companions
-from regnf_core.importing.gate.readings_beside import AmbiguousError, require_told
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
 from regnf_core.schema.description import OBSERVATION, split_color
@@ -34,7 +35,7 @@ from regnf_core.schema.kinds import WEIGHTS
 
 if TYPE_CHECKING:
     from regnf_core.fields.observation import SdfField
-    from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.families.converted import ConvertedField, OpenCandidate
     from regnf_core.importing.gate.reading import ReadUpload
     from regnf_core.importing.upload_description import UploadDescription
 
@@ -52,6 +53,8 @@ _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
 _PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
 """Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
+_SMALL_PICTURE = Calls((40_000, 37_000), (12_000,))
+"""About as many points as a small picture takes."""
 _THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz"}
 """May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
@@ -114,8 +117,12 @@ def _stored(read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool)
 
     _require_text(read.field.description)
     require_affordable(read.field, limits)
-    settled = _settled(read.field, affordable_share(read.field, limits))
-    converted = placed(with_affordable_color(settled, limits), read.description)
+    converted = read.field
+    if converted.readings or converted.untold or converted.assumed:
+        from regnf_core.importing.gate.choice import settled  # loads torch
+
+        converted = settled(converted, affordable_share(converted, limits))
+    converted = placed(with_affordable_color(converted, limits), read.description)
     converted = observed(converted, read, limits, required=cameras)
     said = converted.description
     write_safe_field(target, said, converted.tensors, _ROOM)
@@ -221,25 +228,28 @@ def _require_text(description: dict[str, Any]) -> None:
         raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
 
 
-def _settled(converted: ConvertedField, share: int) -> ConvertedField:
-    """The one function that the field stands for, where its shapes leave several. share: see calls_of_trials."""
-    if converted.open_readings:
-        from regnf_core.importing.gate.network_form import settle_form
+def draw_asked(asked: Sequence[OpenCandidate], out_dir: Path, seconds: float) -> None:
+    """A picture of each function that a person is asked about, in so many processor seconds: as many as there can be.
 
-        converted = settle_form(converted)
-    if converted.readings:
-        from regnf_core.importing.gate.choice import choose_reading
+    The refusal does without those that cannot be drawn. torch lacks memory with a RuntimeError.
+    """
+    from regnf_core.importing.gate.cost_estimate import seconds_of
+    from regnf_core.importing.gate.evidence import field_of
+    from regnf_core.importing.gate.plausibility import without_new_code
+    from regnf_core.viewing.field_picture import SMALL, field_picture
 
-        converted = choose_reading(converted, share)
-    require_told(converted)
-    return converted
+    deadline = time.process_time() + seconds
 
+    def look(_: int) -> None:
+        if time.process_time() > deadline:
+            raise RegnfError("no time is left for the picture")
 
-def _draw_asked(error: AmbiguousError, out_dir: Path, left_s: float) -> None:
-    """A picture of each function that a person is asked about, in a part of the time that is left."""
-    from regnf_core.importing.gate.candidate_pictures import draw_candidates  # loads torch
-
-    draw_candidates(error.asked, out_dir, min(_PICTURES_S, _PICTURES_SHARE * left_s))
+    for number, candidate in enumerate(asked, 1):
+        with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():
+            reading = candidate.make()
+            if seconds_of(reading.description, reading.tensors, _SMALL_PICTURE) < deadline - time.process_time():
+                drawn = field_picture(field_of(reading), reading.description.get("up_axis"), SMALL, look)
+                drawn.save(out_dir / candidate_name(number))
 
 
 def run(
@@ -257,7 +267,8 @@ def run(
         return convert_file(upload, out_dir, description, limits, picture, beside)
     except AmbiguousError as error:
         if ask_by_picture:
-            _draw_asked(error, out_dir, limits.longest_s - (time.monotonic() - started))
+            left_s = limits.longest_s - (time.monotonic() - started)
+            draw_asked(error.asked, out_dir, min(_PICTURES_S, _PICTURES_SHARE * left_s))
         asked = [{"name": one.name, "description": one.say} for one in error.asked]
         return {"reason": error.reason, "detail": str(error), "candidates": asked}
     except FieldFormatError as error:

@@ -21,7 +21,6 @@ from regnf_core.importing.settings.said import Said
 from regnf_core.importing.settings.trainers import (
     deepsdf,
     fusion,
-    implicit_network,
     instant_nsr_pl,
     neuralangelo,
     neus,
@@ -98,7 +97,6 @@ TRAINERS = (
     Trainer(lambda _: "instant-nsr-pl", instant_nsr_pl),
     Trainer(lambda _: "Neuralangelo", neuralangelo),
     Trainer(lambda _: "NeuS", neus),
-    Trainer(lambda _: "IDR, VolSDF or MonoSDF", implicit_network),
     Trainer(lambda _: "DeepSDF", deepsdf),
     Trainer(lambda _: "PIN-SLAM", pin_slam),
     Trainer(lambda _: "a network of sines", sines),

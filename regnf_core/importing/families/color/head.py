@@ -10,7 +10,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
-from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
+from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.families.layers import folded_weight
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.schema.description import COLOR, VALUES, NetworkColor, ValueColor, color_tensors
@@ -176,13 +176,9 @@ def _added(converted: ConvertedField, entries: Mapping[str, Any], tensors: Mappi
         description, stored = {**reading.description, **entries}, {**reading.tensors, **tensors}
         return replace(reading, description=description, tensors=stored)
 
-    def later(reading: OpenReading) -> OpenReading:
-        return replace(reading, make=lambda: added(reading.make()))
-
     return replace(
         converted,
         description={**converted.description, **entries},
         tensors={**converted.tensors, **tensors},
         readings=tuple(map(added, converted.readings)),
-        open_readings=tuple(map(later, converted.open_readings)),
     )
