@@ -54,7 +54,7 @@ def settled(converted: ConvertedField, share: int = 1) -> ConvertedField:
 
     share: after the first round the readings are tried at one ``share``-th of the points.
 
-    Raises AmbiguousError: readings that differ fit alike, or nothing tells them apart.
+    Raises AmbiguousError: readings that differ fit alike.
     """
     if converted.readings:
         chosen, why = _choose(converted.readings, share)
@@ -64,10 +64,6 @@ def settled(converted: ConvertedField, share: int = 1) -> ConvertedField:
             description=chosen.description,
             tensors=chosen.tensors,
             readings=(),
-        )
-    if converted.untold:
-        raise untold_error(
-            converted, converted.untold, "neither the tensors nor how they behave tell which function this is"
         )
     return converted if converted.assumed is None else _confirmed(converted, converted.assumed)
 
