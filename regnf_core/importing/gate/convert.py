@@ -78,7 +78,7 @@ def convert_file(
     # What is kept of the field: its tensors are let go of before the evaluation.
     reported, warnings, sign, sign_is_open, up_axis = _stored(read, target, limits, cameras)
     measured, more, surface = _evaluated(
-        target, reported["kind"] == "mesh", picture, up_axis, said.accept_implausible, sign
+        target, reported["kind"] == "mesh", picture, up_axis, bool(said.accept_implausible), sign
     )
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
