@@ -8,7 +8,6 @@ from typing import Any
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families import (
     deepsdf,
-    deepsdf_blocks,
     instant_nsr_pl,
     neuralangelo,
     neus,
@@ -32,7 +31,7 @@ FAMILIES: tuple[Family, ...] = (
     instant_nsr_pl.convert,
     neuralangelo.convert,
     deepsdf.convert,
-    deepsdf_blocks.convert,
+    deepsdf.convert_blocks,
     siren.convert,
     pin_slam.convert,
     unsupported.refuse,
