@@ -82,7 +82,9 @@ def convert_file(
     )
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
-    warned = list(kept_warnings(_latest([*warnings, *more])))
+    # Of warnings with the same word the last: a safe field brings those of its first import.
+    latest = {warning.partition(":")[0]: warning for warning in (*warnings, *more)}
+    warned = list(kept_warnings(list(latest.values())))
     add_to_source(target, {WARNINGS: warned} if warned else {})
     told = {"plausibility": measured, "surface_bounds": surface, "warnings": warned, "settings": read.settings}
     return {**reported, **told}
@@ -143,11 +145,6 @@ def _read(
         return read_upload(upload, out_dir, description, limits, beside)
     finally:
         remove_unpacked(out_dir)
-
-
-def _latest(warnings: Sequence[str]) -> list[str]:
-    """Of warnings with the same word the last: a safe field brings those of its first import."""
-    return list({warning.partition(":")[0]: warning for warning in warnings}.values())
 
 
 def _evaluated(
