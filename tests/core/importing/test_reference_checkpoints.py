@@ -22,7 +22,6 @@ CHECKPOINTS = {".ckpt", ".pth", ".pt"}
 SAID = {
     "hash": {
         "levels": 16,
-        "log2_table_size": 19,
         "base_resolution": 16,
         "top_resolution": 2048,
         "interpolation": "smoothstep",
