@@ -217,7 +217,7 @@ def _scene(scene: Any, role: Role | None) -> Geometry:
 def _field(converted: ConvertedField, description: Said) -> SdfField:
     """The field of what a converter made, checked as an import's is; warnings are issued as FieldWarnings."""
     from regnf_core.importing.families.converted import Reading
-    from regnf_core.importing.gate.reading_field import field_of as built
+    from regnf_core.importing.gate.evidence import field_of as built
     from regnf_core.importing.gate.report import placed
 
     done = placed(converted, _said(description))

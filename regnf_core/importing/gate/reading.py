@@ -143,7 +143,6 @@ class _Translation:
 
 def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: ImportLimits) -> ConvertedField:
     """By the format's own reader. path: the upload itself, or where a field file out of an archive may be written."""
-    from regnf_core.importing.families.arrays import convert_arrays
     from regnf_core.importing.families.safe_field import convert_safe_field
     from regnf_core.importing.settings.facts import Facts
 
@@ -154,6 +153,7 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
         return _convert_torch(kind, data, tensor_bytes, describe)
     if kind == "npz":
         from regnf_core.importing.containers.npz import ArraySource
+        from regnf_core.importing.families.arrays import convert_arrays  # loads scipy
 
         return convert_arrays(ArraySource(data, tensor_bytes), describe(Facts()))
     if kind == "safetensors":

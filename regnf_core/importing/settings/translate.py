@@ -80,7 +80,6 @@ TRAINERS = (
     Trainer("instant-nsr-pl", _has(hash_grids.NSR_ENCODING), hash_grids.instant_nsr_pl),
     Trainer("Neuralangelo", _has(hash_grids.ANGELO_ENCODING), hash_grids.neuralangelo),
     Trainer("NeuS", _has(layers.NEUS_NETWORK), layers.neus),
-    Trainer("IDR, VolSDF or MonoSDF", _has(layers.IMPLICIT_NETWORK), layers.implicit_network),
     Trainer("DeepSDF", _has(layers.DEEPSDF_NETWORK, "CodeLength"), layers.deepsdf),
     Trainer("PIN-SLAM", _has("neuralpoints"), layers.pin_slam),
     Trainer("a network of sines", layers.names_frequency, layers.sines),

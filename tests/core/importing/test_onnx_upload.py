@@ -57,7 +57,7 @@ def test_a_model_whose_few_numbers_are_all_constants_goes_through_the_gate(tmp_p
     assert again["plausibility"] == pytest.approx(report.plausibility, abs=1e-6)  # processes may round differently
 
 
-@pytest.mark.parametrize("exporter", ["of today", "of before"])
+@pytest.mark.parametrize("exporter", [pytest.param("of today", marks=pytest.mark.long), "of before"])
 def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = Network().eval()

@@ -19,6 +19,17 @@ from regnf_core.importing.gate.report import ImportLimits
 from tests.devdata import dev_data
 
 CHECKPOINTS = {".ckpt", ".pth", ".pt"}
+SAID = {
+    "hash": {
+        "levels": 16,
+        "base_resolution": 16,
+        "top_resolution": 2048,
+        "interpolation": "smoothstep",
+    },
+    "use_grid": True,
+    "positional_encoding": {"degree": 6},
+}
+"""What both studios' configurations say of the layout: nothing is tried."""
 ANGELO_GRID = {"hash": {"base_resolution": 16, "top_resolution": 512, "features_per_level": 8}}
 COLORS = {
     "sdfstudio_neus_facto": "rgb_uncontracted.npy",
@@ -30,7 +41,6 @@ COLORS = {
 }
 """The values of the colors, of points that are not contracted. angelo's own gradient is of differences, with noise."""
 WARNED = {
-    "neus": ["SCALE_ASSUMED"],
     "instant_nsr_pl": ["ACTIVATION_ASSUMED"],
     "sdfstudio_neus_facto": ["COLOR_ASSUMED"],
     "sdfstudio_neus": ["COLOR_ASSUMED"],
@@ -81,17 +91,17 @@ def test_sdfstudio_through_the_gate(tmp_path: Path) -> None:
     assert [warning.partition(":")[0] for warning in report.warnings] == ["COLOR_ASSUMED"]
     assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=0.02)
     assert_reproduces(tmp_path / FIELD_NAME, folder)
+    assert_reproduces_color(tmp_path / FIELD_NAME, folder, COLORS[report.family])
 
 
 @pytest.mark.parametrize(
     ("family", "description"),
     [
-        ("sdfstudio_neus_facto", None),
         ("nerfstudio_neus_facto", None),
         ("sdfstudio_neus", None),
         ("sdfstudio_neus_facto_angelo", None),
         ("sdfstudio_neus_facto_angelo", ANGELO_GRID),
-        ("neus", None),
+        ("neus", {"input_scale": 1.0}),
         ("siren", None),
         ("instant_nsr_pl", None),
         ("neuralangelo", None),
@@ -113,14 +123,16 @@ def test_every_variant_is_recognized_and_reproduced(
 @pytest.mark.parametrize("family", ["sdfstudio_neus_facto", "nerfstudio_neus_facto"])
 def test_the_mean_appearance_may_be_asked_for(tmp_path: Path, family: str) -> None:
     folder = dev_data("formats", family)
-    said = {"color": {"average_appearance": True}} | ({"contraction": "linf"} if family.startswith("sdf") else {})
+    said = (
+        SAID | {"color": {"average_appearance": True}} | ({"contraction": "linf"} if family.startswith("sdf") else {})
+    )
     convert_file(only_file(folder, {".ckpt"}), tmp_path, said, ImportLimits())
     assert_reproduces_color(tmp_path / FIELD_NAME, folder, "rgb_average_appearance.npy")
 
 
 def test_the_contraction_may_be_asked_for(tmp_path: Path) -> None:
     folder = dev_data("formats", "sdfstudio_neus_facto")
-    convert_file(only_file(folder, {".ckpt"}), tmp_path, {"contraction": "linf"}, ImportLimits())
+    convert_file(only_file(folder, {".ckpt"}), tmp_path, SAID | {"contraction": "linf"}, ImportLimits())
     distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(np.load(folder / "points.npy")))
     expected = np.load(folder / "sdf_contracted.npy").reshape(-1)
     np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
@@ -134,7 +146,7 @@ def test_the_trainers_configuration_is_never_opened(tmp_path: Path) -> None:
     sys.addaudithook(_audit)
     _watching = True
     try:
-        convert_file(checkpoint, tmp_path, None, ImportLimits())
+        convert_file(checkpoint, tmp_path, SAID, ImportLimits())
     finally:
         _watching = False
     assert str(checkpoint) in _opened

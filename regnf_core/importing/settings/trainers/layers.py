@@ -84,30 +84,6 @@ def _neus_color(network: Keys, said: Said) -> None:
     said.choose("color.output", network, "squeeze_out", ("sigmoid", "linear"))
 
 
-# IDR, VolSDF and MonoSDF: the .conf file of a run, of which ``model.implicit_network`` counts.
-
-IMPLICIT_NETWORK = "model.implicit_network"
-_SPHERES = ("model.scene_bounding_sphere", "model.ray_tracer.object_bounding_sphere", "model.object_bounding_sphere")
-
-
-def implicit_network(keys: Keys, said: Said) -> None:
-    """Fill ``said``. Raises FieldFormatError: SETTINGS_MALFORMED, SETTINGS_CONTRADICT_TENSORS."""
-    network = keys.below(IMPLICIT_NETWORK)
-    _network(network, said)
-    if network.flag("inside_outside"):  # begun as a room: positive in the free space that it encloses
-        said.put("sign", 1, network, "inside_outside")
-    dims, layers = network.wholes("dims"), said.facts.count("implicit_network.lin", ".bias")
-    if dims is not None and layers:
-        _agree_on_count(keys, IMPLICIT_NETWORK, dims, layers)
-        said.note(network, "dims")
-    _agree_on_skips(network, "skip_in", "implicit_network.lin", said)
-    for path in _SPHERES:
-        radius = keys.number(path)
-        if radius is not None and radius > 0:
-            said.put("bounds", [[-radius] * 3, [radius] * 3], keys, path)
-            break
-
-
 # DeepSDF: specs.json, the shapes' latent codes, and how a shape was scaled into the unit sphere.
 
 DEEPSDF_NETWORK = "NetworkSpecs"

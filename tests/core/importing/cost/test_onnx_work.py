@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import pytest
-import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.onnx.graph import OPERATOR_FUNCTIONS, Step, run_step
-from regnf_core.importing.cost.onnx_work import RULES, walk
 from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds import OnnxDescription
-from regnf_core.schema.onnx_operators import OPERATORS
 from regnf_core.schema.safe_format import parse_description
 from tests.core.fields.test_onnx import GRAPHS
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.onnx_models import Initializers, model
 
-ROOT = Path(__file__).resolve().parents[4]
 HALF: Initializers = {"axes": np.array([1]), "half": np.array(0.5, np.float32)}
 SPHERE = "r = ReduceL2 x axes keepdims:1; s = Sub r half; "
 LAST = "; k = ReduceSum {0} axes keepdims:1; t = Tanh k; y = Add s t"
-TYPES = {"b": torch.bool, "i": torch.int64, "f": torch.float32}
 
 
 def ints(*values: int) -> np.ndarray[Any, Any]:
@@ -49,37 +41,6 @@ def chain(operator: str, times: int, first: str) -> str:
     """``operator`` with {0} for what went before, so often; the last value is e<times>."""
     steps = (f"e{n + 1} = {operator.format(f'e{n}')}" for n in range(times))
     return f"{SPHERE}e0 = {first}; {'; '.join(steps)}"
-
-
-def test_every_operator_has_a_rule() -> None:
-    assert RULES.keys() == OPERATORS.keys()
-
-
-def values_as_evaluated(description: OnnxDescription, tensors: dict[str, Any]) -> dict[str, torch.Tensor]:
-    points = torch.rand(description.batch, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    values: dict[str, torch.Tensor | None] = {"": None, description.input: points}
-    for name, array in tensors.items():
-        values[name] = torch.from_numpy(array).float() if array.dtype.kind == "f" else torch.from_numpy(array).long()
-    types = {"float32": torch.float32, "int64": torch.int64, "bool": torch.bool}
-    for name, constant in description.constants.items():
-        values[name] = torch.tensor(constant.values, dtype=types[constant.type]).reshape(constant.shape)
-    for node in description.nodes:
-        attributes = {**node.attributes, "outputs": len(node.outputs)}
-        values |= run_step(Step(node.op, OPERATOR_FUNCTIONS[node.op], attributes, node.inputs, node.outputs), values)
-    return {name: value for name, value in values.items() if value is not None}
-
-
-@pytest.mark.parametrize("name", GRAPHS)
-def test_shapes_types_and_numbers_are_those_of_the_evaluation(name: str) -> None:
-    text, initializers = GRAPHS[name]
-    description, tensors = described(model(text, initializers | {"axes": np.array([1])}))
-    values = values_as_evaluated(description, tensors)
-    for node, _, results in walk(description, tensors):
-        for output, result in zip(node.outputs, results, strict=False):
-            assert result.shape == tuple(values[output].shape), node
-            if result.numbers is not None:
-                assert values[output].dtype == TYPES[result.kind]
-                np.testing.assert_allclose(result.numbers, values[output].numpy(), rtol=1e-6)
 
 
 COSTLY: dict[str, tuple[str, Initializers]] = {
@@ -146,11 +107,11 @@ def costly(name: str) -> onnx.ModelProto:
 def test_costly_graphs_are_refused_before_anything_is_evaluated(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is a small file that would take minutes."""
+    """Each is a small file that would take minutes: the run that tells it ends where it is too much."""
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda _: pytest.fail("it was opened"))
     path = saved(tmp_path, costly(name).SerializeToString())
     assert path.stat().st_size < 12_000
-    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(wall_s=100)), "IMPORT_TOO_COSTLY")
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(work_s=6)), "IMPORT_TOO_COSTLY")
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
@@ -160,19 +121,6 @@ def test_a_costly_graph_through_the_gate_says_both_numbers(tmp_path: Path) -> No
     with pytest.raises(FieldFormatError, match=r"estimated \d+ s of a core; 60 s are allowed") as caught:
         import_field(path, tmp_path / "out", None, ImportLimits(wall_s=100))
     assert caught.value.reason == "IMPORT_TOO_COSTLY"
-
-
-def test_a_costly_graph_is_refused_before_torch_is_loaded(tmp_path: Path) -> None:
-    """Which takes seconds of the worker's time."""
-    path = saved(tmp_path, costly("large products one after the other").SerializeToString())
-    program = (
-        "import sys; from pathlib import Path; from regnf_core.importing.gate import convert;"
-        "told = convert.run(Path(sys.argv[1]), Path(sys.argv[2]), None, convert.ImportLimits(wall_s=100));"
-        "print(told['reason'], 'torch' in sys.modules)"
-    )
-    command = [sys.executable, "-c", program, str(path), str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["IMPORT_TOO_COSTLY", "False"]
 
 
 def test_the_limit_is_the_callers(tmp_path: Path) -> None:

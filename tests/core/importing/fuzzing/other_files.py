@@ -21,7 +21,6 @@ from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.fuzzing.run_files import make_runs, make_settings
 from tests.core.importing.meshes import mesh_files, test_point_clouds
-from tests.core.importing.networks.cases import FAMILIES
 
 
 def make_others() -> dict[str, dict[str, bytes]]:
@@ -80,8 +79,6 @@ def _checkpoints() -> dict[str, bytes]:
     files = {"pin_slam": _saved(test_pin_slam.floor())}
     for make in (small.neus, small.siren, small.deepsdf, small.instant_nsr_pl):
         files[make.__name__] = _saved(make().checkpoint)
-    rng = np.random.default_rng(4)
-    files |= {family: _saved(FAMILIES[family](rng, 0).checkpoint) for family in ("idr, volsdf", "igr", "plain_network")}
     return files
 
 

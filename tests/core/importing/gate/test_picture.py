@@ -42,7 +42,9 @@ def test_a_ball_looks_like_a_ball() -> None:
 def test_the_gate_leaves_a_picture_when_asked(tmp_path: Path) -> None:
     """And none otherwise, as test_gate.py shows."""
     upload = saved(tmp_path, trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(file_type="stl"))
-    import_field(upload, tmp_path / "with", picture=True)
+    report = import_field(upload, tmp_path / "with", {"label": "ball"}, picture=True)
+    assert (report.family, report.label) == ("mesh", "ball")
+    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=1e-3)
     assert {path.name for path in (tmp_path / "with").iterdir()} == {gate.FIELD_NAME, PICTURE_NAME}
     with Image.open(tmp_path / "with" / PICTURE_NAME) as picture:
         assert picture.size == (3 * PANEL, PANEL)

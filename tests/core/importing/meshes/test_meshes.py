@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
-from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.gate.gate import import_field
-from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.archives import assert_refused
 from tests.core.importing.meshes.mesh_files import BALL, converted, exported
 from tests.devdata import dev_data
 
@@ -119,11 +116,3 @@ def test_what_is_said_goes_before() -> None:
     assert found.description["bounds"][1][0] == pytest.approx(0.001 * (0.5 + 0.05 * 3**0.5), rel=0.02)
     assert_refused(lambda: converted(exported("stl"), level_mask=3), "INVALID_DESCRIPTION")
     assert_refused(lambda: converted(exported("stl"), family="neus"), "FAMILY_NOT_SUPPORTED")
-
-
-def test_a_mesh_goes_through_the_gate(tmp_path: Path) -> None:
-    report = import_field(saved(tmp_path, exported("glb")), tmp_path / "out", {"label": "ball"})
-    assert (report.family, report.label) == ("mesh", "ball")
-    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=1e-3)
-    field = open_field(tmp_path / "out" / "field.safetensors")
-    assert field.signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.48, abs=0.03)

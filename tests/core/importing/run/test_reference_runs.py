@@ -99,12 +99,9 @@ def test_a_run_through_the_gate_s_own_process(tmp_path: Path) -> None:
     report = import_field(upload, tmp_path / "packed", {"frame": "field"})
     assert report.settings is not None
     assert report.settings["files"] == ["config.yaml"]
-    run = find_run(folder)
-    packed = pack_settings(run, tmp_path)
-    report = import_field(run.checkpoint, tmp_path / "beside", settings=packed)
-    assert report.settings is not None
-    assert report.settings["files"] == ["config.yaml", sphere.name]
-    assert any("dataset's frame is known" in line for line in report.why)
+    beside = with_settings(folder, tmp_path)
+    assert beside["settings"]["files"] == ["config.yaml", sphere.name]
+    assert any("dataset's frame is known" in line for line in beside["why"])
 
 
 @pytest.mark.parametrize("family", ["neuralangelo", "neus", "deepsdf", "nerfstudio_neus_facto"])

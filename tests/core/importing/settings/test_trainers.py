@@ -89,25 +89,6 @@ def test_neus_against_its_tensors(layers: int, skip: object, reason: str) -> Non
     assert_refused(lambda: translated(files, facts(NEUS)), f"SETTINGS_CONTRADICT_{reason}")
 
 
-@pytest.mark.parametrize(
-    ("width", "sphere", "where"),
-    [
-        (512, 1.0, "ray_tracer\n { object_bounding_sphere = 1.0 }"),
-        (256, 1.1, "scene_bounding_sphere = 1.1\n Grid_MLP = True"),
-    ],
-)
-def test_implicit_networks_agree_with_their_tensors(width: int, sphere: float, where: str) -> None:
-    dims = ", ".join([str(width)] * 8)
-    text = (
-        f"model{{\n feature_vector_size = 256\n {where}\n implicit_network\n {{\n d_in = 3\n d_out = 1\n"
-        f" dims = [ {dims} ]\n geometric_init = True\n bias = 0.6\n skip_in = [4]\n weight_norm = True\n"
-        " multires = 6\n sphere_scale = 20.0\n }\n}"
-    )
-    shapes = linear("implicit_network.lin", [width] * 3 + [width - 39] + [width] * 4 + [257], [39] + [width] * 8)
-    found = translated({"a.conf": text}, facts(shapes))
-    assert found.values == {"positional_encoding": {"degree": 6}, "bounds": [[-sphere] * 3, [sphere] * 3]}
-
-
 DEEPSDF = linear("model_state_dict.module.lin", [512] * 3 + [253] + [512] * 4 + [1], [259] + [512] * 8)
 
 
