@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_fill_holes, distance_transform_edt, label
+from scipy.ndimage import binary_dilation, binary_fill_holes, label
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from regnf_core.editing.region import GridDistance, Mask, RegionGrid, box_distance
+from regnf_core.editing.region import GridDistance, Mask, RegionGrid, box_distance, signed_distance_to
 from regnf_core.editing.support import PlacedObject, SupportPlane, support_planes
 from regnf_core.fields.observation import SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
@@ -43,8 +44,8 @@ class Ground:
     heights: Tensor
     missing: Tensor
 
-    def distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N,) of points (N, 3) to the support's matter, about, and the gradient (N, 3)."""
+    def distance(self, points: Tensor) -> Solid:
+        """Of points (N, 3) to the support's matter, about."""
         at = (points - self.origin.to(points)) @ self.axes.to(points).T / self.cell
         height, slope = _sampled(self.heights, at)
         missing, away = _sampled(self.missing, at)
@@ -81,7 +82,7 @@ def ground_of(
     free = (distance > tolerance) & ~own
     there = binary_fill_holes(~free) & ~outside
     heights = _membrane(np.where(known, -distance, 0.0), known)
-    missing = np.full(counts, -1e3 * cell) if there.all() else _signed(there, cell)
+    missing = np.full(counts, -1e3 * cell) if there.all() else signed_distance_to(there, cell)
     tensors = (torch.from_numpy(values.astype(np.float32)) for values in (heights, missing))
     return Ground(plane, origin, axes, cell, *tensors)
 
@@ -98,11 +99,6 @@ def _rectangle(plane: SupportPlane, box: OrientedBox) -> tuple[Tensor, Tensor, f
     low, high = low - 2 * cell, high + 2 * cell
     a, b = (int(count) + 1 for count in ((high - low) / cell).ceil().tolist())
     return plane.offset * n + low @ axes, axes, cell, (a, b)
-
-
-def _signed(there: Mask, cell: float) -> Heights:
-    signed: Heights = (distance_transform_edt(~there) - distance_transform_edt(there)) * cell
-    return signed - 0.5 * cell * np.sign(signed)
 
 
 def _membrane(values: Heights, known: Mask) -> Heights:
@@ -225,25 +221,25 @@ _OVERLAP = 0.004
 """Of the box's diagonal: the continued ground reaches so far into the matter round it, and leaves no gap."""
 
 
+Solid = tuple[Tensor, Tensor]
+"""Signed distances (N,) to a solid, and their gradients (N, 3)."""
+Place = PlacedObject | OrientedBox
+
+
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What a clearing makes of a scene's distances (N,): min(max(distance, least), most), with gradients (N, 3).
+    """What a clearing makes of a scene's distances: min(max(distance, least), most).
 
     As solids: the scene less the box (but for what is kept), and the ground. most: None without ground.
     """
 
-    least: Tensor
-    least_slope: Tensor
-    most: Tensor | None
-    most_slope: Tensor | None
+    least: Solid
+    most: Solid | None
 
-    def apply(self, distance: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """The distance (N,) of the cleared scene where the scene's own is ``distance``, and its gradient (N, 3)."""
-        distance, gradient = _larger(distance, gradient, self.least, self.least_slope)
-        if self.most is None or self.most_slope is None:
-            return distance, gradient
-        distance, gradient = _larger(-distance, -gradient, -self.most, -self.most_slope)
-        return -distance, -gradient
+    def apply(self, scene: Solid) -> Solid:
+        """The cleared scene."""
+        found = _larger(scene, self.least)
+        return found if self.most is None else _smaller(found, self.most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,38 +252,24 @@ class Clearing:
 
     def reaches(self, points: Tensor) -> Tensor:
         """(N,) distance to what may be changed, negative within, less the overlap."""
-        return box_distance(self.box, points) - self._overlap
+        return box_distance(self.box, points) - _OVERLAP * self.box.diagonal
 
     def limits(self, points: Tensor, with_gradient: bool) -> Limits:
         """Between which the cleared scene's distance lies at points (N, 3), whatever the scene's own is.
 
         Without gradients the slopes mean nothing.
         """
-        box, outward = self._box(points)
-        removed, away = box, outward
+        distance, outward = removed = self._box(points)
         if self.kept is not None:
             kept, slope = self.kept.at_with_gradient(points) if with_gradient else (self.kept.at(points), outward)
-            removed, away = _larger(box, outward, -kept, -slope)
+            removed = _larger(removed, (-kept, -slope))
+        least = -removed[0], -removed[1]
         if not self.grounds:
-            return Limits(-removed, -away, None, None)
-        ground, slope = self._ground(points)
-        filled, slope = _larger(ground, slope, box - self._overlap, outward)
-        return Limits(-removed, -away, filled, slope)
+            return Limits(least, None)
+        ground = reduce(_smaller, (each.distance(points) for each in self.grounds))
+        return Limits(least, _larger(ground, (distance - _OVERLAP * self.box.diagonal, outward)))
 
-    @property
-    def _overlap(self) -> float:
-        return _OVERLAP * self.box.diagonal
-
-    def _ground(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        distance, gradient = self.grounds[0].distance(points)
-        for ground in self.grounds[1:]:
-            other, slope = ground.distance(points)
-            distance, gradient = _larger(-distance, -gradient, -other, -slope)
-            distance, gradient = -distance, -gradient
-        return distance, gradient
-
-    def _box(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The box's signed distance (N,) and its gradient (N, 3)."""
+    def _box(self, points: Tensor) -> Solid:
         local = self.box.to_local(points)
         beyond = local.abs() - self.box.size.to(points) / 2.0
         out = beyond.clamp_min(0.0)
@@ -296,32 +278,50 @@ class Clearing:
         inward = torch.nn.functional.one_hot(axis, 3).to(points)
         slope = torch.where((deepest > 0)[:, None], out / outside.clamp_min(1e-12)[:, None], inward)
         slope = slope * torch.where(local < 0, -1.0, 1.0)
-        distance = torch.where(deepest > 0, outside, deepest)
-        return distance, slope @ self.box.rotation.to(points).T
+        return torch.where(deepest > 0, outside, deepest), slope @ self.box.rotation.to(points).T
 
 
-def clear_thing(scene: SdfField, thing: PlacedObject, residual: float, generator: torch.Generator) -> Clearing:
-    """Clear the scene's copy of a thing. residual: of its registration, scene units."""
-    own = _OWN_MARGIN * thing.box.diagonal + 3.0 * residual
-    margin = _BOX_MARGIN * thing.box.diagonal + residual
-    box = OrientedBox(thing.box.center, thing.box.size + 2.0 * margin, thing.box.rotation)
-    planes = support_planes(scene, thing.box, generator)
-    belongs = near_thing(thing, own)
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """All of the scene is cleared, but for what is near surface that was measured. shell: the distance to that."""
+
+    shell: GridDistance
+
+    def reaches(self, points: Tensor) -> Tensor:
+        """(N,): everywhere."""
+        return torch.full_like(points[:, 0], -torch.inf)
+
+    def limits(self, points: Tensor, with_gradient: bool) -> Limits:
+        """As of a :class:`Clearing`."""
+        if with_gradient:
+            return Limits(self.shell.at_with_gradient(points), None)
+        return Limits((self.shell.at(points), torch.zeros_like(points)), None)
+
+
+def clear(scene: SdfField, removed: Place, residual: float, generator: torch.Generator) -> Clearing:
+    """Clear the scene's copy of a thing, or a box in which nobody knows the thing's surface.
+
+    residual: of the thing's registration, scene units.
+    """
+    of_thing = removed.box if isinstance(removed, PlacedObject) else removed
+    margin = _BOX_MARGIN * of_thing.diagonal + residual
+    box = OrientedBox(of_thing.center, of_thing.size + 2.0 * margin, of_thing.rotation)
+    planes = support_planes(scene, of_thing, generator)
+    belongs = None
+    if isinstance(removed, PlacedObject):
+        belongs = near_thing(removed, _OWN_MARGIN * of_thing.diagonal + 3.0 * residual)
     kept = kept_neighbors(scene, box, planes, belongs)
     grounds = (ground_of(scene, plane, box, belongs) for plane in planes)
     return Clearing(box, kept, [ground for ground in grounds if ground is not None])
 
 
-def clear_box(scene: SdfField, box: OrientedBox, generator: torch.Generator) -> Clearing:
-    """Clear a box in which nobody knows the thing's surface."""
-    grown = OrientedBox(box.center, box.size + 2.0 * _BOX_MARGIN * box.diagonal, box.rotation)
-    planes = support_planes(scene, box, generator)
-    kept = kept_neighbors(scene, grown, planes, None)
-    grounds = (ground_of(scene, plane, grown, None) for plane in planes)
-    return Clearing(grown, kept, [ground for ground in grounds if ground is not None])
+def _larger(one: Solid, other: Solid) -> Solid:
+    """What both solids share."""
+    first = one[0] >= other[0]
+    return torch.where(first, one[0], other[0]), torch.where(first[:, None], one[1], other[1])
 
 
-def _larger(a: Tensor, slope_a: Tensor, b: Tensor, slope_b: Tensor) -> tuple[Tensor, Tensor]:
-    """The larger of two distances (N,), with its gradient (N, 3): what both solids share."""
-    first = a >= b
-    return torch.where(first, a, b), torch.where(first[:, None], slope_a, slope_b)
+def _smaller(one: Solid, other: Solid) -> Solid:
+    """Both solids together."""
+    first = one[0] <= other[0]
+    return torch.where(first, one[0], other[0]), torch.where(first[:, None], one[1], other[1])

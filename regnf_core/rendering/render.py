@@ -218,30 +218,18 @@ def render_frames(
         if cancelled is not None and cancelled():
             raise CancelledError("the rendering was cancelled")
 
-    done = _watched(_done(work, tasks, processes, check), len(tasks), check, progress)
+    def watched() -> Iterator[list[Part]]:
+        done = in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
+        for number in range(1, len(tasks) + 1):
+            check()
+            tile = next(done)
+            if progress is not None:
+                progress(number / len(tasks))
+            yield tile
+
+    done = watched()
     for camera, of_frame in zip(cameras, tiles, strict=True):
         yield _frame(camera, of_frame, done)
-
-
-def _done(
-    work: Callable[[tuple[int, int]], list[Part]],
-    tasks: Sequence[tuple[int, int]],
-    processes: int,
-    check: Callable[[], None],
-) -> Iterator[list[Part]]:
-    return in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
-
-
-def _watched(
-    tiles: Iterator[list[Part]], count: int, check: Callable[[], None], progress: Progress | None
-) -> Iterator[list[Part]]:
-    """The same, with ``check`` before each, and ``progress`` told once it is there."""
-    for number in range(1, count + 1):
-        check()
-        tile = next(tiles)
-        if progress is not None:
-            progress(number / count)
-        yield tile
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,9 +244,7 @@ class Renderer:
     @classmethod
     def of(cls, field: SdfField, options: RenderOptions) -> Renderer:
         """Raises InvalidInputError (FIELD_NOT_FINITE, COLORS_MISSING) and NoSurfaceError (NO_SURFACE_IN_SCENE)."""
-        up = torch.zeros(3)
-        up["xyz".index(options.up[-1])] = -1.0 if options.up.startswith("-") else 1.0
-        painter = Painter.of(field, up, options)
+        painter = Painter.of(field, options)
         grid = DistanceGrid.of(field)
         if bool((grid.bound > 0).all()):
             raise NoSurfaceError("the field has no surface within its bounds", reason="NO_SURFACE_IN_SCENE")
@@ -304,7 +290,7 @@ class Renderer:
         rays, cosine = camera.rays(pixels, at)
         rays = Rays(rays.origins.to(self.field.device), rays.directions.to(self.field.device))
         samples = self._samples(rays, pixels // camera.width, pixels % camera.width)
-        colors, parts = self.painter.colors(samples, rays.directions[samples.ray])
+        colors, parts = self.painter.colors(samples.points, rays.directions[samples.ray], samples.normals)
         blank = torch.zeros_like(rays.origins)
         color = blank.index_add(0, samples.ray, samples.weight[:, None] * colors)
         background = torch.tensor(self.options.background, device=color.device)

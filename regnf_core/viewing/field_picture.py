@@ -82,9 +82,8 @@ def _section(field: SdfField, surface: Surface, pixels: int) -> Image.Image:
     distance = np.zeros((pixels, pixels))
     distance[within] = field.signed_distance(torch.from_numpy(places[within])).double().cpu().numpy()
     picture = np.broadcast_to(_BACKGROUND, (pixels, pixels, 3)).copy()
-    picture[within] = _shades(
-        distance[within] / float(np.linalg.norm(high - low)), pixel / float(np.linalg.norm(high - low))
-    )
+    diagonal = float(np.linalg.norm(high - low))
+    picture[within] = _shades(distance[within] / diagonal, pixel / diagonal)
     return _image(picture)
 
 

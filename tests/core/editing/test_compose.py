@@ -21,8 +21,8 @@ from regnf_core import (
     render,
 )
 from regnf_core.editing.compose import standing_alike
+from regnf_core.editing.edited_scene import without_unseen
 from regnf_core.editing.edits import SCENE_PART, Edit
-from regnf_core.editing.region import without_unseen
 from regnf_core.editing.storing import write_field
 from regnf_core.errors import NoSurfaceError, RegnfError
 from regnf_core.fields.composite import TransformedField

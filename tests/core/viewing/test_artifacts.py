@@ -16,9 +16,8 @@ from PIL import Image
 from regnf_core.document import Alternative, Candidate, ObjectSymmetry, ranking_document, result_document
 from regnf_core.errors import VERDICT_REASONS
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RegistrationOptions
 from regnf_core.viewing.artifacts import write_artifacts
-from regnf_core.viewing.registration_picture import _up_axis, residual_colors
+from regnf_core.viewing.registration_picture import residual_colors
 from regnf_core.viewing.splats import Surfels, View, nearest_surfels, render
 from tests.core.conftest import ChairRun
 
@@ -223,18 +222,6 @@ def test_the_ramp_runs_from_dark_to_yellow_and_clips() -> None:
     np.testing.assert_allclose(colors[0], [0.18, 0.20, 0.46])
     np.testing.assert_allclose(colors[1], [0.98, 0.88, 0.18])
     np.testing.assert_allclose(colors[2], colors[1])
-
-
-@pytest.mark.parametrize(
-    ("options", "up"),
-    [
-        ({}, "z"),
-        ({"up_axis": "y"}, "y"),
-        ({"preset": "paper", "up_axis": "x"}, "x"),
-    ],
-)
-def test_the_picture_stands_on_the_axis_that_the_options_name(options: dict[str, object], up: str) -> None:
-    assert _up_axis(RegistrationOptions.from_dict(options).to_dict()) == up
 
 
 def test_a_picture_drawn_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
