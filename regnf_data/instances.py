@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import combinations
 from typing import Any
 
@@ -27,7 +26,10 @@ def read_instances(given: Any) -> tuple[Instance, ...]:
 
     Raises DatasetError (DATASET_INSTANCE_INVALID).
     """
-    return tuple(_read(entry, name) for name, entry in _entries(given))
+    if not isinstance(given, dict | list | None):
+        raise DatasetError("instances are neither a list nor an object", reason=_REASON)
+    named = given.items() if isinstance(given, dict) else ((None, entry) for entry in given or ())
+    return tuple(_read(entry, name) for name, entry in named)
 
 
 def write_instance(instance: Instance) -> dict[str, Any]:
@@ -42,18 +44,12 @@ def write_instance(instance: Instance) -> dict[str, Any]:
         # The three above lose the last digits, and the box's own axes; this is what regnf reads back.
         "box": {"center": box.center.tolist(), "size": box.size.tolist(), "rotation": box.rotation.tolist()},
     }
-    for name in ("T_object_world", "world_pose", "gt_pose"):
-        matrix = getattr(instance, name)
-        if matrix is not None:
-            written[name] = np.asarray(matrix).tolist()
-    return written
+    matrices = {name: getattr(instance, name) for name in ("T_object_world", "world_pose", "gt_pose")}
+    return written | {name: np.asarray(T).tolist() for name, T in matrices.items() if T is not None}
 
 
-def box_of_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Center (3,), edge lengths (3,) and axes (3, 3), as columns, of the box whose corners (8, 3) come in any order.
-
-    Raises DatasetError (DATASET_INSTANCE_INVALID) if they are not those of a box.
-    """
+def _box_of_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Center (3,), edge lengths (3,) and axes (3, 3), as columns, of the box whose corners (8, 3) come in any order."""
     offsets = corners[1:] - corners[0]
     lengths = np.linalg.norm(offsets, axis=1)
     diagonal = offsets[lengths.argmax()]
@@ -72,31 +68,14 @@ def box_of_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], .
     raise DatasetError("box_corners are not the eight corners of a box", reason=_REASON)
 
 
-def _entries(given: Any) -> Iterator[tuple[str | None, Any]]:
-    if given is None:
-        return
-    if isinstance(given, dict):
-        yield from given.items()
-    elif isinstance(given, list):
-        for entry in given:
-            yield None, entry
-    else:
-        raise DatasetError("instances are neither a list nor an object", reason=_REASON)
-
-
 def _read(entry: Any, name: str | None) -> Instance:
     if not isinstance(entry, dict):
         raise DatasetError("an instance is not a JSON object", reason=_REASON)
     label = str(next((entry[key] for key in _LABELS if entry.get(key) is not None), name or "instance"))
     label = "".join(letter if letter.isprintable() else "?" for letter in label[:_LONGEST_LABEL])
-    object_world = entry.get("T_object_world")
-    poses = {key: entry.get(key) for key in ("world_pose", "gt_pose")}
-    return Instance(
-        label,
-        _box(entry, label),
-        None if object_world is None else similarity(object_world, f"T_object_world of {label}", _REASON),
-        **{k: None if v is None else matrix4(v, f"{k} of {label}", _REASON) for k, v in poses.items()},
-    )
+    read = {"T_object_world": similarity, "world_pose": matrix4, "gt_pose": matrix4}
+    known = {k: of(entry[k], f"{k} of {label}", _REASON) for k, of in read.items() if entry.get(k) is not None}
+    return Instance(label, _box(entry, label), **known)
 
 
 def _box(entry: dict[str, Any], label: str) -> OrientedBox:
@@ -107,17 +86,13 @@ def _box(entry: dict[str, Any], label: str) -> OrientedBox:
             parts = [array(entry["box"].get(k), (s,), f"box {k} of {label}", _REASON) for k, s in shapes.items()]
         elif entry.get("box_corners") is not None:
             corners = array(entry["box_corners"], ((8, 3),), f"box_corners of {label}", _REASON)
-            parts = list(box_of_corners(corners))
+            parts = list(_box_of_corners(corners))
             if np.allclose(np.abs(parts[2]).max(axis=0), 1.0, atol=1e-6):
-                return _between(corners.min(axis=0), corners.max(axis=0), label)
+                return OrientedBox.from_corners(corners.min(axis=0), corners.max(axis=0), label)
         else:
             lower, upper = (array(entry.get(k), ((3,),), f"{k} of {label}", _REASON) for k in ("box_min", "box_max"))
-            return _between(lower, upper, label)
+            return OrientedBox.from_corners(lower, upper, label)
         center, size, rotation = (torch.tensor(np.ascontiguousarray(part)) for part in parts)
         return OrientedBox(center, size, rotation, label)
     except InvalidDetectionError as error:
         raise DatasetError(f"the box of {label}: {error}", reason=_REASON) from error
-
-
-def _between(lower: NDArray[np.float64], upper: NDArray[np.float64], label: str) -> OrientedBox:
-    return OrientedBox.from_corners(lower.tolist(), upper.tolist(), label)

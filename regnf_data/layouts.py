@@ -24,10 +24,7 @@ _LARGEST = 1e9
 
 
 def array(value: Any, shapes: tuple[tuple[int, ...], ...], what: str, reason: str) -> NDArray[np.float64]:
-    """``value`` as float64 numbers of one of the shapes, finite and up to 1e9.
-
-    Raises DatasetError with the given reason.
-    """
+    """``value`` as float64 numbers of one of the shapes, finite and up to 1e9. Raises DatasetError (``reason``)."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -73,10 +70,8 @@ def similarity(value: Any, what: str, reason: str) -> NDArray[np.float64]:
 def whole_number(value: Any, what: str, reason: str) -> int:
     """A positive whole number."""
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-    if isinstance(value, bool) or not whole:
-        raise DatasetError(f"{what} is not a whole number", reason=reason)
-    if value < 1:
-        raise DatasetError(f"{what} is not positive", reason=reason)
+    if isinstance(value, bool) or not whole or value < 1:
+        raise DatasetError(f"{what} is not a positive whole number", reason=reason)
     return int(value)
 
 

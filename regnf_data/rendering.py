@@ -4,34 +4,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_data.mesh_scene import Hits, MeshScene, to_srgb
+from regnf_data.mesh_scene import MeshScene, to_srgb
 
 Size = tuple[int, int]
 """Height and width, pixels."""
 
 _BACKGROUND = (1.0, 1.0, 1.0)
+_FINE = 3
+"""Rays along each side of a pixel, an odd number: the one in the middle gives the depth."""
 
 
-@dataclass(frozen=True)
-class Shading:
-    """Lambert's cosine law under one far lamp, and light from all around, a little more from above.
+_TO_LAMP, _LAMP, _AMBIENT = (0.5, 0.35, 0.8), 0.55, 0.45
+"""The shares of full light are together 1 at most, so that nothing is overexposed."""
 
-    to_lamp: (3,), any length · lamp, ambient: shares of full light; together 1 at most, so that nothing is overexposed.
-    """
 
-    to_lamp: tuple[float, float, float] = (0.5, 0.35, 0.8)
-    lamp: float = 0.55
-    ambient: float = 0.45
-
-    def light(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,): light that falls on surfaces with unit normals (P, 3)."""
-        direction = np.array(self.to_lamp) / np.linalg.norm(self.to_lamp)
-        shone: NDArray[np.float64] = self.lamp * np.maximum(normals @ direction, 0.0)
-        return shone + self.ambient * (0.8 + 0.2 * normals[:, 2])
+def light(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P,): on surfaces with unit normals (P, 3), by Lambert's cosine law under one far lamp, and from all around, a
+    little more from above."""
+    shone: NDArray[np.float64] = _LAMP * np.maximum(normals @ (np.array(_TO_LAMP) / np.linalg.norm(_TO_LAMP)), 0.0)
+    return shone + _AMBIENT * (0.8 + 0.2 * normals[:, 2])
 
 
 @dataclass(frozen=True)
@@ -73,36 +69,25 @@ def render(
     size: Size,
     intrinsics: NDArray[np.float64],
     T_scene_camera: NDArray[np.float64],
-    shading: Shading | None = None,
-    fine: int = 3,
 ) -> View:
-    """The scene from one camera, depth at the pixels' middles, colors the mean over ``fine`` x ``fine`` rays a pixel.
+    """The scene from one camera, depth at the pixels' middles, colors the mean over 3 x 3 rays a pixel.
 
     size: height and width · intrinsics: (3, 3) · T_scene_camera: (4, 4), a rotation and a translation, OpenCV's axes.
-    ``fine`` must be odd: the ray in the middle gives the depth.
     """
-    if fine % 2 == 0:
-        raise ValueError("fine must be odd")
-    origins, directions = camera_rays(size, intrinsics, T_scene_camera, fine)
+    origins, directions = camera_rays(size, intrinsics, T_scene_camera, _FINE)
     hits = scene.cast(origins, directions)
     height, width = size
-    blocks = _shaded(hits, shading or Shading()).reshape(height, fine, width, fine, 3)
-    middle = slice(fine // 2, None, fine)
+    shaded = hits.color * light(hits.normal)[:, None]
+    shaded[hits.thing < 0] = _BACKGROUND
 
-    def middles(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return values.reshape(height * fine, width * fine)[middle, middle]
+    def middles(values: NDArray[Any]) -> NDArray[Any]:
+        return values.reshape(height * _FINE, width * _FINE)[_FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
 
     cosine = -np.einsum("rc,rc->r", hits.normal, directions) / np.linalg.norm(directions, axis=1)
     depth = middles(hits.distance)
     return View(
-        colors=to_srgb(blocks.mean(axis=(1, 3))),
+        colors=to_srgb(shaded.reshape(height, _FINE, width, _FINE, 3).mean(axis=(1, 3))),
         depth=np.where(np.isfinite(depth), depth, 0.0),
         cosine=middles(cosine),
-        thing=hits.thing.reshape(height * fine, width * fine)[middle, middle],
+        thing=middles(hits.thing),
     )
-
-
-def _shaded(hits: Hits, shading: Shading) -> NDArray[np.float64]:
-    shaded: NDArray[np.float64] = hits.color * shading.light(hits.normal)[:, None]
-    shaded[hits.thing < 0] = _BACKGROUND
-    return shaded

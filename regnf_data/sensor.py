@@ -30,33 +30,25 @@ class DepthSensor:
     edge_jump_m: float = 0.05
     edge_dropout: float = 0.2
     """The share of readings lost where the depth jumps by ``edge_jump_m`` or more; a choice, for small images."""
-    axial: bool = True
 
     def deviation_m(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviation of the axial error at depths in meters."""
-        deviation: NDArray[np.float64] = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
-        return deviation if self.axial else np.zeros_like(deviation)
+        return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
 
     def measure(
-        self,
-        depth: NDArray[np.float64],
-        cosine: NDArray[np.float64],
-        rng: np.random.Generator,
-        meters_per_unit: float = 1.0,
+        self, exact: NDArray[np.float64], cosine: NDArray[np.float64], rng: np.random.Generator
     ) -> NDArray[np.float64]:
-        """What the sensor reads of an exact depth image (H, W), 0 where it reads nothing; the image's own units.
+        """What the sensor reads of an exact depth image (H, W), 0 where it reads nothing; meters.
 
         cosine: (H, W), between the ray and the surface's normal.
         """
-        exact = depth * meters_per_unit
         lost = cosine < np.cos(np.radians(self.grazing_deg))
         lost |= jumps(exact, self.edge_jump_m) & (rng.random(exact.shape) < self.edge_dropout)
         seen = self._sideways(exact, rng)
         read = seen + self.deviation_m(seen) * rng.normal(size=exact.shape)
         read = np.round(read / self.step_m) * self.step_m
         lost |= (exact <= 0.0) | (seen <= 0.0) | (read < self.nearest_m) | (read > self.farthest_m)
-        readings: NDArray[np.float64] = np.where(lost, 0.0, read / meters_per_unit)
-        return readings
+        return np.where(lost, 0.0, read)
 
     def _sideways(self, depth: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """Every pixel's depth taken from a neighbor that lies as far as the lateral error says, mostly itself."""

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from regnf_core.errors import DatasetError
 from regnf_core.fields.composite import SurfaceSource
 from regnf_data.composing import bad_view, half_view, seen_points
-from regnf_data.mesh_scene import MeshScene, Thing, TilePaint, box_thing
+from regnf_data.mesh_scene import MeshScene, Thing, box_thing, tile_paint
 from regnf_data.rendering import intrinsics_of
 from regnf_data.trajectories import WalkingGround, check_free, long_walk, look_at, orbit, pass_by, short_walk
 
 SIZE = (60, 80)
 INTRINSICS = intrinsics_of(SIZE, 60.0)
-PAINT = TilePaint((1.0, 1.0, 1.0), (0.5, 0.5, 0.5), 0.3)
+PAINT = tile_paint((1.0, 1.0, 1.0), (0.5, 0.5, 0.5), 0.3)
 FLOOR = np.array([[-2.5, -2.5, -0.1], [2.5, 2.5, 0.0]])
 BOXES = (
     np.array([[-1.3, -1.2, 0.0], [-0.7, -0.4, 0.9]]),
