@@ -173,11 +173,19 @@ def kept_neighbors(
         matter &= grid.cube(plane.height(points)) > max(thickness, 4.0 * plane.roughness)
     if of_thing is not None:
         matter &= ~_mask(grid, of_thing(points))
-    measured = _measured(scene, grid, points)
-    if measured is not None:
-        matter &= measured
+    observation = observation_of(scene)
+    if observation is not None:
+        reach = max(1, round(observation.voxel / grid.cell))
+        matter &= binary_dilation(_mask(grid, observation.at(points) == SURFACE), iterations=reach)
     inside = _mask(grid, box_distance(box, points) < 0.0)
-    kept = _going_out(matter, inside, 1e-9 if of_thing is not None else _LEAST_OUTSIDE)
+    # the components of matter of which at least this share lies outside of the box
+    least_outside = 1e-9 if of_thing is not None else _LEAST_OUTSIDE
+    labels, count = label(matter, structure=np.ones((3, 3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    outside = np.bincount(labels[~inside], minlength=count + 1)
+    neighbor = (sizes >= _LEAST_CELLS) & (outside >= np.maximum(1, least_outside * sizes))
+    neighbor[0] = False
+    kept = neighbor[labels]
     if not (kept & inside).any():
         return None
     return grid.distance_to(binary_dilation(kept, iterations=_KEPT_AROUND))
@@ -186,31 +194,6 @@ def kept_neighbors(
 def _mask(grid: RegionGrid, values: Tensor) -> Mask:
     found: Mask = values.cpu().numpy().reshape(grid.shape)
     return found
-
-
-def _measured(scene: SdfField, grid: RegionGrid, points: Tensor) -> Mask | None:
-    """Cells near a place where a surface was measured; None where that is not known."""
-    observation = observation_of(scene)
-    if observation is None:
-        return None
-    near = _mask(grid, observation.at(points) == SURFACE)
-    reach = max(1, round(observation.voxel / grid.cell))
-    return np.asarray(binary_dilation(near, iterations=reach))
-
-
-def _going_out(matter: Mask, inside: Mask, least_outside: float) -> Mask:
-    """The components of ``matter`` of which at least this share lies outside of the box."""
-    labels, count = label(matter, structure=np.ones((3, 3, 3)))
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    outside = np.bincount(labels[~inside], minlength=count + 1)
-    neighbor = (sizes >= _LEAST_CELLS) & (outside >= np.maximum(1, least_outside * sizes))
-    neighbor[0] = False
-    return np.asarray(neighbor[labels])
-
-
-def near_thing(thing: SdfField, margin: float) -> Callable[[Tensor], Tensor]:
-    """Tells of points (N, 3) whether they are in ``thing`` or nearer to it than ``margin``."""
-    return lambda points: thing.signed_distance(points.to(thing.device)).to(points.device) < margin
 
 
 _BOX_MARGIN = 0.05
@@ -307,9 +290,14 @@ def clear(scene: SdfField, removed: Place, residual: float, generator: torch.Gen
     margin = _BOX_MARGIN * of_thing.diagonal + residual
     box = OrientedBox(of_thing.center, of_thing.size + 2.0 * margin, of_thing.rotation)
     planes = support_planes(scene, of_thing, generator)
-    belongs = None
-    if isinstance(removed, PlacedObject):
-        belongs = near_thing(removed, _OWN_MARGIN * of_thing.diagonal + 3.0 * residual)
+    own = _OWN_MARGIN * of_thing.diagonal + 3.0 * residual
+    thing = removed if isinstance(removed, PlacedObject) else None
+
+    def near_thing(points: Tensor) -> Tensor:
+        assert thing is not None
+        return thing.signed_distance(points.to(thing.device)).to(points.device) < own
+
+    belongs = None if thing is None else near_thing
     kept = kept_neighbors(scene, box, planes, belongs)
     grounds = (ground_of(scene, plane, box, belongs) for plane in planes)
     return Clearing(box, kept, [ground for ground in grounds if ground is not None])

@@ -149,17 +149,14 @@ def read_edits(values: Any) -> list[EditRequest]:
         try:
             found.append(_ADAPTERS[kind].validate_python(value))
         except ValidationError as error:
-            raise _fault(index, error) from error
+            first = error.errors(include_url=False, include_input=False)[0]
+            member = ".".join(str(part) for part in first["loc"])
+            reason = "EDIT_INVALID"
+            if first["type"] == "value_error" and member.startswith("T_"):
+                reason = "INVALID_TRANSFORM"
+            if first["type"] == "value_error" and member == "detection":
+                reason = "INVALID_DETECTION"
+            where = f"edits[{index}]" + (f".{member}" if member else "")
+            message = f"{where}: {first['msg'].removeprefix('Value error, ')}"
+            raise InvalidInputError(message, reason=reason) from error
     return found
-
-
-def _fault(index: int, error: ValidationError) -> InvalidInputError:
-    first = error.errors(include_url=False, include_input=False)[0]
-    member = ".".join(str(part) for part in first["loc"])
-    reason = "EDIT_INVALID"
-    if first["type"] == "value_error" and member.startswith("T_"):
-        reason = "INVALID_TRANSFORM"
-    if first["type"] == "value_error" and member == "detection":
-        reason = "INVALID_DETECTION"
-    where = f"edits[{index}]" + (f".{member}" if member else "")
-    return InvalidInputError(f"{where}: {first['msg'].removeprefix('Value error, ')}", reason=reason)

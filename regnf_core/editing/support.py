@@ -81,7 +81,10 @@ def _best(
         near = _near(points, normals, n, float(n @ p), box)
         if int(near.sum()) <= max(most, 8):
             continue
-        n, offset = _fitted(points[near], n)
+        middle = points[near].mean(0)  # the plane of least squares, its normal on the side of ``n``
+        thinnest = torch.linalg.eigh((points[near] - middle).T @ (points[near] - middle))[1][:, 0]
+        n = thinnest * torch.sign(thinnest @ n)
+        offset = float(n @ middle)
         near = _near(points, normals, n, offset, box)
         if int(near.sum()) > most and _supports(n, offset, points[near], box):
             heights = points[near] @ n - offset
@@ -91,14 +94,6 @@ def _best(
 
 def _near(points: Tensor, normals: Tensor, n: Tensor, offset: float, box: OrientedBox) -> Tensor:
     return ((points @ n - offset).abs() <= _THICKNESS * box.diagonal) & (normals @ n >= _FACING)
-
-
-def _fitted(points: Tensor, n: Tensor) -> tuple[Tensor, float]:
-    """The plane of least squares, its normal on the side of ``n``."""
-    middle = points.mean(0)
-    thinnest = torch.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
-    thinnest = thinnest * torch.sign(thinnest @ n)
-    return thinnest, float(thinnest @ middle)
 
 
 def _supports(n: Tensor, offset: float, on_plane: Tensor, box: OrientedBox) -> bool:

@@ -82,7 +82,12 @@ class Camera:
         if not forward.norm() > 1e-12:
             raise invalid_camera("a camera cannot look at the place where it stands")
         focal = size[0] / 2.0 / math.tan(math.radians(field_of_view_deg) / 2.0)
-        axes = _upright_axes(forward / forward.norm(), up_vector(up))
+        forward, up = forward / forward.norm(), up_vector(up)
+        right = torch.linalg.cross(forward, up)
+        if right.norm() < 1e-6:
+            right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
+        right = right / right.norm()
+        axes = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
         return cls(at, axes, size[0], size[1], (focal, focal), (size[0] / 2.0, size[1] / 2.0))
 
     @property
@@ -128,14 +133,6 @@ def up_vector(up: str | Sequence[float] | Tensor) -> Tensor:
         raise invalid_camera("up is a vector of three finite numbers, not all zero")
     unit: Tensor = vector / vector.norm()
     return unit
-
-
-def _upright_axes(forward: Tensor, up: Tensor) -> Tensor:
-    right = torch.linalg.cross(forward, up)
-    if right.norm() < 1e-6:
-        right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
-    right = right / right.norm()
-    return torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
 
 
 # One rendered picture with everything that is known at its pixels.

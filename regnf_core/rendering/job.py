@@ -63,7 +63,7 @@ def write_colored_mesh(
 
 _GAP = 6
 """Pixels between the pictures of a strip."""
-_FRAMES_A_SECOND = 12
+_FRAME_MS = round(1000 / 12)
 Picture = NDArray[np.uint8]
 """(H, W, 3)"""
 
@@ -79,12 +79,6 @@ def depth_unit(largest: float) -> float:
 
 def _save(picture: NDArray[Any], path: Path) -> None:
     Image.fromarray(picture).save(path, format="PNG")
-
-
-def _write_animation(pictures: Sequence[Picture], path: Path) -> None:
-    first, *others = [Image.fromarray(picture) for picture in pictures]
-    duration = round(1000 / _FRAMES_A_SECOND)
-    first.save(path, format="WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=80)
 
 
 def _side_by_side(pictures: Sequence[Picture]) -> Picture:
@@ -149,7 +143,8 @@ def run_render(
         scene = without_unseen(scene) if request.clear_unseen else scene
         edited = compose(scene, open_edits(request.edits, open_object), request.seed, work.tell)
     cameras = _cameras(request, edited)
-    unit = depth_unit(_farthest(edited, cameras))
+    corners = torch.cartesian_prod(*edited.bounds.T)  # no depth is larger than to one of them
+    unit = depth_unit(max(float((corners - camera.position).norm(dim=-1).max()) for camera in cameras))
     cut_away = replace(request.options, cut_away=True)
 
     def rendered(field: SdfField, options: RenderOptions) -> Iterator[Frame]:
@@ -239,7 +234,9 @@ class _Work:
             _save(_side_by_side([before[0], after[0]]), self.add("before-after.png", "strip"))
         if "animation" in self._outputs:
             both = [_side_by_side(pair) for pair in zip(before, after, strict=True)] if before else after
-            _write_animation(both, self.add("animation.webp", "animation", "image/webp"))
+            first, *others = [Image.fromarray(picture) for picture in both]
+            path, timing = self.add("animation.webp", "animation", "image/webp"), {"duration": _FRAME_MS, "loop": 0}
+            first.save(path, format="WEBP", save_all=True, append_images=others, quality=80, **timing)
 
     def finish(self, unit: float) -> RenderReport:
         self.add("render.json", "report", "application/json")
@@ -272,9 +269,3 @@ def _posed(pose: PoseRequest) -> Camera:
     matrix = torch.tensor(pose.T_scene_camera, dtype=torch.float64)
     fx, fy, cx, cy = pose.intrinsics
     return Camera(matrix[:3, 3], matrix[:3, :3], *pose.size, (fx, fy), (cx, cy))
-
-
-def _farthest(field: SdfField, cameras: Sequence[Camera]) -> float:
-    """No depth of these cameras is larger."""
-    corners = torch.cartesian_prod(*field.bounds.T)
-    return max(float((corners - camera.position).norm(dim=-1).max()) for camera in cameras)

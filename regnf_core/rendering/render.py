@@ -289,7 +289,14 @@ class Renderer:
         """color (P, 3), normal (P, 3), opacity (P,), depth (P,), part (P,) of pixels (P,), on the CPU."""
         rays, cosine = camera.rays(pixels, at)
         rays = Rays(rays.origins.to(self.field.device), rays.directions.to(self.field.device))
-        samples = self._samples(rays, pixels // camera.width, pixels % camera.width)
+        rows, columns = (at.to(rays.origins.device) for at in (pixels // camera.width, pixels % camera.width))
+        region = Region.along(rays, self.field, self.grid, _TOLERANCE)
+        if self.options.mode == "surface":
+            samples = surface_samples(region, rays, free_start(region, rays, rows, columns))
+        else:
+            least = self.painter.least_sharpness
+            start = free_start(region, rays, rows, columns, 2.0 * CLEAR / least)
+            samples = volume_samples(region, rays, start, self.painter.distance_and_sharpness, least)
         colors, parts = self.painter.colors(samples.points, rays.directions[samples.ray], samples.normals)
         blank = torch.zeros_like(rays.origins)
         color = blank.index_add(0, samples.ray, samples.weight[:, None] * colors)
@@ -298,24 +305,12 @@ class Renderer:
         normal = blank.index_add(0, samples.ray, samples.weight[:, None] * samples.normals)
         seen = (samples.opacity >= _LEAST_SEEN).cpu()
         depth = torch.where(seen, samples.length.cpu() * cosine, 0.0)
-        part = torch.where(seen, _main_part(samples, parts, len(pixels), len(self.painter.parts)).cpu(), NOTHING)
+        count = len(self.painter.parts)
+        shares = samples.weight.new_zeros(len(pixels) * count)
+        shares.index_add_(0, samples.ray * count + parts, samples.weight)
+        # the part that gives most of a ray's color
+        part = torch.where(seen, shares.view(len(pixels), count).argmax(dim=-1).cpu(), NOTHING)
         return color.cpu(), normal.cpu(), samples.opacity.cpu(), depth, part.to(torch.int16)
-
-    def _samples(self, rays: Rays, rows: Tensor, columns: Tensor) -> TileSamples:
-        rows, columns = rows.to(rays.origins.device), columns.to(rays.origins.device)
-        region = Region.along(rays, self.field, self.grid, _TOLERANCE)
-        if self.options.mode == "surface":
-            return surface_samples(region, rays, free_start(region, rays, rows, columns))
-        least = self.painter.least_sharpness
-        start = free_start(region, rays, rows, columns, 2.0 * CLEAR / least)
-        return volume_samples(region, rays, start, self.painter.distance_and_sharpness, least)
-
-
-def _main_part(samples: TileSamples, parts: Tensor, rays: int, count: int) -> Tensor:
-    """(N,): the part that gives most of a ray's color."""
-    shares = samples.weight.new_zeros(rays * count)
-    shares.index_add_(0, samples.ray * count + parts, samples.weight)
-    return shares.view(rays, count).argmax(dim=-1)
 
 
 def _frame(camera: Camera, tiles: Sequence[Tensor], done: Iterator[list[Part]]) -> Frame:

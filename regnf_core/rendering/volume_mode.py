@@ -76,7 +76,11 @@ def volume_samples(region: Region, rays: Rays, start: Start, medium: Medium, lea
         if index.numel() == 0:
             break
         points = rays.origins[index] + t[:, None] * rays.directions[index]
-        d, s = _distance(region, points, medium, least)
+        # the field's where the opacity may change, a lower bound and ``least`` elsewhere
+        d = region.grid.at(points)
+        s = torch.full_like(d, least)
+        asked = (d <= 2.0 * CLEAR / least).nonzero().squeeze(-1)
+        d[asked], s[asked] = medium(points[asked])
         alpha = _alpha(last_s * last_d, last_s * d)
         weight = passed[index] * alpha
         passed[index] = passed[index] * (1.0 - alpha)
@@ -91,16 +95,16 @@ def volume_samples(region: Region, rays: Rays, start: Start, medium: Medium, lea
         index, t, last_t, last_d, last_s = (part[going] for part in (index, t, last_t, last_d, last_s))
     opacity = 1.0 - passed
     length = weighted / opacity.clamp_min(1e-6)
-    return _shaded_samples(region, rays, kept, opacity, length)
-
-
-def _distance(region: Region, points: Tensor, medium: Medium, least: float) -> tuple[Tensor, Tensor]:
-    """Distance and s (N,): the field's where the opacity may change, a lower bound and ``least`` elsewhere."""
-    distance = region.grid.at(points)
-    s = torch.full_like(distance, least)
-    asked = (distance <= 2.0 * CLEAR / least).nonzero().squeeze(-1)
-    distance[asked], s[asked] = medium(points[asked])
-    return distance, s
+    empty = opacity.new_zeros(0)
+    ray, t, weight = (torch.cat(values) for values in zip(*(kept or [(empty.long(), empty, empty)]), strict=True))
+    shaded = weight > _LEAST_WEIGHT * opacity[ray]
+    ray, t, weight = ray[shaded], t[shaded], weight[shaded]
+    total = torch.zeros_like(opacity).index_add_(0, ray, weight)
+    weight = weight * (opacity / total.clamp_min(1e-9))[ray]
+    opacity = torch.where(total > 0, opacity, 0.0)
+    points = rays.origins[ray] + t[:, None] * rays.directions[ray]
+    gradient = region.field.signed_distance_and_gradient(points)[1].to(points)
+    return TileSamples(ray, points, torch.nn.functional.normalize(gradient, dim=-1), weight, opacity, length)
 
 
 def _alpha(before: Tensor, after: Tensor) -> Tensor:
@@ -121,22 +125,6 @@ def _mean_share(before: Tensor, after: Tensor) -> Tensor:
     integral = (torch.nn.functional.softplus(a) - torch.nn.functional.softplus(b)) / (a - b)
     share = (integral - torch.sigmoid(b)) / fall
     return torch.where((fall > 1e-9) & ((a - b) > 1e-4), share, 0.5).clamp(0.0, 1.0).to(before)
-
-
-def _shaded_samples(
-    region: Region, rays: Rays, kept: list[tuple[Tensor, Tensor, Tensor]], opacity: Tensor, length: Tensor
-) -> TileSamples:
-    empty = opacity.new_zeros(0)
-    parts = kept or [(empty.long(), empty, empty)]
-    ray, t, weight = (torch.cat(values) for values in zip(*parts, strict=True))
-    shaded = weight > _LEAST_WEIGHT * opacity[ray]
-    ray, t, weight = ray[shaded], t[shaded], weight[shaded]
-    total = torch.zeros_like(opacity).index_add_(0, ray, weight)
-    weight = weight * (opacity / total.clamp_min(1e-9))[ray]
-    opacity = torch.where(total > 0, opacity, 0.0)
-    points = rays.origins[ray] + t[:, None] * rays.directions[ray]
-    gradient = region.field.signed_distance_and_gradient(points)[1].to(points)
-    return TileSamples(ray, points, torch.nn.functional.normalize(gradient, dim=-1), weight, opacity, length)
 
 
 # The color of places that rays see: the field's own, or light and shade on a plain color; tinted where asked.

@@ -66,7 +66,11 @@ def at_most(mesh: Triangles, triangles: int, vertices: int) -> Triangles:
     """
     if len(mesh.faces) <= triangles and len(mesh.vertices) <= vertices:
         return mesh
-    edge = _first_edge(mesh, min(triangles, 2 * vertices))
+    # a surface leaves about two triangles for each square of the cells' edge; no more cells than can be counted
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    least = float(np.ptp(mesh.vertices, axis=0).max()) / (_MOST_CLUSTERS - 1)
+    edge = max((area / min(triangles, 2 * vertices)) ** 0.5, least, float(np.finfo(np.float64).tiny))
     while True:
         smaller = clustered(mesh, edge)
         if len(smaller.faces) <= triangles and len(smaller.vertices) <= vertices:
@@ -103,14 +107,6 @@ def used_alone(mesh: Triangles) -> Triangles:
         return mesh
     normals, colors = (None if part is None else part[used] for part in (mesh.normals, mesh.colors))
     return replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3), normals=normals, colors=colors)
-
-
-def _first_edge(mesh: Triangles, triangles: int) -> float:
-    """A surface leaves about two triangles for each square of the cells' edge; no more cells than can be counted."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    longest = float(np.ptp(mesh.vertices, axis=0).max())
-    return float(max((area / triangles) ** 0.5, longest / (_MOST_CLUSTERS - 1), np.finfo(np.float64).tiny))
 
 
 # The surface of a field as people see it: a mesh with a bounded number of triangles, in two levels of detail.
@@ -199,19 +195,13 @@ class _Clock:
 
 
 def _surface(field: SdfField, cells: int, clock: _Clock) -> Triangles:
-    found = extract_surface(field, cells, clock)
-    return Triangles(found.vertices, found.faces, found.normals, _colors(field, found.vertices, found.normals))
-
-
-def _colors(field: SdfField, vertices: Floats, normals: Floats) -> Floats | None:
-    """(V, 3) in [0, 1], seen from before the surface."""
-    if not has_color(field):
-        return None
-    points, towards = torch.from_numpy(vertices), torch.from_numpy(-normals)
-    parts = zip(torch.split(points, _AT_ONCE), torch.split(towards, _AT_ONCE), strict=True)
-    found = torch.cat([field.color(some, along).cpu() for some, along in parts])
-    colors: Floats = found.clamp(0.0, 1.0).double().numpy()
-    return colors
+    found, colors = extract_surface(field, cells, clock), None
+    if has_color(field):  # seen from before the surface
+        points, towards = torch.from_numpy(found.vertices), torch.from_numpy(-found.normals)
+        parts = zip(torch.split(points, _AT_ONCE), torch.split(towards, _AT_ONCE), strict=True)
+        colors = torch.cat([field.color(some, along).cpu() for some, along in parts])
+        colors = colors.clamp(0.0, 1.0).double().numpy()
+    return Triangles(found.vertices, found.faces, found.normals, colors)
 
 
 _BUDGET_S = 5.0
@@ -231,13 +221,7 @@ def field_views(path: Path) -> FieldViews:
             None if mesh is None else mesh_file(mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
             for mesh in (found.fine, found.coarse)
         )
-    return FieldViews(fine, coarse, _picture(field, up_axis))
-
-
-def _picture(field: SdfField, up_axis: str | None) -> bytes | None:
-    file, clock = io.BytesIO(), _Clock(time.process_time() + _BUDGET_S)
-    try:
-        field_picture(field, up_axis, progress=clock).save(file, "PNG")
-    except (RegnfError, MemoryError):
-        return None
-    return file.getvalue()
+    file = io.BytesIO()
+    with suppress(RegnfError, MemoryError):
+        field_picture(field, up_axis, progress=_Clock(time.process_time() + _BUDGET_S)).save(file, "PNG")
+    return FieldViews(fine, coarse, file.getvalue() or None)

@@ -76,13 +76,9 @@ def sampled_rays(images: PosedImages) -> tuple[Floats, Floats, Floats]:
     direction's part along the camera's axis is 1. None without depths."""
     if images.depths is None:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-    measured = images.depths > 0.0 if images.masks is None else (images.depths > 0.0) & images.masks
-    chosen = np.flatnonzero(measured)[:: max(1, int(measured.sum()) // _SAMPLED)]
-    image, row, column = np.unravel_index(chosen, images.depths.shape)
-    pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(chosen))], axis=-1)
-    T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
-    rays = np.einsum("rij,rj->ri", T_world_pixel[image], pixels)
-    return images.T_world_camera[image, :3, 3], rays, images.depths[image, row, column].astype(np.float64)
+    chosen = np.flatnonzero(images.measured)
+    pixels = np.unravel_index(chosen[:: max(1, len(chosen) // _SAMPLED)], images.depths.shape)
+    return *images.rays(*pixels), images.depths[pixels].astype(np.float64)
 
 
 def _unit_hint(images: PosedImages, origins: Floats, rays: Floats, depths: Floats) -> str | None:

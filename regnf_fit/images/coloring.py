@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from numpy.typing import NDArray
@@ -18,7 +18,16 @@ from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.schema.description import TABLE, DirectionEncoding, NetworkColor, color_tensors
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.images.preparation import PixelRays
-from regnf_fit.network import GRID_RADIUS, StartShape, TrainableField, random_layers
+from regnf_fit.network import (
+    GRID_RADIUS,
+    StartShape,
+    TrainableField,
+    arrays_of,
+    layer_tensors,
+    make_optimizer,
+    random_layers,
+    random_table,
+)
 from regnf_fit.options import ReconstructionOptions
 
 # The parameters of a field that is being fitted to images: geometry, color and the opacity's sharpness.
@@ -83,8 +92,7 @@ class HeldOutErrors:
     eikonal_error: float
 
 
-@dataclass(frozen=True)
-class FirstHits:
+class FirstHits(NamedTuple):
     """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3), not of unit length."""
 
     depths: Tensor
@@ -94,11 +102,9 @@ class FirstHits:
 @torch.no_grad()
 def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
     """Where rays first enter matter: sphere tracing with a least step, then bisection."""
-    parts = [_traced(field, rays.take(index), size) for index in _chunks(len(rays))]
-    if not parts:
-        empty = torch.zeros(0, 3)
-        return FirstHits(empty[:, 0], empty)
-    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals")))
+    chunks = torch.arange(len(rays)).split(_HELD_OUT_CHUNK)  # of no rays: one, empty
+    parts = [_traced(field, rays.take(index), size) for index in chunks]
+    return FirstHits(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 @torch.no_grad()
@@ -116,10 +122,6 @@ def evaluate(field: RadianceField, rays: PixelRays, size: float) -> HeldOutError
         depth_error_median=float(depth_error.median()) if both.any() else None,
         eikonal_error=float((norms - 1.0).abs().mean()) if met.any() else 1.0,
     )
-
-
-def _chunks(count: int) -> tuple[Tensor, ...]:
-    return tuple(torch.arange(start, min(start + _HELD_OUT_CHUNK, count)) for start in range(0, count, _HELD_OUT_CHUNK))
 
 
 def _traced(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
@@ -153,7 +155,6 @@ _RAYS = 60_000
 _BATCH = 2048
 _ITERATIONS = 600
 _TABLE_RATE, _NETWORK_RATE = 1e-2, 2e-3
-_TABLE_SPREAD = 1e-4
 _DIRECTIONS = 2
 """Frequencies of the direction: highlights of a fitted color are wide."""
 _SAME_SURFACE = 0.01
@@ -184,8 +185,7 @@ class SurfaceColor(nn.Module):
         self.form = NetworkColor("network", direction=direction, gradient="unit", hash=grid, grid_radius=GRID_RADIUS)
         weights, biases = random_layers([self.form.own_width + hidden, width, width, 3], generator)
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
-        table = torch.rand(grid.entries, grid.features_per_level, generator=generator)
-        self.table = nn.Parameter((2.0 * table - 1.0) * _TABLE_SPREAD)
+        self.table = random_table(grid, generator)
 
     def head(self) -> ColorHead:
         """The color of the present parameters, differentiable with respect to them."""
@@ -194,27 +194,24 @@ class SurfaceColor(nn.Module):
 
     def stored(self, half_table: bool) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The description's entry, and the tensors by their names in the file."""
-        table = self.table.detach()
-        tensors = {TABLE: table.half() if half_table else table}
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"] = weight.detach(), bias.detach()
-        return asdict(self.form), color_tensors({name: tensor.cpu().numpy() for name, tensor in tensors.items()})
+        tensors = {TABLE: self.table.half() if half_table else self.table}
+        return asdict(self.form), color_tensors(arrays_of(tensors | layer_tensors(self.weights, self.biases)))
 
 
 def fit_color(field: RadianceField, rays: PixelRays, size: float, seed: int) -> SurfaceColor | None:
     """The color of ``field``'s surface in the pixels of ``rays``; None where no ray meets it. size: of the bounds."""
     generator = torch.Generator().manual_seed(seed)
     device = rays.origins.device
-    shown = _of_one_surface(rays).nonzero()[:, 0]
+    # Rays that show one surface alone: on the edge of what is near, a pixel mixes its color with what is behind.
+    plain = ~rays.background & (rays.cosines > 0.0)
+    shown = (plain if bool(plain.any()) else ~rays.background).nonzero()[:, 0]
     chosen = shown[torch.randperm(len(shown), generator=generator)[:_RAYS].to(device)]
     seen = _seen(field, rays.take(chosen), size)
     if seen is None:
         return None
     hidden = seen.appearance.hidden.shape[1]
     color = SurfaceColor(hidden, field.options.hidden_width, field.options.grid, generator).to(device)
-    networks = [*color.weights, *color.biases]
-    groups = [{"params": [color.table], "lr": _TABLE_RATE, "eps": 1e-15}, {"params": networks, "lr": _NETWORK_RATE}]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
+    optimizer = make_optimizer(color.table, [*color.weights, *color.biases], _TABLE_RATE, _NETWORK_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _ITERATIONS)
     for _ in range(_ITERATIONS):
         batch = seen.take(torch.randint(len(seen.colors), (_BATCH,), generator=generator).to(device))
@@ -235,15 +232,6 @@ def appearance_of(field: RadianceField, points: Tensor) -> Appearance:
         parts.append((gradient, function.mlp.hidden(function.encode(part))))
     gradients, hidden = (torch.cat(column) for column in zip(*parts, strict=True))
     return Appearance(points, gradients, hidden)
-
-
-def _of_one_surface(rays: PixelRays) -> Tensor:
-    """Which rays (R,) show one surface alone: on the edge of what is near, a pixel mixes its color with what is behind.
-
-    Where there are depths: those with a plane through their neighbors. Otherwise all that no mask excludes.
-    """
-    plain = ~rays.background & (rays.cosines > 0.0)
-    return plain if bool(plain.any()) else ~rays.background
 
 
 def _seen(field: RadianceField, rays: PixelRays, size: float) -> _Seen | None:

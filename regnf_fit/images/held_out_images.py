@@ -11,7 +11,7 @@ from torch import Tensor
 
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.coloring import RadianceField, SurfaceColor, appearance_of, first_hits
-from regnf_fit.images.preparation import PixelRays, measured_within, pixel_axes, rays_of_pixels
+from regnf_fit.images.preparation import PixelRays, measured_within, rays_of_pixels
 
 _ONE_OF = 15
 _MOST_IMAGES = 4
@@ -91,7 +91,8 @@ def _picture(
         if bool(rays.background.any()):  # of what is behind the thing the field knows nothing
             behind = rays.colors[rays.background].mean(dim=0)
         rays = rays.take(index)
-        right, down = pixel_axes(images)[number].to(rays.directions)
+        # by what a ray's direction changes to the pixel right of its own, and to the one below it
+        right, down = torch.from_numpy(images.T_world_pixel[number, :, :2].T.copy()).to(rays.directions)
         for x, y in _PLACES:
             moved = replace(rays, directions=rays.directions + x * right + y * down)
             drawn[index] += _drawn(field, color, moved, size, behind)

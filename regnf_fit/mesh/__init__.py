@@ -6,7 +6,7 @@ import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +28,7 @@ from regnf_fit.options import FitOptions, FitProgress, FitReport
 # A mesh file as the target of a fit.
 
 
-@dataclass(frozen=True)
-class MeshTarget:
+class MeshTarget(NamedTuple):
     """field: the mesh, scaled if that was asked for · source: where it came from, as the fitted field records it."""
 
     field: MeshField
@@ -198,7 +197,8 @@ def _train(
     generator = torch.Generator().manual_seed(seed)
     size = diagonal(target)
     network = TrainableField(options, StartShape(torch.zeros(3), radius=size / 4.0), generator)
-    optimizer = make_optimizer(network.table, [*network.weights, *network.biases], options)
+    networks = [*network.weights, *network.biases]
+    optimizer = make_optimizer(network.table, networks, options.table_rate, options.network_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, options.rate_share)
     started = time.monotonic()
     for iteration in range(1, options.iterations + 1):

@@ -46,17 +46,3 @@ def test_errors_have_the_deviation_and_correlation_asked_for() -> None:
     assert float(a.std()) == pytest.approx(amplitude, rel=0.05)
     assert abs(float(a.mean())) < 0.05 * amplitude
     assert float((a * b).mean() / a.square().mean()) == pytest.approx(math.exp(-0.5), abs=0.05)
-
-
-def test_seeds_bend_differently_and_reproducibly() -> None:
-    points = places(50)
-    first, again, other = (BentField(BOX, 0.01, 0.1, seed).signed_distance(points) for seed in (1, 1, 2))
-    assert torch.equal(first, again)
-    assert not torch.allclose(first, other, atol=1e-3)
-
-
-def test_a_moved_field_is_the_same() -> None:
-    field, points = BentField(BOX, amplitude=0.05, length=0.2, seed=3), places(50)
-    moved = field.to("cpu")
-    assert moved is not field
-    assert torch.equal(moved.signed_distance(points), field.signed_distance(points))

@@ -56,14 +56,6 @@ def test_symmetries_follow_the_frame(name: str) -> None:
     assert torch.allclose(T.apply(plain.apply(points)), moved.apply(T.apply(points)), atol=1e-9)
 
 
-def test_declared_symmetries_form_the_group() -> None:
-    quarter = turn((0.0, 0.0, 1.0), 90.0)
-    angles = [one.log()[2] for one in declared("et").discrete]
-    assert len(angles) == 3
-    assert torch.allclose(quarter.apply(torch.tensor([[1.0, 0, 0]]).double()), torch.tensor([[0.0, 1, 0]]).double())
-    assert not declared("fc").discrete
-
-
 def result(verdict: str, T: Sim3, *others: Sim3) -> RegistrationResult:
     """As much of a result as the judgment looks at."""
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5

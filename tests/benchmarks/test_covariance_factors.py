@@ -49,13 +49,6 @@ def test_both_parts_are_those_of_the_engine_in_the_objects_own_units() -> None:
     assert square == pytest.approx(mahalanobis_squared(error, other), rel=1e-3)
 
 
-def test_a_covariance_that_is_none_has_no_parts() -> None:
-    broken = torch.eye(7).double()
-    broken[3, 3] = -1.0
-    told = diagonal_parts(torch.ones(7).double(), broken, torch.randn(50, 3), Sim3.identity(), 0.01)
-    assert told == {"whitened_error": None, "offset_share": None}
-
-
 def _drawn(count: int, part: str, residuals: float, offset: float, freedom: float) -> list[dict[str, object]]:
     """Errors of a Student distribution whose two parts are this many times as large as the engine says."""
     rng = np.random.default_rng(5)

@@ -59,16 +59,3 @@ def test_only_what_may_have_died_twice_is_excused(deaths: Deaths, reason: str, m
 def test_time_is_counted_from_the_last_death(deaths: Deaths, clock: Clock) -> None:
     clock.now = 100
     assert (deaths.last_end(5.0), deaths.last_end(60.0)) == (30.0, 60.0)
-
-
-def test_while_one_is_under_way_no_time_counts(clock: Clock) -> None:
-    deaths = Deaths(clock)
-    seen = []
-
-    def deed() -> bool:
-        clock.now = 7.0
-        seen.append((deaths.last_end(0.0), deaths.since(5.0)))
-        return True
-
-    deaths.during("worker", deed)
-    assert seen == [(7.0, 1)]

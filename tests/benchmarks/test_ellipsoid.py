@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.robust.ellipsoid import LIMIT, calibration, mahalanobis_squared, nearest_truth, pose_error
-from benchmarks.robust.symmetries import declared
+from benchmarks.robust.ellipsoid import LIMIT, calibration, mahalanobis_squared, pose_error
 from regnf_core import Sim3
 
 
@@ -29,16 +28,16 @@ def some_pose() -> Sim3:
 
 def test_95_percent_of_gaussian_errors_lie_inside() -> None:
     covariance, estimate = some_covariance(), some_pose()
-    steps = torch.randn(1500, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    steps = torch.randn(400, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     squares = []
     for step in steps @ torch.linalg.cholesky(covariance).T:
         truth = estimate.perturb(step)
         squares.append(mahalanobis_squared(pose_error(estimate, truth), covariance))
     found = calibration(squares)
-    assert found.count == 1500
-    assert found.inside == pytest.approx(0.95, abs=0.012)
-    assert found.median == pytest.approx(0.907, abs=0.05)
-    assert found.high == pytest.approx(LIMIT / 7, abs=0.1)
+    assert found.count == 400
+    assert found.inside == pytest.approx(0.95, abs=0.022)
+    assert found.median == pytest.approx(0.907, abs=0.09)
+    assert found.high == pytest.approx(LIMIT / 7, abs=0.2)
 
 
 def test_too_small_a_covariance_is_seen() -> None:
@@ -61,10 +60,3 @@ def test_the_error_is_the_left_perturbation_to_the_truth() -> None:
 @pytest.mark.parametrize("broken", [torch.full((7, 7), float("nan")), torch.zeros(7, 7), -torch.eye(7)])
 def test_what_is_no_covariance_holds_nothing(broken: Tensor) -> None:
     assert mahalanobis_squared(torch.full((7,), 1e-9).double(), broken.double()) == float("inf")
-
-
-def test_the_nearest_true_pose_is_taken() -> None:
-    points = torch.rand(50, 3, dtype=torch.float64) - 0.5
-    truth, symmetries = some_pose(), declared("et")
-    for twin in symmetries.discrete:
-        assert pose_error(twin @ truth, nearest_truth(twin @ truth, truth, points, symmetries)).norm() < 1e-9

@@ -5,17 +5,16 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from benchmarks.robust.library_objects import library_meshes, simple_furniture
+from benchmarks.robust.library_objects import library_meshes
 from regnf_core.fields.mesh import MeshField
 from tests.devdata import dev_data
 
 
 def shape_of(mesh: MeshField) -> NDArray[np.float64]:
     """Numbers that no rotation, shift or scale changes: main radii, spread of the distances to the middle, area."""
-    points = mesh.sample_surface(8000, np.random.default_rng(0))
+    points = mesh.sample_surface(3000, np.random.default_rng(0))
     points = points - points.mean(0)
     radii = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
     distance = np.linalg.norm(points, axis=1)
@@ -35,15 +34,3 @@ def test_there_are_64_objects_and_no_two_are_similar() -> None:
     )
     assert noise < 1e-6
     assert least > 0.03
-
-
-def test_simple_pieces_stand_on_the_floor_and_hold_matter() -> None:
-    for name, mesh in simple_furniture().items():
-        low, high = mesh.bounds
-        assert low[2] == 0.0, name
-        points = mesh.sample_surface(2000, np.random.default_rng(0))
-        inside = torch.from_numpy(np.concatenate([points - 0.004 * axis for axis in (*np.eye(3), *-np.eye(3))]))
-        value = mesh.signed_distance(inside)
-        assert (value < 0).float().mean() > 0.1, name
-        assert (value > 0).float().mean() > 0.1, name
-        assert (high - low).min() > 0.04

@@ -50,18 +50,3 @@ def test_a_part_is_missing_or_a_block_is_added(tmp_path: Path, seed: int) -> Non
     extent = where.amax(0) - where.amin(0)
     assert float(extent.max()) < 0.45 * 2.0 * float(np.linalg.norm([0.5, 0.5, 0.65]))
     assert float(other.case.obj.signed_distance(other.points.float()).abs().max()) < 1e-3
-
-
-def test_what_is_missing_is_a_whole_part(tmp_path: Path) -> None:
-    """The seat is too much of the surface to be left out; only the cushion can be."""
-    right = known(tmp_path, together(SEAT, CUSHION))
-    missing = [
-        where
-        for seed in range(12)
-        if float((where := differing(right, look_alike(tmp_path, right, np.random.default_rng(seed))))[:, 2].min())
-        > 0.85
-        and bool((right.case.obj.signed_distance(where) < 0.0).all())
-    ]
-    assert missing
-    for where in missing:
-        torch.testing.assert_close(where.abs().amax(0)[:2], torch.tensor([0.3, 0.2]), rtol=0, atol=0.11)

@@ -22,7 +22,7 @@ PARTS = (
 """The boxes of tests.core.analytic.chair."""
 
 
-@pytest.mark.parametrize("position", [(0.9, -0.9, 0.85), (-0.2, -1.3, 0.7)])
+@pytest.mark.parametrize("position", [(0.9, -0.9, 0.85)])
 def test_it_is_found(position: tuple[float, float, float]) -> None:
     placed = together(*(box(low, high) for low, high in PARTS)).transformed(chair_pose().inverse().matrix().numpy())
     room = together(placed, box((-1.0, -1.0, -0.06), (1.0, 1.0, 0.0)), box((-1.0, 0.94, 0.0), (1.0, 1.0, 0.9)))

@@ -58,12 +58,3 @@ def test_the_most_similar_object_of_another_name_is_taken(tmp_path: Path) -> Non
     sampled = torch.from_numpy(wider.sample(4000, np.random.default_rng(1))[0])
     torch.testing.assert_close(ratios(found.points), ratios(sampled), rtol=0, atol=0.02)
     assert float(found.case.obj.signed_distance(found.points.float()).abs().max()) < 1e-3 * float(found.points.std())
-
-
-def test_without_other_worlds_one_is_drawn_and_a_seed_says_which(tmp_path: Path) -> None:
-    right = world(tmp_path / "right", bracket=BRACKET)
-    first, again, other = (
-        similar_object(right, first_case(BRACKET), [], np.random.default_rng(seed)).points for seed in (0, 0, 1)
-    )
-    torch.testing.assert_close(first, again)
-    assert not torch.allclose(ratios(first), ratios(other))
