@@ -18,8 +18,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_data.layouts import Furnishing, Layout
 from regnf_data.mesh_scene import MeshScene, Thing, box_thing, load_thing, tile_paint
 from regnf_data.posed_images import Instance, PosedImages
-from regnf_data.rendering import Size, View, intrinsics_of, render
-from regnf_data.sensor import DepthSensor
+from regnf_data.rendering import DepthSensor, Size, View, intrinsics_of, render
 from regnf_data.trajectories import (
     CLEARANCE_M,
     WalkingGround,

@@ -42,7 +42,8 @@ def texture_paint(picture: NDArray[np.float32], coordinates: Array) -> Paint:
         u, v = np.einsum("pk,pkc->cp", shares, coordinates[corners])
         column = np.floor(u * width).astype(np.int64) % width
         row = np.floor((1.0 - v) * height).astype(np.int64) % height
-        return picture[row, column].astype(np.float64)
+        texels: Array = picture[row, column].astype(np.float64)
+        return texels
 
     return at
 

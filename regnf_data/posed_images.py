@@ -84,7 +84,8 @@ class PosedImages:
         rows, columns = np.indices(self.size) + 0.5
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(self.intrinsics[image]).T
         T = self.T_world_camera[image]
-        return (self.depths[image][..., None] * rays) @ T[:3, :3].T + T[:3, 3]
+        ends: NDArray[np.float64] = (self.depths[image][..., None] * rays) @ T[:3, :3].T + T[:3, 3]
+        return ends
 
     def moved(self, origin: NDArray[np.float64], scale: float) -> PosedImages:
         """The same images in the world x' = scale (x - origin). origin: (3,), world frame."""

@@ -10,9 +10,8 @@ import torch
 from scipy.ndimage import binary_dilation
 from torch import Tensor
 
-from regnf_core.editing.clearing import Clearing, Unseen
+from regnf_core.editing.clearing import Clearing, RegionGrid, Unseen
 from regnf_core.editing.edits import SCENE_PART, Part, PartedField
-from regnf_core.editing.region import RegionGrid
 from regnf_core.editing.support import PlacedObject
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import Observation, SdfField, has_color, inverse_deviation_of, observation_of

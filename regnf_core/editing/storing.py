@@ -57,8 +57,8 @@ def write_field(field: SdfField, path: Path, resolution: int) -> tuple[int, int,
         "kind": "voxel_grid", "origin": bounds[0], "spacing": [lattice.step] * 3, "bounds": bounds
     }  # fmt: skip
     if origin.any():
-        rows = shift_rows(origin.tolist())
-        description |= {"placement": {"transform": rows, "bounds": bounds}, "bounds": moved_box(rows, bounds)}
+        placed = shift_rows(origin.tolist())
+        description |= {"placement": {"transform": placed, "bounds": bounds}, "bounds": moved_box(placed, bounds)}
     tensors: dict[str, Any] = {"values": values}
     known = observation_of(field)
     if known is not None and (known := known.without_shift()).T_grid_frame is None:

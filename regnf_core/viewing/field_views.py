@@ -199,8 +199,8 @@ def _surface(field: SdfField, cells: int, clock: _Clock) -> Triangles:
     if has_color(field):  # seen from before the surface
         points, towards = torch.from_numpy(found.vertices), torch.from_numpy(-found.normals)
         parts = zip(torch.split(points, _AT_ONCE), torch.split(towards, _AT_ONCE), strict=True)
-        colors = torch.cat([field.color(some, along).cpu() for some, along in parts])
-        colors = colors.clamp(0.0, 1.0).double().numpy()
+        seen = torch.cat([field.color(some, along).cpu() for some, along in parts])
+        colors = seen.clamp(0.0, 1.0).double().numpy()
     return Triangles(found.vertices, found.faces, found.normals, colors)
 
 

@@ -6,9 +6,10 @@ The geometry does not change. Where rays meet it is computed once, so that an it
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -17,7 +18,8 @@ from regnf_core.fields.color_head import Appearance, ColorHead, PositionalEncodi
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.schema.description import TABLE, DirectionEncoding, NetworkColor, color_tensors
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_fit.images.preparation import PixelRays
+from regnf_data.posed_images import PosedImages
+from regnf_fit.images.preparation import PixelRays, measured_within, rays_of_pixels
 from regnf_fit.network import (
     GRID_RADIUS,
     StartShape,
@@ -102,7 +104,7 @@ class FirstHits(NamedTuple):
 @torch.no_grad()
 def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
     """Where rays first enter matter: sphere tracing with a least step, then bisection."""
-    chunks = torch.arange(len(rays)).split(_HELD_OUT_CHUNK)  # of no rays: one, empty
+    chunks = torch.split(torch.arange(len(rays)), _HELD_OUT_CHUNK)  # of no rays: one, empty
     parts = [_traced(field, rays.take(index), size) for index in chunks]
     return FirstHits(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
@@ -162,20 +164,6 @@ _SAME_SURFACE = 0.01
 _CHUNK = 1 << 14
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What N rays meet: the surface as a color sees it, unit directions (N, 3), the pixels' colors (N, 3)."""
-
-    appearance: Appearance
-    directions: Tensor
-    colors: Tensor
-
-    def take(self, index: Tensor) -> _Seen:
-        one = self.appearance
-        picked = Appearance(one.position[index], one.gradient[index], one.hidden[index])
-        return _Seen(picked, self.directions[index], self.colors[index])
-
-
 class SurfaceColor(nn.Module):
     """A trainable :class:`ColorHead`. hidden: what the geometry's last layer is given · grid: of its own table."""
 
@@ -206,16 +194,23 @@ def fit_color(field: RadianceField, rays: PixelRays, size: float, seed: int) -> 
     plain = ~rays.background & (rays.cosines > 0.0)
     shown = (plain if bool(plain.any()) else ~rays.background).nonzero()[:, 0]
     chosen = shown[torch.randperm(len(shown), generator=generator)[:_RAYS].to(device)]
-    seen = _seen(field, rays.take(chosen), size)
-    if seen is None:
+    rays = rays.take(chosen)
+    hits = first_hits(field, rays, size)
+    met = hits.depths > 0.0
+    if rays.depths.any():  # a ray that meets another surface than the camera saw has another's color
+        met &= (hits.depths - rays.depths).abs() * rays.directions.norm(dim=1) < _SAME_SURFACE * size
+    if not met.any():
         return None
-    hidden = seen.appearance.hidden.shape[1]
-    color = SurfaceColor(hidden, field.options.hidden_width, field.options.grid, generator).to(device)
+    rays, depths = rays.take(met), hits.depths[met]
+    directions = torch.nn.functional.normalize(rays.directions, dim=1)
+    seen = appearance_of(field, rays.at(depths[:, None])[:, 0])
+    color = SurfaceColor(seen.hidden.shape[1], field.options.hidden_width, field.options.grid, generator).to(device)
     optimizer = make_optimizer(color.table, [*color.weights, *color.biases], _TABLE_RATE, _NETWORK_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _ITERATIONS)
     for _ in range(_ITERATIONS):
-        batch = seen.take(torch.randint(len(seen.colors), (_BATCH,), generator=generator).to(device))
-        loss = (color.head()(batch.appearance, batch.directions) - batch.colors).square().mean()
+        some = torch.randint(len(rays), (_BATCH,), generator=generator).to(device)
+        batch = Appearance(seen.position[some], seen.gradient[some], seen.hidden[some])
+        loss = (color.head()(batch, directions[some]) - rays.colors[some]).square().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -234,13 +229,95 @@ def appearance_of(field: RadianceField, points: Tensor) -> Appearance:
     return Appearance(points, gradients, hidden)
 
 
-def _seen(field: RadianceField, rays: PixelRays, size: float) -> _Seen | None:
-    hits = first_hits(field, rays, size)
-    met = hits.depths > 0.0
-    if rays.depths.any():  # a ray that meets another surface than the camera saw has another's color
-        met &= (hits.depths - rays.depths).abs() * rays.directions.norm(dim=1) < _SAME_SURFACE * size
-    if not met.any():
+# Whole images that no color is fitted to, and how much the field's pictures are like them.
+
+_ONE_OF = 15
+_MOST_IMAGES = 4
+_LEAST_IMAGES = 4
+"""Of fewer images all are needed."""
+_PLACES = tuple((x / 3.0, y / 3.0) for x in (-1, 0, 1) for y in (-1, 0, 1))
+"""In a pixel, from its middle: a camera's pixel has the mean color of what lies in it."""
+_WINDOW, _SPREAD = 11, 1.5
+_LUMINANCE, _CONTRAST = 0.01**2, 0.03**2
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """psnr: decibels, over all pixels that show the thing · ssim: mean structural similarity about them, up to 1."""
+
+    psnr: float
+    ssim: float
+
+
+def held_out_images(count: int) -> list[int]:
+    """The numbers of the images to hold out, of so many: one of 15, evenly over them, at most four."""
+    if count < _LEAST_IMAGES:
+        return []
+    wanted = min(max(count // _ONE_OF, 1), _MOST_IMAGES)
+    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+
+
+@torch.no_grad()
+def likeness(
+    field: RadianceField, color: SurfaceColor, images: PosedImages, chosen: list[int], size: float
+) -> Likeness | None:
+    """Of the field's surface, colored, to the chosen images; None where they show nothing of it."""
+    squared, similar, pixels = 0.0, 0.0, 0
+    for number in chosen:
+        shown, seen, drawn = _picture(field, color, images, number, size)
+        if not shown.any():
+            continue
+        pixels += int(shown.sum())
+        squared += float((drawn - seen)[shown].square().mean(dim=-1).sum())
+        similar += float(structural_similarity(drawn, seen)[shown].sum())
+    if not pixels:
         return None
-    rays, depths = rays.take(met), hits.depths[met]
-    directions = torch.nn.functional.normalize(rays.directions, dim=1)
-    return _Seen(appearance_of(field, rays.at(depths[:, None])[:, 0]), directions, rays.colors)
+    return Likeness(-10.0 * math.log10(max(squared / pixels, 1e-10)), similar / pixels)
+
+
+def structural_similarity(one: Tensor, other: Tensor) -> Tensor:
+    """(H, W) of pictures (H, W, 3) in [0, 1], in Gaussian windows of 11 pixels, mean of channels (Wang et al. 2004)."""
+    offsets = torch.arange(_WINDOW, dtype=one.dtype, device=one.device) - _WINDOW // 2
+    bell = torch.exp(-0.5 * (offsets / _SPREAD).square())
+    kernel = (bell[:, None] * bell / bell.sum().square())[None, None]
+
+    def mean(picture: Tensor) -> Tensor:
+        padded = torch.nn.functional.pad(picture.permute(2, 0, 1)[:, None], (_WINDOW // 2,) * 4, mode="replicate")
+        return torch.nn.functional.conv2d(padded, kernel)[:, 0].permute(1, 2, 0)
+
+    a, b = mean(one), mean(other)
+    both = mean(one * other) - a * b
+    spread = mean(one.square()) - a.square() + mean(other.square()) - b.square()
+    alike = (2.0 * a * b + _LUMINANCE) * (2.0 * both + _CONTRAST)
+    whole: Tensor = alike / ((a.square() + b.square() + _LUMINANCE) * (spread + _CONTRAST))
+    return whole.mean(dim=-1)
+
+
+def _picture(
+    field: RadianceField, color: SurfaceColor, images: PosedImages, number: int, size: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which pixels (H, W) show the thing, the image (H, W, 3), the field's picture; black where nothing is shown."""
+    device = field.table.device
+    height, width = images.colors.shape[1:3]
+    pixels = number * height * width + np.arange(height * width)
+    rays = rays_of_pixels(images, pixels, None).to(device)
+    shown = ~rays.background & (rays.far > rays.near) if images.depths is None else measured_within(rays)
+    index = shown.nonzero()[:, 0]
+    drawn, seen = torch.zeros(len(rays), 3, device=device), torch.zeros(len(rays), 3, device=device)
+    if len(index):
+        behind = field.background.sigmoid()
+        if bool(rays.background.any()):  # of what is behind the thing the field knows nothing
+            behind = rays.colors[rays.background].mean(dim=0)
+        rays = rays.take(index)
+        # by what a ray's direction changes to the pixel right of its own, and to the one below it
+        right, down = torch.from_numpy(images.T_world_pixel[number, :, :2].T.copy()).to(rays.directions)
+        for x, y in _PLACES:
+            moved = replace(rays, directions=rays.directions + x * right + y * down)
+            hits = first_hits(field, moved, size)
+            met = hits.depths > 0.0
+            points = moved.at(torch.where(met, hits.depths, moved.far)[:, None])[:, 0]
+            towards = torch.nn.functional.normalize(moved.directions, dim=1)
+            drawn[index] += torch.where(met[:, None], color.head()(appearance_of(field, points), towards), behind)
+        drawn /= len(_PLACES)
+        seen[index] = rays.colors
+    return shown.view(height, width), seen.view(height, width, 3), drawn.view(height, width, 3)

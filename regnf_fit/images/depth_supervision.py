@@ -91,12 +91,17 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
     free_to = torch.where(seen, rays.depths - before / rays.directions.norm(dim=1), rays.far).minimum(rays.far)
     is_open = (seen | rays.background) & (free_to > rays.near)
     points = _free_points(rays.take(is_open), free_to[is_open], prepared.boxes, options.detail_share, rng)
+    # what depths count: the maximum likelihood of L1, within limits, 1 in the mean
+    trust = torch.ones_like(surface.deviations)
+    if len(surface) and bool((surface.deviations > 0.0).all()):
+        weight = (surface.deviations.median() / surface.deviations).clamp(1.0 / _MAX_TRUST, _MAX_TRUST)
+        trust = weight / weight.mean()
     return DepthSupervision(
         rays=surface,
         before=before[inside],
         behind=behind[inside],
         noise=_NOISE * spreads[inside],
-        trust=_trust(surface.deviations),
+        trust=trust,
         detailed=(in_boxes(prepared.boxes, ends) | uneven(ends, surface.deviations, size)).nonzero()[:, 0],
         free_points=points,
         clearances=torch.from_numpy(cKDTree(cloud).query(points.numpy())[0].astype(np.float32)),
@@ -118,30 +123,19 @@ def _free_points(
     return torch.cat((points[within], points[: _FREE_POOL - len(within)]))
 
 
-def _trust(deviations: Tensor) -> Tensor:
-    """What depths of these deviations (R,) count: the maximum likelihood of L1, within limits, 1 in the mean."""
-    if len(deviations) == 0 or not bool((deviations > 0.0).all()):
-        return torch.ones_like(deviations)
-    weight = (deviations.median() / deviations).clamp(1.0 / _MAX_TRUST, _MAX_TRUST)
-    return weight / weight.mean()
-
-
 def _cloud(points: NDArray[np.float32], deviations: NDArray[np.float32], band: float) -> NDArray[np.float64]:
     """Averaged points (V, 3). Those too noisy for the band count only where no others are."""
-    precise = deviations <= _PRECISE * band
-    cloud, rough = (_averaged(points[chosen], _VOXEL * band) for chosen in (precise, ~precise))
+
+    def averaged(given: Tensor) -> NDArray[np.float64]:
+        """One point (V, 3) for each occupied voxel: the mean of those within."""
+        return np.asarray(cells_of(given, _VOXEL * band).means(given)) if len(given) else np.zeros((0, 3))
+
+    precise = torch.from_numpy(deviations <= _PRECISE * band)
+    cloud, rough = (averaged(torch.from_numpy(points)[chosen]) for chosen in (precise, ~precise))
     if len(cloud) == 0 or len(rough) == 0:
         return cloud if len(cloud) else rough
     alone = np.isinf(cKDTree(cloud).query(rough, distance_upper_bound=_ALONE * band)[0])
     return np.concatenate((cloud, rough[alone]))
-
-
-def _averaged(points: NDArray[np.float32], voxel: float) -> NDArray[np.float64]:
-    """One point (V, 3) for each occupied voxel: the mean of those within."""
-    if len(points) == 0:
-        return np.zeros((0, 3))
-    given = torch.from_numpy(points)
-    return np.asarray(cells_of(given, voxel).means(given))
 
 
 # What measured depths say about the signed distance.

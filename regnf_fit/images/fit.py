@@ -28,11 +28,19 @@ from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
-from regnf_fit.images.coloring import COLOR_INPUTS, DIRECTION_DEGREE, RadianceField, SurfaceColor, evaluate, fit_color
-from regnf_fit.images.fusion import ends_of, map_distances, measured_rays, sharp_width
-from regnf_fit.images.held_out_images import held_out_images, likeness
+from regnf_fit.images.coloring import (
+    COLOR_INPUTS,
+    DIRECTION_DEGREE,
+    RadianceField,
+    SurfaceColor,
+    evaluate,
+    fit_color,
+    held_out_images,
+    likeness,
+)
+from regnf_fit.images.fusion import map_distances, measured_rays, sharp_width
 from regnf_fit.images.observing import observe
-from regnf_fit.images.preparation import PreparedImages, cells_of, prepare
+from regnf_fit.images.preparation import PreparedImages, cells_of, ends_of, prepare
 from regnf_fit.images.trainer import Trainer
 from regnf_fit.local_frame import LocalFrame
 from regnf_fit.network import GRID_RADIUS, POSITION_DEGREE, arrays_of, layer_tensors

@@ -19,7 +19,7 @@ from torch import Tensor
 from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
 from regnf_core.schema.safe_format import read_description, write_safe_field
-from regnf_data.fusing import BlockGrid, DepthImages, Progress, fuse_blocks
+from regnf_data.fusing import BlockGrid, Progress, fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
 from regnf_fit.images.observing import attach_observation
@@ -111,8 +111,8 @@ def write_map(
     ends = (images.ends(image) for image in range(len(images)))
     within = np.stack([((places >= low) & (places <= high)).all(axis=-1) for places in ends])
     depths = np.where(within & images.measured, images.depths, np.float32(0.0))
-    fused = DepthImages(depths, images.intrinsics, images.T_world_camera, images.colors if colors else None)
-    fuse_blocks(fused, grid, path, progress)
+    shown = images.colors if colors else None
+    fuse_blocks(depths, images.intrinsics, images.T_world_camera, grid, path, shown, progress)
     return replace(images, depths=depths)
 
 

@@ -73,7 +73,14 @@ def depth_spread(images: PosedImages, cosines: NDArray[np.float32]) -> DepthSpre
     rng = np.random.default_rng(0)
     pairs = rng.integers(len(images), size=(_PAIRS, 2))
     found = [_differences(images, cosines, first, second, rng) for first, second in pairs if first != second]
-    return _by_depth(np.concatenate([depth for depth, _ in found]), np.concatenate([apart for _, apart in found]))
+    depths, apart = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    count = min(_BINS, len(depths) // _LEAST_IN_BIN)
+    if count == 0:
+        return NO_SPREAD
+    bins = np.array_split(np.argsort(depths), count)
+    # the difference of two images' depths has sqrt(2) times the deviation of one's
+    deviations = [_deviation(apart[part]) / sqrt(2.0) for part in bins]
+    return DepthSpread(np.array([np.median(depths[part]) for part in bins]), np.array(deviations))
 
 
 def _differences(
@@ -102,16 +109,6 @@ def _differences(
     apart = (seen[:, 2] - measured) * length * cosine
     # the mean does not depend on the difference, as either depth does: bins of it have the differences of all
     return ((seen[:, 2] + measured) / 2.0)[same], apart[same]
-
-
-def _by_depth(depths: Floats, apart: Floats) -> DepthSpread:
-    """The deviation of one image's depths: the difference of two has sqrt(2) times as much."""
-    count = min(_BINS, len(depths) // _LEAST_IN_BIN)
-    if count == 0:
-        return NO_SPREAD
-    parts = np.array_split(np.argsort(depths), count)
-    deviations = [_deviation(apart[part]) / sqrt(2.0) for part in parts]
-    return DepthSpread(np.array([np.median(depths[part]) for part in parts]), np.array(deviations))
 
 
 def _deviation(values: Floats) -> float:

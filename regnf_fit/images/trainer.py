@@ -272,7 +272,10 @@ class Trainer:
         loss = self._loss()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        self._hold_back_fine_levels()
+        # Coarse to fine, as Li et al. (2023, "Neuralangelo"): a level that does not learn yet stays next to zero.
+        levels = self.options.learning_levels(self.iteration)
+        if self.field.table.grad is not None and levels < len(self._level_ends):
+            self.field.table.grad[self._level_ends[levels - 1] :] = 0.0
         self.optimizer.step()
         with torch.no_grad():
             self.field.log_sharpness.clamp_(0.0, math.log(_SHARPEST))
@@ -281,12 +284,6 @@ class Trainer:
                 average.lerp_(parameter, 1.0 - keep)
         self.iteration += 1
         self._losses.append(loss.detach())
-
-    def _hold_back_fine_levels(self) -> None:
-        """Coarse to fine, as Li et al. (2023, "Neuralangelo"): a level that does not learn yet stays next to zero."""
-        levels = self.options.learning_levels(self.iteration)
-        if self.field.table.grad is not None and levels < len(self._level_ends):
-            self.field.table.grad[self._level_ends[levels - 1] :] = 0.0
 
     def sharpness(self) -> Tensor:
         """The opacity's sharpness now, per field unit."""

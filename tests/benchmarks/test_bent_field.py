@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from benchmarks.robust.bent_field import BentField
+from benchmarks.robust.plain_field import PlainField
+from regnf_core import open_field
 from regnf_core.fields.composite import BoxField
 
 BOX = BoxField((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
@@ -46,3 +49,16 @@ def test_errors_have_the_deviation_and_correlation_asked_for() -> None:
     assert float(a.std()) == pytest.approx(amplitude, rel=0.05)
     assert abs(float(a.mean())) < 0.05 * amplitude
     assert float((a * b).mean() / a.square().mean()) == pytest.approx(math.exp(-0.5), abs=0.05)
+
+
+# The plain module and the evaluator: two ways to one field.
+
+ROOM = Path(__file__).parents[2] / "examples" / "data" / "mix-room.safetensors"
+
+
+def test_both_evaluators_give_the_same_field() -> None:
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    value, gradient = open_field(ROOM).signed_distance_and_gradient(points)
+    plain_value, plain_gradient = PlainField(ROOM).value_and_gradient(points)
+    assert torch.allclose(value, plain_value, atol=1e-5)
+    assert torch.allclose(gradient, plain_gradient, atol=1e-3)

@@ -11,13 +11,17 @@ import torch
 from torch import Tensor
 
 from benchmarks.random_worlds.models import PARTS, read_catalog
+from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.cases import cases_of
+from benchmarks.worlds.evidence import Gathering, evidence_of_world
 from benchmarks.worlds.making import WORLD, Task, make, read_cameras
 from benchmarks.worlds.recipe import SCENES, Scene, parts_of_name
+from benchmarks.worlds.similar_objects import SIMILAR
 from benchmarks.worlds.tables import lost_at, markdown, success, wrong
 from regnf_core import Sim3
 from regnf_core.errors import DatasetError
 from regnf_core.fields.observation import Observation, observation_of
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 from regnf_core.schema.description import FREE, SURFACE
 
 
@@ -133,3 +137,21 @@ def test_the_report_tells_how_many_true_poses_lie_in_their_ellipsoids() -> None:
     text = markdown([run(mahalanobis_squared=square) for square in squares] + [run(length="single", mssd_share=0.2)])
     assert "| long | 3/4 (75.0 %) | 2.00 | 2.01 |" in text
     assert "nan" not in text
+
+
+# Rows of evidence: the right object's, and those of a similar one, which are all wrong.
+
+
+def test_rows_of_the_right_object_and_of_a_similar_one(world: Task) -> None:
+    rows = evidence_of_world(world.home, [world.home], Gathering(cases=1, asked=("right", "similar")))
+    similar = [row for row in rows if row["model"] == SIMILAR]
+    right = [row for row in rows if row["model"] != SIMILAR]
+    assert {row["model"] for row in right} == {rows[0]["object"]}
+    assert min(row["mssd"] for row in right) <= SUCCESS
+    assert similar
+    assert {row["mssd"] for row in similar} == {9.0}
+    for kind in (similar, right):
+        chosen = [row for row in kind if row["winner"]]
+        assert len(chosen) == 1
+        assert chosen[0]["verdict"] in ("registered", "ambiguous", "rejected")
+        assert set(chosen[0]["features"]) == set(SPEAKS_FOR)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from regnf_data.rendering import intrinsics_of
-from regnf_data.sensor import DepthSensor, jumps
+from regnf_data.rendering import DepthSensor, intrinsics_of, jumps
 
 SIZE = (200, 300)
 FACING = np.ones(SIZE)
@@ -75,10 +74,3 @@ def test_the_lateral_error_moves_edges_and_nothing_else() -> None:
     assert wrong[150] == pytest.approx(0.266, abs=0.09)
     assert (wrong[:144] == 0.0).all()
     assert (wrong[156:] == 0.0).all()
-
-
-def test_the_seed_decides() -> None:
-    depth = np.linspace(0.5, 4.5, SIZE[0] * SIZE[1]).reshape(SIZE)
-    first, again = (DepthSensor().measure(depth, FACING, rng()) for _ in range(2))
-    np.testing.assert_array_equal(first, again)
-    assert (DepthSensor().measure(depth, FACING, np.random.default_rng(6)) != first).any()
