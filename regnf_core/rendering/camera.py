@@ -13,7 +13,6 @@ from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.rendering.request import OrbitRequest, check_extent
 from regnf_core.surface.sphere_tracing import Rays, axis_vector
 
@@ -90,18 +89,6 @@ class Camera:
         axes = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
         return cls(at, axes, size[0], size[1], (focal, focal), (size[0] / 2.0, size[1] / 2.0))
 
-    @property
-    def forward(self) -> Tensor:
-        """(3,) unit, scene frame: the viewing axis, along which depths are measured."""
-        return self.axes[:, 2]
-
-    def pinhole(self) -> PinholeCameras:
-        """The same camera as a batch of one."""
-        size = torch.tensor([self.width, self.height], dtype=torch.float64)
-        focal, middle = (torch.tensor([value], dtype=torch.float64) / size for value in (self.focal, self.middle))
-        aspect = torch.tensor([self.width / self.height], dtype=torch.float64)
-        return PinholeCameras(self.position[None], self.axes[None], focal, middle, aspect)
-
     def rays(self, pixels: Tensor, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[Rays, Tensor]:
         """Rays through pixels (N,), numbered row by row, and the cosines (N,) of their angles to the viewing axis.
 
@@ -165,8 +152,7 @@ _ROOM_AROUND = 1.25
 def orbit_cameras(orbit: OrbitRequest, box: OrientedBox, size: tuple[int, int] = (640, 480)) -> list[Camera]:
     """Cameras on a circle round ``box``, all looking at its middle. size: width and height.
 
-    The first is turned by ``start_deg`` about the vertical, the last by ``sweep_deg`` from it; a full turn ends one
-    step before its start. Without ``distance``, a ball that holds the box is in view.
+    A full turn ends one step before its start. Without a distance, a ball that holds the box is in view.
     """
     up, full = up_vector(orbit.up), abs(orbit.sweep_deg) >= 360.0
     steps = orbit.frames if full else max(orbit.frames - 1, 1)

@@ -96,7 +96,9 @@ composite.glb · field: the edited scene as a field file."""
 @dataclass(frozen=True)
 class OrbitRequest:
     """Cameras round one thing. edit: the number of an edit, whose object is looked at · detection: a box instead;
-    neither: the first edit, or without edits the scene's bounds. The rest: regnf_core.rendering.camera.Orbit."""
+    neither: the first edit, or without edits the scene's bounds · elevation_deg: above the horizon · start_deg,
+    sweep_deg: the first camera's turn about the vertical, and how far the last one is turned from it · distance: from
+    the thing's middle, scene units; None: all of it is in view."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 

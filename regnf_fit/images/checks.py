@@ -40,7 +40,14 @@ def check_images(images: PosedImages) -> None:
     """
     if len(images) == 0 or images.colors[0].size == 0:
         raise DatasetError("the dataset holds no pixels", reason="DATASET_NO_FRAMES")
-    _check_cameras(images)
+    rotation = images.T_world_camera[:, :3, :3]
+    product = rotation @ rotation.transpose(0, 2, 1)
+    # not (a <= b): NaN must fail too
+    if not (np.isfinite(images.T_world_camera).all() and (np.abs(product - np.eye(3)) <= 1e-3).all()):
+        raise DatasetError("a camera's pose is not finite, or no rotation", reason="DATASET_POSE_NOT_RIGID")
+    focal = images.intrinsics[:, [0, 1], [0, 1]]
+    if not (np.isfinite(images.intrinsics).all() and (focal > 0.0).all()):
+        raise DatasetError("a camera's focal length is not positive", reason="DATASET_INTRINSICS_INVALID")
     check_bounds(images.bounds)
     if images.depths is not None:
         if not np.isfinite(images.depths).all() or (images.depths > 0).mean() < _MIN_DEPTH_SHARE:
@@ -108,17 +115,6 @@ def _unit_hint(images: PosedImages, origins: Floats, rays: Floats, depths: Float
 def _box(corners: Floats) -> str:
     """Lowest and highest corner (2, 3) in words."""
     return " to ".join("(" + ", ".join(f"{number:.4g}" for number in corner) + ")" for corner in corners)
-
-
-def _check_cameras(images: PosedImages) -> None:
-    rotation = images.T_world_camera[:, :3, :3]
-    product = rotation @ rotation.transpose(0, 2, 1)
-    # not (a <= b): NaN must fail too
-    if not (np.isfinite(images.T_world_camera).all() and (np.abs(product - np.eye(3)) <= 1e-3).all()):
-        raise DatasetError("a camera's pose is not finite, or no rotation", reason="DATASET_POSE_NOT_RIGID")
-    focal = images.intrinsics[:, [0, 1], [0, 1]]
-    if not (np.isfinite(images.intrinsics).all() and (focal > 0.0).all()):
-        raise DatasetError("a camera's focal length is not positive", reason="DATASET_INTRINSICS_INVALID")
 
 
 def check_bounds(bounds: Floats) -> None:

@@ -241,14 +241,6 @@ _WINDOW, _SPREAD = 11, 1.5
 _LUMINANCE, _CONTRAST = 0.01**2, 0.03**2
 
 
-@dataclass(frozen=True)
-class Likeness:
-    """psnr: decibels, over all pixels that show the thing · ssim: mean structural similarity about them, up to 1."""
-
-    psnr: float
-    ssim: float
-
-
 def held_out_images(count: int) -> list[int]:
     """The numbers of the images to hold out, of so many: one of 15, evenly over them, at most four."""
     if count < _LEAST_IMAGES:
@@ -260,8 +252,9 @@ def held_out_images(count: int) -> list[int]:
 @torch.no_grad()
 def likeness(
     field: RadianceField, color: SurfaceColor, images: PosedImages, chosen: list[int], size: float
-) -> Likeness | None:
-    """Of the field's surface, colored, to the chosen images; None where they show nothing of it."""
+) -> tuple[float, float] | None:
+    """Of the field's surface, colored, to the chosen images: decibels (PSNR) over all pixels that show the thing, and
+    their mean structural similarity, up to 1. None where they show nothing of it."""
     squared, similar, pixels = 0.0, 0.0, 0
     for number in chosen:
         shown, seen, drawn = _picture(field, color, images, number, size)
@@ -272,7 +265,7 @@ def likeness(
         similar += float(structural_similarity(drawn, seen)[shown].sum())
     if not pixels:
         return None
-    return Likeness(-10.0 * math.log10(max(squared / pixels, 1e-10)), similar / pixels)
+    return -10.0 * math.log10(max(squared / pixels, 1e-10)), similar / pixels
 
 
 def structural_similarity(one: Tensor, other: Tensor) -> Tensor:

@@ -214,7 +214,11 @@ def reconstruct(
     """
     options = options or ReconstructionOptions()
     started = time.monotonic()
-    torch_device = pick_device(device)
+    if device not in ("auto", "cpu", "cuda"):
+        raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {device:.40}")
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    torch_device = usable_device(device)
     rng = np.random.default_rng(seed)
     key = _key(images, options, seed)
     check_bounds(images.bounds)
@@ -239,7 +243,13 @@ def reconstruct(
         with torch.no_grad():
             held_out = trainer.poses.correct(held_out)
     chosen = held_out_images(len(images.colors))
-    color = _fit_color(trainer, prepared, chosen, seed)
+    color = None
+    if trainer.learns_color:  # of the finished geometry, without the images ``chosen``
+        rays = prepared.training
+        rays = rays.take(~torch.isin(rays.images, torch.tensor(chosen, dtype=rays.images.dtype))).to(torch_device)
+        with torch.no_grad():
+            rays = rays if trainer.poses is None else trainer.poses.correct(rays)
+        color = fit_color(trainer.averaged, rays, prepared.size, seed)
     write(trainer, files.output, color)
     if files.pictures:
         _draw(trainer.averaged, write.bounds, files.output.with_suffix(".png"))
@@ -250,10 +260,11 @@ def reconstruct(
         files.checkpoint.unlink(missing_ok=True)
     errors = evaluate(trainer.averaged, held_out, prepared.size)
     alike = None if color is None else likeness(trainer.averaged, color, images, chosen, prepared.size)
+    psnr, ssim = alike or (None, None)
     return ReconstructionReport(
         loss=loss,
-        psnr=None if alike is None else alike.psnr,
-        ssim=None if alike is None else alike.ssim,
+        psnr=psnr,
+        ssim=ssim,
         pose_shift=None if trainer.poses is None else trainer.poses.median_shift() / frame.scale,
         iterations=options.iterations,
         seconds=time.monotonic() - started,
@@ -262,27 +273,6 @@ def reconstruct(
         eikonal_error=errors.eikonal_error,
         warnings=prepared.warnings,
     )
-
-
-def _fit_color(trainer: Trainer, prepared: PreparedImages, held_out: list[int], seed: int) -> SurfaceColor | None:
-    """The color of the finished geometry, without the images ``held_out``; None where no color is wanted or seen."""
-    if not trainer.learns_color:
-        return None
-    rays = prepared.training
-    rays = rays.take(~torch.isin(rays.images, torch.tensor(held_out, dtype=rays.images.dtype)))
-    rays = rays.to(trainer.field.table.device)
-    with torch.no_grad():
-        rays = rays if trainer.poses is None else trainer.poses.correct(rays)
-    return fit_color(trainer.averaged, rays, prepared.size, seed)
-
-
-def pick_device(name: str) -> torch.device:
-    """``auto``: an NVIDIA GPU where there is one. Raises InvalidOptionsError."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name not in ("cpu", "cuda"):
-        raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {name:.40}")
-    return usable_device(name)
 
 
 def _train(

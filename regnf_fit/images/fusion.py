@@ -73,16 +73,17 @@ _GROWTH = 1.1
 
 
 @dataclass(frozen=True)
-class MapSize:
-    """voxel: from node to node, field units; None: as wide as a pixel of the sharper images is at its surface, or as
-    noise and many blocks allow · truncation: voxels; None: 4, or 6 standard deviations of the depths from image to
-    image."""
+class FusionOptions:
+    """How images are fused. voxel: from node to node, field units; None: as wide as a pixel of the sharper images is at
+    its surface, or as noise and many blocks allow · truncation: voxels; None: 4, or 6 standard deviations of the depths
+    from image to image · observation_voxels: along the longest side of the grid of what was observed."""
 
     voxel: float | None = None
     truncation: float | None = None
+    observation_voxels: int = 192
 
 
-def map_grid(prepared: PreparedImages, rays: PixelRays, size: MapSize) -> BlockGrid:
+def map_grid(prepared: PreparedImages, rays: PixelRays, size: FusionOptions) -> BlockGrid:
     """The voxels of a map. rays: those that were measured, at least one.
 
     Raises InvalidOptionsError for voxels that are too small for the surface that was measured.
@@ -117,13 +118,6 @@ def write_map(
 
 
 _CHECKED = 20_000
-
-
-@dataclass(frozen=True)
-class FusionOptions(MapSize):
-    """How images are fused. observation_voxels: along the longest side of the grid of what was observed."""
-
-    observation_voxels: int = 192
 
 
 @dataclass(frozen=True)
@@ -213,7 +207,7 @@ def map_distances(images: PosedImages, prepared: PreparedImages, rng: np.random.
     """Fuse ``images``, which have depths, without the pixels held out, and draw places near their surface."""
     assert images.depths is not None
     rays = measured_rays(prepared)
-    grid = map_grid(prepared, rays, MapSize())
+    grid = map_grid(prepared, rays, FusionOptions())
     depths = images.depths.copy()
     depths.reshape(-1)[prepared.held_out_pixels] = 0.0
     ends = ends_of(rays)

@@ -149,22 +149,16 @@ def local_planes(depths: NDArray[np.float32], intrinsics: Floats) -> LocalPlanes
     cosines, left_over = np.zeros(depths.shape, np.float32), np.zeros(depths.shape, np.float32)
     for image, (depth, camera) in enumerate(zip(depths, intrinsics, strict=True)):
         cosines[image], left_over[image] = _of_one(depth, camera)
-    return LocalPlanes(cosines, _normals_by_depth(depths, left_over, cosines > 0.0))
-
-
-def _normals_by_depth(
-    depths: NDArray[np.float32], left_over: NDArray[np.float32], known: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """The median of ``left_over`` (N, H, W) as a function of the depth, at every pixel."""
+    known = cosines > 0.0
     if not known.any():
-        return np.zeros_like(depths)
+        return LocalPlanes(cosines, np.zeros_like(depths))
     z, noise = depths[known], left_over[known]
     edges = np.quantile(z, np.linspace(0.0, 1.0, _DEPTH_BINS + 1))
     bins = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, _DEPTH_BINS - 1)
     filled = [i for i in range(_DEPTH_BINS) if (bins == i).any()]
     middles = [float(np.median(z[bins == i])) for i in filled]
     medians = [float(np.median(noise[bins == i])) for i in filled]
-    return np.interp(depths, middles, medians).astype(np.float32)
+    return LocalPlanes(cosines, np.interp(depths, middles, medians).astype(np.float32))
 
 
 def _of_one(depth: NDArray[np.float32], camera: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

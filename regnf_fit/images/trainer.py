@@ -71,10 +71,6 @@ class CameraPoses(nn.Module):
         """Of all cameras, field units."""
         return float(self.corrections()[1].norm(dim=1).median())
 
-    def prior(self) -> Tensor:
-        """Mean square of the corrections in the deviations that are expected."""
-        return self.steps.square().mean()
-
     @torch.no_grad()
     def corrected(self, images: PosedImages) -> PosedImages:
         """The images with corrected poses."""
@@ -301,7 +297,7 @@ class Trainer:
         of_surface = of_surface if self._data.near is None else weights.map
         loss = of_surface * surface + weights.free_space * free_space
         if (poses := self._learning_poses()) is not None:
-            loss = loss + weights.poses * poses.prior()
+            loss = loss + weights.poses * poses.steps.square().mean()
         loss = loss + weights.eikonal * self._eikonal(function, near)
         if self.options.color_rays > 0 and (self.poses is not None or self.iteration % _COLOR_EVERY == 0):
             loss = loss + self._color(self._data)

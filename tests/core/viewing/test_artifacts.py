@@ -65,7 +65,7 @@ def test_numbers_that_json_lacks_become_null(chair_run: ChairRun) -> None:
     assert document["alternatives"][0]["relation"] == "180 degrees about z"
     assert document["alternatives"][0]["T_scene_object"]["matrix"] == np.eye(4).tolist()
     assert len(document["covariance"]) == 7
-    assert document["symmetry"] == {"order": 2, "axis": (0.0, 0.0, 1.0), "continuous": True}
+    assert document["symmetry"] == {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": True}
     json.dumps(document, allow_nan=False)
 
 
