@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -34,21 +32,6 @@ def test_the_gradient_is_that_of_the_value() -> None:
         slope = (bend[0] - bend[1]) / (2 * step)
         assert torch.allclose(gradient[:, axis] - plain[:, axis], slope, atol=2e-3)
         assert slope.abs().max() > 0.1
-
-
-def test_errors_have_the_deviation_and_correlation_asked_for() -> None:
-    amplitude, length = 0.01, 0.3
-    points = places(400)
-    aside = torch.tensor([length, 0.0, 0.0])
-    here, there = [], []
-    for seed in range(60):
-        field = BentField(BOX, amplitude, length, seed)
-        here.append(field.signed_distance(points) - BOX.signed_distance(points))
-        there.append(field.signed_distance(points + aside) - BOX.signed_distance(points + aside))
-    a, b = torch.stack(here), torch.stack(there)
-    assert float(a.std()) == pytest.approx(amplitude, rel=0.05)
-    assert abs(float(a.mean())) < 0.05 * amplitude
-    assert float((a * b).mean() / a.square().mean()) == pytest.approx(math.exp(-0.5), abs=0.05)
 
 
 # The plain module and the evaluator: two ways to one field.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.peers import registry
-from benchmarks.peers.clouds import cloud_pair, similarity
+from benchmarks.peers.clouds import cloud_pair
 from benchmarks.peers.disturbance import disturbed, keypoints, rigid_fit
 from benchmarks.peers.interface import Peer, PeerCase, sampled
 from benchmarks.peers.judging import NO_POSE, SKIPPED, WRONG, run_one
@@ -137,15 +137,6 @@ def test_a_normalized_pair_leads_back_by_hand() -> None:
     # (3, 0, 0) is (1, 0, 0) at work; turned it is (0, 1, 0); in the object's frame (0, 11, 0).
     assert torch.allclose(T.apply(torch.tensor([[3.0, 0, 0]]).double()), torch.tensor([[0.0, 11, 0]]).double())
     assert float(T.scale) == pytest.approx(3.0)
-
-
-def test_matrices_of_other_packages() -> None:
-    T = random_pose(3, 2.5)
-    rounded = np.asarray(T.matrix().tolist()) + 1e-7 * np.eye(4)
-    assert torch.allclose(similarity(rounded).matrix(), T.matrix(), atol=1e-6)
-    for bad in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([0.0, 0.0, 0.0, 1.0]), np.full((4, 4), np.nan)):
-        with pytest.raises(InitializationError):
-            similarity(bad)
 
 
 def test_a_disturbed_truth_is_as_far_off_as_stated() -> None:

@@ -7,7 +7,6 @@ from PIL import Image
 
 from benchmarks.real.cases import Work, make_case, object_field
 from benchmarks.real.drift import overlap
-from benchmarks.real.fits import seeing
 from benchmarks.real.fusion import fuse, open_fused, surface, voxel_of
 from benchmarks.real.halves import INTERLEAVED
 from benchmarks.real.maps import keep_observation, open_map
@@ -118,12 +117,6 @@ def test_halves_without_drift_lie_on_each_other(work, thing):
     found = overlap(work.map_files("A").fused, work.map_files("B").fused, thing)
     assert found.drift_m < WALL / K[0, 0]  # a pixel's width: the images tell no more
     assert found.seen_share > 0.9
-
-
-def test_frames_that_see_a_thing(recording, thing):
-    assert len(seeing(recording, range(16), thing, 5)) == 5
-    away = Thing("nothing", thing.low + 10.0, thing.high + 10.0, thing.T_room_world)
-    assert seeing(recording, range(16), away, 5) == []
 
 
 def test_a_map_keeps_its_voxel_and_its_truncation(recording, tmp_path):
