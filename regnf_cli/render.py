@@ -83,7 +83,10 @@ def render(
     Example: **regnf render room.safetensors --around box.json --frames 8 --output pictures/**
     """
     require("engine")
-    poses = None if cameras is None else poses_of(cameras, every, None if size is None else size_of(size))
+    from regnf_core.rendering.camera_poses import poses_of_file
+
+    wide = None if size is None else size_of(size)
+    poses = None if cameras is None else poses_of_file(cameras, wide, every)
     wanted = request_of(
         request, around=around, poses=poses, size=size, mode=mode, frames=frames, elevation_deg=elevation,
         distance=distance, up=up_axis, outputs=outputs, antialias=antialias, cut_away=cut_away,
@@ -156,23 +159,6 @@ def request_of(
     if "outputs" in said:
         values["outputs"] = [word.strip() for word in said["outputs"].split(",")]
     return RenderRequest.from_dict(values)
-
-
-def poses_of(path: Path, every: int, size: tuple[int, int] | None) -> list[dict[str, Any]]:
-    """The cameras of a file as a request says them."""
-    from regnf_core.rendering.camera import cameras_of_file
-
-    found = []
-    for camera in cameras_of_file(path, size=size, every=every):
-        rows = [[*axes, place] for axes, place in zip(camera.axes.tolist(), camera.position.tolist(), strict=True)]
-        found.append(
-            {
-                "T_scene_camera": [*rows, [0.0, 0.0, 0.0, 1.0]],
-                "intrinsics": [*camera.focal, *camera.middle],
-                "size": [camera.width, camera.height],
-            }
-        )
-    return found
 
 
 def size_of(text: str) -> tuple[int, int]:

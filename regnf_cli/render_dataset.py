@@ -52,8 +52,8 @@ def render_dataset(
     """
     require("engine")
     from regnf_data.composing import RenderOptions
+    from regnf_data.rendering import DepthSensor
     from regnf_data.sdfstudio import check_target, write_dataset
-    from regnf_data.sensor import DepthSensor
 
     layout = source.suffix.lower() == ".json"
     _check(layout, meshes, trajectory, instance, units_per_meter)

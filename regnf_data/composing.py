@@ -16,10 +16,9 @@ from regnf_core.errors import DatasetError
 from regnf_core.fields.composite import SurfaceSource
 from regnf_core.geometry.box import OrientedBox
 from regnf_data.layouts import Furnishing, Layout
-from regnf_data.mesh_scene import MeshScene, Thing, TilePaint, box_thing, load_thing
+from regnf_data.mesh_scene import MeshScene, Thing, box_thing, load_thing, tile_paint
 from regnf_data.posed_images import Instance, PosedImages
-from regnf_data.rendering import Size, View, intrinsics_of, render
-from regnf_data.sensor import DepthSensor
+from regnf_data.rendering import DepthSensor, Size, View, intrinsics_of, render
 from regnf_data.trajectories import (
     CLEARANCE_M,
     WalkingGround,
@@ -31,6 +30,8 @@ from regnf_data.trajectories import (
     pass_by,
     short_walk,
 )
+
+Array = NDArray[np.float64]
 
 # One view of one thing, a poor one, chosen by rule.
 
@@ -100,13 +101,12 @@ def _candidates(scene: MeshScene, center: Array, distance: float, floor: float) 
         yield from look_at(positions[free & inside], np.tile(center, (int((free & inside).sum()), 1)))
 
 
-Array = NDArray[np.float64]
 Trajectory = Literal["long", "short", "single"]
 Progress = Callable[[int, int], None]
 """Told how many images are done, and of how many."""
 
-_FLOOR = TilePaint((0.42, 0.33, 0.22), (0.5, 0.41, 0.29), 0.3)
-_WALL = TilePaint((0.62, 0.62, 0.58), (0.7, 0.71, 0.68), 0.4)
+_FLOOR = tile_paint((0.42, 0.33, 0.22), (0.5, 0.41, 0.29), 0.3)
+_WALL = tile_paint((0.62, 0.62, 0.58), (0.7, 0.71, 0.68), 0.4)
 _FRAMES = {"room": {"long": 240, "short": 60, "single": 1}, "object": {"long": 60, "short": 20, "single": 1}}
 _OBJECT_MARGIN = 0.1
 _SINGLE_MARGIN_M = 0.4
@@ -162,7 +162,10 @@ def render_room(
         pieces = [pair for pair in pieces if pair[0].name == instance][:1]
         if not pieces:
             raise DatasetError(f"{layout.name} has no instance {instance!r}", reason="DATASET_NO_INSTANCE")
-        poses, bounds = _single_view(layout, scene, pieces[0][1], options)
+        thing = pieces[0][1]
+        poses = bad_view(scene, thing, options.size, options.intrinsics, float(layout.floor[1, 2]))[None]
+        (lower, upper), (low, high) = thing.solid.bounds.numpy(), scene.bounds
+        bounds = np.stack([np.maximum(lower - _SINGLE_MARGIN_M, low), np.minimum(upper + _SINGLE_MARGIN_M, high)])
     else:
         walk = long_walk if options.trajectory == "long" else short_walk
         boxes = [thing.solid.bounds.numpy() for _, thing in pieces]
@@ -219,15 +222,6 @@ def scale_and_shift(units_per_meter: float, origin_m: tuple[float, float, float]
     return matrix
 
 
-def _single_view(layout: Layout, scene: MeshScene, thing: Thing, options: RenderOptions) -> tuple[Array, Array]:
-    """The pose (1, 4, 4), metric, and the bounds (2, 3): the thing's with a margin, within the scene's."""
-    floor = float(layout.floor[1, 2])
-    pose = bad_view(scene, thing, options.size, options.intrinsics, floor)
-    lower, upper = thing.solid.bounds.numpy()
-    low, high = scene.bounds
-    return pose[None], np.stack((np.maximum(lower - _SINGLE_MARGIN_M, low), np.minimum(upper + _SINGLE_MARGIN_M, high)))
-
-
 def _taken(
     scene: MeshScene,
     poses: Array,
@@ -238,16 +232,14 @@ def _taken(
 ) -> PosedImages:
     """Images from metric poses, put into the world frame."""
     check_free(scene, poses)
-    rng = np.random.default_rng(options.seed)
-    units = float(T_world_metric[0, 0])
+    rng, sensor = np.random.default_rng(options.seed), options.sensor
     views: list[View] = []
     depths = []
     for pose in poses:
         view = render(scene, options.size, options.intrinsics, pose)
-        sensor = options.sensor
         depth = view.depth if sensor is None else sensor.measure(view.depth, view.cosine, rng)
         views.append(view)
-        depths.append((depth * units).astype(np.float32))
+        depths.append((depth * float(T_world_metric[0, 0])).astype(np.float32))
         if progress is not None:
             progress(len(views), len(poses))
     T_world_camera = poses.copy()

@@ -24,10 +24,7 @@ _LARGEST = 1e9
 
 
 def array(value: Any, shapes: tuple[tuple[int, ...], ...], what: str, reason: str) -> NDArray[np.float64]:
-    """``value`` as float64 numbers of one of the shapes, finite and up to 1e9.
-
-    Raises DatasetError with the given reason.
-    """
+    """``value`` as float64 numbers of one of the shapes, finite and up to 1e9. Raises DatasetError (``reason``)."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -73,10 +70,8 @@ def similarity(value: Any, what: str, reason: str) -> NDArray[np.float64]:
 def whole_number(value: Any, what: str, reason: str) -> int:
     """A positive whole number."""
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-    if isinstance(value, bool) or not whole:
-        raise DatasetError(f"{what} is not a whole number", reason=reason)
-    if value < 1:
-        raise DatasetError(f"{what} is not positive", reason=reason)
+    if isinstance(value, bool) or not whole or value < 1:
+        raise DatasetError(f"{what} is not a positive whole number", reason=reason)
     return int(value)
 
 
@@ -133,8 +128,8 @@ def read_layout(path: str | os.PathLike[str], meshes: str | os.PathLike[str]) ->
     x, y, z = array(room.get("scene_origin_m", _USUAL_ORIGIN_M), ((3,),), "scene_origin_m", _REASON).tolist()
     return Layout(
         name=source.stem,
-        floor=_box(room.get("floor"), "floor"),
-        walls=tuple(_box(wall, "a wall") for wall in room.get("walls", [])),
+        floor=_corners(room.get("floor"), "floor"),
+        walls=tuple(_corners(wall, "a wall") for wall in room.get("walls", [])),
         furnishings=tuple(_furnishing(instance, Path(meshes)) for instance in instances),
         units_per_meter=units,
         origin_m=(x, y, z),
@@ -150,20 +145,15 @@ def _furnishing(instance: Any, meshes: Path) -> Furnishing:
     mesh = meshes / Path(instance["mesh"]).name
     if "\0" in mesh.name or len(mesh.name.encode("utf-8", "surrogatepass")) > _LONGEST_FILE_NAME or not mesh.is_file():
         raise DatasetError(f"{name}: no such mesh: {mesh.name!r:.200}", reason="DATASET_MESH_MISSING")
-    bounds = None
-    if instance.get("aabb_min") is not None:
-        bounds = _corners(instance, "aabb_min", "aabb_max", name)
+    stated = instance.get("aabb_min") is not None
+    bounds = _corners(instance, name, "aabb_min", "aabb_max") if stated else None
     pose = rigid(instance.get("T_room_from_object"), f"T_room_from_object of {name}", _REASON)
     return Furnishing(name, mesh, pose, bounds)
 
 
-def _box(given: Any, what: str) -> Array:
+def _corners(given: Any, what: str, lowest: str = "box_min", highest: str = "box_max") -> Array:
     if not isinstance(given, dict):
         raise DatasetError(f"{what} is not a box", reason=_REASON)
-    return _corners(given, "box_min", "box_max", what)
-
-
-def _corners(given: dict[str, Any], lowest: str, highest: str, what: str) -> Array:
     corners = np.stack([array(given.get(key), ((3,),), f"{key} of {what}", _REASON) for key in (lowest, highest)])
     if not (corners[0] < corners[1]).all():
         raise DatasetError(f"{what}: {lowest} is not below {highest}", reason=_REASON)

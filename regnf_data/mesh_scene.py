@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,68 +22,41 @@ from regnf_core.importing.mesh_file import load_solid
 _GRAY = (0.5, 0.5, 0.5)
 
 
-class Paint(Protocol):
-    """Colors of surface points."""
-
-    def at(
-        self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Colors (P, 3) at points (P, 3), each the mix by ``shares`` (P, 3) of a triangle's vertices (P, 3)."""
-        ...
+Array = NDArray[np.float64]
+Rgb = tuple[float, float, float]
+Paint = Callable[[Array, NDArray[np.int64], Array], Array]
+"""Colors (P, 3) at points (P, 3), each the mix by shares (P, 3) of a triangle's vertices (P, 3)."""
 
 
-@dataclass(frozen=True)
-class VertexPaint:
+def vertex_paint(colors: Array) -> Paint:
     """One color a vertex, (V, 3), mixed over the triangle."""
-
-    colors: NDArray[np.float64]
-
-    def at(
-        self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Colors (P, 3)."""
-        del points
-        mixed: NDArray[np.float64] = np.einsum("pk,pkc->pc", shares, self.colors[corners])
-        return mixed
+    return lambda points, corners, shares: np.einsum("pk,pkc->pc", shares, colors[corners])
 
 
-@dataclass(frozen=True)
-class TexturePaint:
-    """A picture (h, w, 3) laid on by texture coordinates (V, 2); (0, 0) is its lower left corner, and it repeats."""
+def texture_paint(picture: NDArray[np.float32], coordinates: Array) -> Paint:
+    """The nearest texels of a picture (h, w, 3) laid on by coordinates (V, 2); (0, 0) is its lower left corner, and it
+    repeats."""
+    height, width = picture.shape[:2]
 
-    picture: NDArray[np.float32]
-    coordinates: NDArray[np.float64]
-
-    def at(
-        self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Colors (P, 3), of the nearest texel."""
-        del points
-        u, v = np.einsum("pk,pkc->cp", shares, self.coordinates[corners])
-        height, width = self.picture.shape[:2]
+    def at(_: Array, corners: NDArray[np.int64], shares: Array) -> Array:
+        u, v = np.einsum("pk,pkc->cp", shares, coordinates[corners])
         column = np.floor(u * width).astype(np.int64) % width
         row = np.floor((1.0 - v) * height).astype(np.int64) % height
-        texels: NDArray[np.float64] = self.picture[row, column].astype(np.float64)
+        texels: Array = picture[row, column].astype(np.float64)
         return texels
 
+    return at
 
-@dataclass(frozen=True)
-class TilePaint:
-    """Cubes of two colors (3,) in turn, ``edge`` long: what floors and walls wear, so that images show them move."""
 
-    first: tuple[float, float, float]
-    second: tuple[float, float, float]
-    edge: float
+def tile_paint(first: Rgb, second: Rgb, edge: float) -> Paint:
+    """Cubes of two colors in turn, ``edge`` long: what floors and walls wear, so that images show them move."""
 
-    def at(
-        self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Colors (P, 3)."""
-        del corners, shares
+    def at(points: Array, _corners: NDArray[np.int64], _shares: Array) -> Array:
         # Off the faces by a part of a tile: rounding must not choose the color.
-        odd = np.floor(points / self.edge + 0.3).sum(axis=1) % 2 == 1
-        colors: NDArray[np.float64] = np.where(odd[:, None], self.first, self.second)
-        return colors
+        odd = np.floor(points / edge + 0.3).sum(axis=1) % 2 == 1
+        return np.where(odd[:, None], first, second)
+
+    return at
 
 
 def paint_of(mesh: Any) -> Paint:
@@ -96,24 +69,23 @@ def paint_of(mesh: Any) -> Paint:
         factor = getattr(material, "baseColorFactor", None)
         tint = 1.0 if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255.0
         linear = to_linear(np.asarray(picture.convert("RGB"))) * tint
-        return TexturePaint(linear.astype(np.float32), np.asarray(coordinates, dtype=np.float64))
-    plain = visual.kind in (None, "texture")
-    main = getattr(material, "main_color", None) if plain else None
-    if plain and main is None:
-        return VertexPaint(np.tile(_GRAY, (len(mesh.vertices), 1)))
-    colors = np.tile(main, (len(mesh.vertices), 1)) if main is not None else np.asarray(visual.vertex_colors)
-    return VertexPaint(to_linear(colors[:, :3]))
+        return texture_paint(linear.astype(np.float32), np.asarray(coordinates, dtype=np.float64))
+    if visual.kind not in (None, "texture"):
+        return vertex_paint(to_linear(np.asarray(visual.vertex_colors)[:, :3]))
+    main = getattr(material, "main_color", None)
+    color = np.array(_GRAY) if main is None else to_linear(np.asarray(main)[:3])
+    return vertex_paint(np.tile(color, (len(mesh.vertices), 1)))
 
 
-def to_linear(srgb: NDArray[Any]) -> NDArray[np.float64]:
+def to_linear(srgb: NDArray[Any]) -> Array:
     """sRGB bytes to linear light, 0 to 1 (IEC 61966-2-1)."""
     steps = np.arange(256) / 255.0
     table = np.where(steps <= 0.04045, steps / 12.92, ((steps + 0.055) / 1.055) ** 2.4)
-    linear: NDArray[np.float64] = table[srgb.astype(np.uint8)]
+    linear: Array = table[srgb.astype(np.uint8)]
     return linear
 
 
-def to_srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+def to_srgb(linear: Array) -> NDArray[np.uint8]:
     """Linear light, 0 to 1, to sRGB bytes (IEC 61966-2-1)."""
     light = np.clip(linear, 0.0, 1.0)
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
@@ -128,7 +100,7 @@ _SEEN_SHARE = 0.003
 class PaintedMesh:
     """Triangles with their color: vertices (V, 3), faces (F, 3)."""
 
-    vertices: NDArray[np.float64]
+    vertices: Array
     faces: NDArray[np.int64]
     paint: Paint
 
@@ -150,10 +122,10 @@ class Hits:
     normal: (R, 3) unit, towards the ray's origin · color: (R, 3) linear, zero where nothing was met.
     """
 
-    distance: NDArray[np.float64]
+    distance: Array
     thing: NDArray[np.int64]
-    normal: NDArray[np.float64]
-    color: NDArray[np.float64]
+    normal: Array
+    color: Array
 
 
 def load_thing(path: str | os.PathLike[str], T_scene_mesh: ArrayLike | None = None, name: str | None = None) -> Thing:
@@ -175,7 +147,7 @@ def load_thing(path: str | os.PathLike[str], T_scene_mesh: ArrayLike | None = No
     return Thing(meshes, solid, name)
 
 
-def box_thing(lower: ArrayLike, upper: ArrayLike, paint: TilePaint) -> Thing:
+def box_thing(lower: ArrayLike, upper: ArrayLike, paint: Paint) -> Thing:
     """A box between two corners (3,): a floor or a wall."""
     corners = np.array([lower, upper], dtype=np.float64)
     vertices = np.array([[corners[i, 0], corners[j, 1], corners[k, 2]] for i, j, k in product((0, 1), repeat=3)])
@@ -193,16 +165,16 @@ class MeshScene:
         self._meshes = [(index, mesh) for index, thing in enumerate(self.things) for mesh in thing.meshes]
 
     @cached_property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Array:
         """(2, 3): lowest and highest corner of everything."""
         return UnionField([thing.solid for thing in self.things]).bounds.numpy()
 
-    def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def signed_distance(self, points: Array) -> Array:
         """(N,): distance of points (N, 3) to the nearest thing, negative inside."""
         solids = UnionField([thing.solid for thing in self.things])
         return solids.signed_distance(torch.from_numpy(points)).numpy().astype(np.float64)
 
-    def cast(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
+    def cast(self, origins: Array, directions: Array) -> Hits:
         """What the rays from ``origins`` (R, 3) along ``directions`` (R, 3), of any length, meet first."""
         answer = self._cast(origins, directions)
         distance = answer["t_hit"].astype(np.float64)
@@ -215,19 +187,19 @@ class MeshScene:
             corners = mesh.faces[answer["primitive_ids"][chosen].astype(np.int64)]
             second, third = answer["primitive_uvs"][chosen].astype(np.float64).T
             points = origins[chosen] + distance[chosen, None] * directions[chosen]
-            color[chosen] = mesh.paint.at(points, corners, np.stack([1.0 - second - third, second, third], axis=1))
+            color[chosen] = mesh.paint(points, corners, np.stack([1.0 - second - third, second, third], axis=1))
             normal[chosen] = answer["primitive_normals"][chosen]
             thing[chosen] = owner
         away = np.einsum("rc,rc->r", normal, directions) > 0.0
         normal[away] *= -1.0
         return Hits(distance, thing, normal, color)
 
-    def sees(self, position: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def sees(self, position: Array, points: Array) -> NDArray[np.bool_]:
         """(N,): whether nothing lies between ``position`` (3,) and the surface points (N, 3)."""
         distance = self._cast(np.broadcast_to(position, points.shape), points - position)["t_hit"]
         return np.asarray(distance >= 1.0 - _SEEN_SHARE)
 
-    def _cast(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    def _cast(self, origins: Array, directions: Array) -> dict[str, NDArray[Any]]:
         import open3d
 
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)

@@ -14,6 +14,8 @@ from scipy.sparse import csgraph
 from regnf_core.errors import DatasetError
 from regnf_data.mesh_scene import MeshScene
 
+Array = NDArray[np.float64]
+
 # Where a person with a camera can walk in a room.
 
 _CELL_M = 0.1
@@ -42,7 +44,9 @@ class WalkingGround:
     def __init__(self, scene: Distances, floor: Array) -> None:
         axes = [np.arange(floor[0, axis] + _CELL_M, floor[1, axis], _CELL_M) for axis in (0, 1)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (X, Y, 2)
-        clearance = np.min([_clearance(scene, grid, floor[1, 2] + height) for height in _BODY_M], axis=0)
+        flat = grid.reshape(-1, 2)
+        layers = (np.insert(flat, 2, floor[1, 2] + height, axis=1) for height in _BODY_M)
+        clearance = np.min([scene.signed_distance(points) for points in layers], axis=0).reshape(grid.shape[:2])
         # The edge of the floor bounds the ground as a wall would.
         edge = np.minimum(grid - floor[0, :2], floor[1, :2] - grid).min(axis=-1)
         clearance = np.minimum(clearance, edge)
@@ -101,13 +105,6 @@ class WalkingGround:
         return one_way + one_way.T
 
 
-def _clearance(scene: Distances, grid: Array, height: float) -> Array:
-    points = np.concatenate([grid.reshape(-1, 2), np.full((grid[..., 0].size, 1), height)], axis=1)
-    return scene.signed_distance(points).reshape(grid.shape[:2])
-
-
-Array = NDArray[np.float64]
-
 CLEARANCE_M = 0.15
 """A camera's least distance from matter, and from the floor."""
 WALK_HEIGHTS_M = (1.5, 0.75)
@@ -145,11 +142,11 @@ def orbit(bounds: Array, frames: int, half_view: float, floor: float) -> Array:
     center = bounds.mean(axis=0)
     distance = framing_distance(bounds, half_view)
     counts = _shared_out(frames, _RING_SHARES)
-    positions = []
+    rings = []
     for ring, (count, elevation) in enumerate(zip(counts, _elevations(center, distance, floor), strict=True)):
         azimuth = 2.0 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / max(count, 1)
-        positions.append(_on_sphere(center, distance, azimuth, np.full(count, elevation)))
-    return _towards(np.concatenate(positions), center)
+        rings.append(_ring_round(center, distance, azimuth, elevation))
+    return np.concatenate(rings)
 
 
 def pass_by(bounds: Array, frames: int, half_view: float, floor: float) -> Array:
@@ -158,7 +155,7 @@ def pass_by(bounds: Array, frames: int, half_view: float, floor: float) -> Array
     distance = framing_distance(bounds, half_view)
     half = math.radians(_SHORT_ARC_DEG) / 2.0
     elevation = _elevations(center, distance, floor)[1]
-    return _towards(_on_sphere(center, distance, np.linspace(-half, half, frames), np.full(frames, elevation)), center)
+    return _ring_round(center, distance, np.linspace(-half, half, frames), elevation)
 
 
 def long_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Array:
@@ -166,12 +163,8 @@ def long_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Arr
 
     From one to the next the camera goes by the shortest way through free space.
     """
-    laps = _shared_out(frames, (0.5, 0.5))
-    poses = []
-    for count, height in zip(laps, WALK_HEIGHTS_M, strict=True):
-        path, watched = _tour(ground, boxes)
-        poses.append(_walked(path, watched, count, height))
-    return np.concatenate(poses)
+    laps, tour = _shared_out(frames, (0.5, 0.5)), _tour(ground, boxes)
+    return np.concatenate([_walked(*tour, count, at) for count, at in zip(laps, WALK_HEIGHTS_M, strict=True)])
 
 
 def short_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Array:
@@ -229,15 +222,11 @@ def _elevations(center: Array, distance: float, floor: float) -> tuple[float, ..
     return (lowest, *np.radians(_ELEVATIONS_DEG).tolist())
 
 
-def _on_sphere(center: Array, distance: float, azimuth: Array, elevation: Array) -> Array:
-    level = np.cos(elevation)
-    unit = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
-    around: Array = center + distance * unit
-    return around
-
-
-def _towards(positions: Array, center: Array) -> Array:
-    return look_at(positions, np.broadcast_to(center, positions.shape))
+def _ring_round(center: Array, distance: float, azimuth: Array, elevation: float) -> Array:
+    """(N, 4, 4): cameras at azimuths (N,) and one elevation that look at ``center`` (3,)."""
+    level, height = np.cos(elevation), np.full(len(azimuth), np.sin(elevation))
+    unit = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), height], axis=1)
+    return look_at(center + distance * unit, np.broadcast_to(center, unit.shape))
 
 
 def _shared_out(count: int, shares: Sequence[float]) -> list[int]:

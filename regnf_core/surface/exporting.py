@@ -39,13 +39,13 @@ def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     return len(surface.faces)
 
 
-def glb_of(mesh: trimesh.Trimesh, origin: Floats) -> bytes:
+def glb_of(mesh: trimesh.Trimesh, origin: Floats, normals: bool = True) -> bytes:
     """The mesh as .glb, ``origin`` (3,) added to its places by its node: vertices have single precision alone."""
     shift = np.eye(4)
     shift[:3, 3] = origin
     scene = trimesh.Scene()
     scene.add_geometry(mesh, transform=shift)
-    export: Callable[..., bytes] = partial(export_glb, include_normals=True)
+    export: Callable[..., bytes] = partial(export_glb, include_normals=normals)
     return export(scene)
 
 

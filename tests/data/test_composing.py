@@ -16,7 +16,6 @@ from regnf_core.importing.mesh_file import load_mesh
 from regnf_data.composing import RenderOptions, render_object, render_room
 from regnf_data.layouts import read_layout
 from regnf_data.posed_images import PosedImages
-from regnf_data.sdfstudio import load_dataset, write_dataset
 from scripts import make_demo_fields as demo
 from tests.data.rooms import CHEST, room, write_chest, write_room
 from tests.devdata import dev_data
@@ -84,16 +83,6 @@ def test_single_views_are_about_one_instance(tmp_path: Path) -> None:
     assert int(chest.box.contains(points_of(images), margin=0.01).sum()) > 100
 
 
-def test_two_pieces_of_one_name_keep_their_places(tmp_path: Path) -> None:
-    path = write_room(tmp_path)
-    path.write_text(path.read_text().replace('"id": "b"', '"id": "a"'))
-    images = render_room(read_layout(path, tmp_path), RenderOptions("short", frames=1, **SMALL), instance="a")
-    assert len(images) == 1
-    first, second = (instance.box.center.numpy() for instance in images.instances)
-    np.testing.assert_allclose(first[:2], [-0.4, -0.35], atol=1e-6)
-    np.testing.assert_allclose(second[:2], [0.45, 0.3], atol=1e-6)
-
-
 def test_noise_is_told_in_meters_and_decided_by_the_seed(tmp_path: Path) -> None:
     write_chest(tmp_path / "chest.ply")
 
@@ -107,15 +96,6 @@ def test_noise_is_told_in_meters_and_decided_by_the_seed(tmp_path: Path) -> None
     read = first > 0.0
     error = 2.0 * (first - exact)[read & (exact > 0.0)]
     assert 0.5 < np.median(np.abs(error)) / (0.6745 * 0.0013) < 2.0  # at about .7 m: 1.3 mm
-
-
-def test_written_and_read_again(tmp_path: Path) -> None:
-    images = render_object(write_chest(tmp_path / "chest.ply"), RenderOptions("short", frames=2, **SMALL))
-    write_dataset(images, tmp_path / "data")
-    read = load_dataset(tmp_path / "data")
-    np.testing.assert_array_equal(read.depths, images.depths)
-    np.testing.assert_array_equal(read.colors, images.colors)
-    np.testing.assert_array_equal(read.T_world_camera, images.T_world_camera)
 
 
 def test_truths_and_boxes_are_those_of_the_benchmarks_fields() -> None:

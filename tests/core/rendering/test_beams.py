@@ -59,16 +59,6 @@ def test_a_margin_is_kept() -> None:
     assert float(field.signed_distance(ends[start.free]).min()) > margin
 
 
-def test_rays_that_begin_in_matter_are_free_only_beyond_it() -> None:
-    field = FIELDS["rod before a slab"]
-    camera = Camera.look_at([-0.25, 0.05, 0.04], [0.4, 0.0, 0.0], SIZE, 60.0)
-    _, rays, start = begun(field, camera)
-    ends = rays.origins + start.length[:, None] * rays.directions
-    inside = field.signed_distance(ends) <= 0
-    assert bool(inside.any())
-    assert not bool((start.free & inside).any())
-
-
 def test_a_pixel_takes_few_evaluations() -> None:
     field = CountingField(sphere(0.35, [0.05, 0.0, 0.02]))
     DistanceGrid.of(field)

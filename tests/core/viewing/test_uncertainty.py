@@ -43,16 +43,7 @@ def test_against_finite_differences() -> None:
     )
 
 
-def test_against_draws_of_poses() -> None:
-    covariance = some_covariance(1e-3)
-    draws = torch.randn(40_000, 7, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    drawn = places(POSE, draws @ torch.linalg.cholesky(covariance).mT)
-    found = uncertainty(covariance, POSE, CENTER)["center_scene"]
-    assert found == pytest.approx(drawn.std(0).tolist(), rel=0.02)
-    torch.testing.assert_close(center_covariance(covariance, POSE, CENTER), torch.cov(drawn.mT), rtol=0.05, atol=1e-7)
-
-
-@pytest.mark.parametrize("far", [0.0, 7.0, 60.0, 1000.0, 1e6])
+@pytest.mark.parametrize("far", [7.0, 1000.0, 1e6])
 def test_it_does_not_depend_on_where_the_scenes_origin_is(far: float) -> None:
     """The very pose and its covariance, told by a scene whose origin is that far away; 1e6: as maps of cities have."""
     shift = torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64) * far
@@ -88,11 +79,6 @@ def test_the_contracts_example_prints_what_it_says(capsys: pytest.CaptureFixture
 POSE_IN_WORKING_FRAMES = Sim3.from_quaternion(1.3, [0.2, 0.1, -0.3, 0.9], [0.05, -0.1, 0.02])
 
 
-@pytest.fixture(scope="module")
-def at_home() -> RegistrationResult:
-    return registered(0.0)
-
-
 def registered(far: float) -> RegistrationResult:
     """The chair in its room, which stands that far from the scene's origin; the search begins near by."""
     move = Sim3.from_translation(torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64) * far)
@@ -102,9 +88,8 @@ def registered(far: float) -> RegistrationResult:
     return register(scene, chair(), chair_box(T), initial_transform=start, clouds=False)
 
 
-@pytest.mark.parametrize("far", [7.0, 60.0])
-def test_a_registration_far_from_the_origin_is_as_certain(at_home: RegistrationResult, far: float) -> None:
-    found = registered(far)
+def test_a_registration_far_from_the_origin_is_as_certain() -> None:
+    at_home, found = registered(0.0), registered(60.0)
     assert found.covariance is not None
     assert at_home.covariance is not None
     here, there = (uncertainty(one.covariance, one.T_object_scene, one.center_object) for one in (at_home, found))

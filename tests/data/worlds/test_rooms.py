@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from functools import cache
+from itertools import islice
 
 import numpy as np
 import pytest
 
-from benchmarks.random_worlds.mesh import ball, block, box, turned
-from benchmarks.random_worlds.models import Catalog, Model
-from benchmarks.random_worlds.placing import GAP_M, Placed, collides, rest, resting_turns, touching
+from benchmarks.random_worlds.mesh import Array, Mesh, ball, block, box, together
+from benchmarks.random_worlds.models import PARTS, Catalog, Model, families, part_of, part_of_world, seeds_of
+from benchmarks.random_worlds.placing import GAP_M, Placed, collides, rest
 from benchmarks.random_worlds.walks import KINDS, Kind, World, make_world
 
 FLOOR = Placed(None, np.eye(4), box((-2.0, -2.0, -0.1), (2.0, 2.0, 0.0)))
@@ -59,23 +59,54 @@ def test_a_thing_does_not_stay_where_its_weight_is_not_carried() -> None:
     assert rest(cube(), UP, np.array([0.13, 0.0, 0.2 + GAP_M]), [FLOOR, first]) is None
 
 
-def test_a_thing_that_is_pushed_stops_where_it_touches() -> None:
-    wall = Placed(None, np.eye(4), box((1.0, -2.0, 0.0), (1.1, 2.0, 2.0)))
-    thing = rest(cube(), UP, np.array([0.0, 0.0, 0.0]), [FLOOR])
-    assert thing is not None
-    pushed = touching(thing, np.array([1.0, 0.0, 0.0]), [FLOOR, wall], 3.0, 0.01)
-    assert pushed.mesh.bounds[1, 0] == pytest.approx(0.99, abs=1e-5)
-    assert touching(thing, np.array([1.0, 0.0, 0.0]), [FLOOR, wall], 0.5, 0.01) is thing
-
-
 def test_one_thing_within_another_collides_with_it() -> None:
     host = Placed(None, np.eye(4), block((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
     assert collides(ball((0.0, 0.0, 0.0), 0.1), [host])
     assert not collides(ball((0.0, 0.0, 0.8), 0.1), [host])
 
 
-def test_a_bottle_lies_on_its_side() -> None:
-    bottle = Model("bottle", turned([(0.0, 0.0), (0.04, 0.0), (0.04, 0.3), (0.0, 0.3)]))
-    turn = resting_turns(bottle, np.random.default_rng(1), lying=True)
-    height = np.ptp(bottle.mesh.moved(turn).vertices[:, 2])
-    assert math.isclose(height, 0.08, rel_tol=0.05) or math.isclose(height, 0.3, rel_tol=0.05)
+# Which names and seeds belong to train, validation and test.
+
+
+def test_a_name_always_belongs_to_the_same_part() -> None:
+    assert [part_of(name) for name in ("teapot", "chair_pine", "mini_fridge")] == ["train", "test", "train"]
+
+
+def test_look_alikes_are_of_one_family() -> None:
+    family = families(["arm_chair", "arm_chair_nopillow", "arm", "armada", "stool"])
+    assert family == {
+        "arm_chair": "arm",
+        "arm_chair_nopillow": "arm",
+        "arm": "arm",
+        "armada": "armada",
+        "stool": "stool",
+    }
+
+
+def test_every_seed_is_of_one_part_and_each_part_has_its_share() -> None:
+    parts = [part_of_world(seed) for seed in range(2000)]
+    for part, least in zip(PARTS, (0.4, 0.2, 0.25), strict=True):
+        assert parts.count(part) >= least * len(parts)
+        assert list(islice(seeds_of(part), 5)) == [seed for seed, own in enumerate(parts) if own == part][:5]
+
+
+# What can be seen of a model from outside.
+
+
+def seen(mesh: Mesh) -> Array:
+    return Model("thing", mesh).surface
+
+
+def test_what_lies_within_another_part_is_not_seen() -> None:
+    outer, inner = box([-1.0] * 3, [1.0] * 3), box([-0.5] * 3, [0.5] * 3)
+    found = seen(together(outer, inner))
+    assert len(found) > 1_000
+    assert (np.abs(found).max(axis=1) > 0.999).all()
+
+
+def test_a_cup_is_seen_within() -> None:
+    walls = [box([-1.0, -1.0, 0.0], [1.0, -0.9, 2.0]), box([-1.0, 0.9, 0.0], [1.0, 1.0, 2.0])]
+    walls += [box([-1.0, -0.9, 0.0], [-0.9, 0.9, 2.0]), box([0.9, -0.9, 0.0], [1.0, 0.9, 2.0])]
+    found = seen(together(*walls, box([-0.9, -0.9, 0.0], [0.9, 0.9, 0.1])))
+    within = (np.abs(found[:, :2]) < 0.95).all(axis=1) & (found[:, 2] > 0.05) & (found[:, 2] < 1.99)
+    assert within.mean() > 0.3
