@@ -16,13 +16,6 @@ from typing import TypeVar
 import httpx
 
 from regnf_state.settings import variables
-from regnf_state.settings import variables
-from regnf_state.settings import variables
-from regnf_state.settings import variables
-from regnf_state.settings import variables
-from regnf_state.settings import variables
-from regnf_state.settings import variables
-from regnf_state.settings import variables
 from tests.listing import files_below
 from tests.redis_server import private_redis
 
