@@ -22,12 +22,6 @@ class Reason:
 
 REASONS: dict[str, Reason] = {
     # the request as such
-    "MALFORMED_REQUEST": Reason(400, "Malformed request", "The request's head or the framing of its body is no HTTP."),
-    "REQUEST_STALLED": Reason(408, "Request stalled", "The head or the body did not arrive in time. Nothing was kept."),
-    "HEADERS_TOO_LARGE": Reason(431, "Headers too large", "The request's head has too many lines or too many bytes."),
-    "TOO_MANY_CONNECTIONS": Reason(
-        503, "Too many connections", "The service, or your address, has the maximum number of connections. Close some."
-    ),
     "MALFORMED_JSON": Reason(
         400, "Malformed JSON", "The body is not one JSON value, names a member twice, or nests too deeply."
     ),
@@ -55,11 +49,6 @@ REASONS: dict[str, Reason] = {
     "METHOD_NOT_ALLOWED": Reason(405, "Method not allowed", "The header `Allow` lists what this address answers to."),
     "RATE_LIMITED": Reason(
         429, "Too many calls", "You send requests faster than the service allows. See `Retry-After`."
-    ),
-    "TOO_MANY_WRITES": Reason(
-        429,
-        "Too many writes",
-        "You post, change, cancel or delete faster than the service allows. Nothing was done. See `Retry-After`.",
     ),
     "TOO_MANY_REQUESTS_AT_ONCE": Reason(
         429, "Too many requests at once", "Wait until some of your requests have been answered, then repeat."

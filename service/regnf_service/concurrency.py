@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 from anyio import CapacityLimiter, to_thread
 from anyio.lowlevel import RunVar
 
-from regnf_service.problem import CLOSE, RETRY_LATER, Problem
+from regnf_service.problem import RETRY_LATER, Problem
 
 _LOOK_EVERY_S = 0.02
 _Given = ParamSpec("_Given")
@@ -139,25 +139,25 @@ class Slots:
         self._reason = reason
         self._taken: Counter[str] = Counter()
 
-    def take(self, caller: str) -> None:
-        """Take one; give it back with ``free``. Raises Problem."""
-        if self._taken[caller] >= self._most:
-            raise Problem(self._reason, headers=RETRY_LATER | CLOSE)
-        self._taken[caller] += 1
+    def take(self, caller: str, count: int = 1) -> None:
+        """Take so many; give them back with ``free``. Raises Problem."""
+        if self._taken[caller] + count > self._most:
+            raise Problem(self._reason, headers=RETRY_LATER)
+        self._taken[caller] += count
 
-    def free(self, caller: str) -> None:
-        self._taken[caller] -= 1
+    def free(self, caller: str, count: int = 1) -> None:
+        self._taken[caller] -= count
         if not self._taken[caller]:
             del self._taken[caller]
 
     @contextmanager
-    def held(self, caller: str) -> Iterator[None]:
-        """One for as long as the context lasts. Raises Problem."""
-        self.take(caller)
+    def held(self, caller: str, count: int = 1) -> Iterator[None]:
+        """So many for as long as the context lasts. Raises Problem."""
+        self.take(caller, count)
         try:
             yield
         finally:
-            self.free(caller)
+            self.free(caller, count)
 
     async def emptied(self, seconds: float) -> None:
         """Wait until none is taken, at most this long."""
@@ -231,7 +231,7 @@ class Claim:
         if more <= 0:
             return
         if self._room is not None and self._claimed[self._caller] + more > self._room:
-            raise Problem("QUOTA_STORED_BYTES", headers=CLOSE)
+            raise Problem("QUOTA_STORED_BYTES")
         self._claimed[self._caller] += more
         self._held = size
 

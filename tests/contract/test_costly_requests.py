@@ -116,7 +116,6 @@ def test_wrong_tokens_become_429_and_right_ones_stay_right(guarded: World) -> No
     refused = guess("another")
     assert_refused(refused, 429, "TOO_MANY_WRONG_TOKENS")
     assert 1 <= int(refused.headers["retry-after"]) <= 5
-    assert refused.headers["connection"] == "close"
     assert guarded.client.get("/jobs", headers=ALICE).status_code == 200
     # no token at all is no guess
     assert_refused(guarded.client.get("/jobs"), 401, "UNAUTHENTICATED")

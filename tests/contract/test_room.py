@@ -28,7 +28,7 @@ def redis() -> Iterator[Redis]:
 def served(folder: Path, redis: Redis, **settings: Any) -> World:
     """No rate of writes protects Redis here: its own bounds have to."""
     callers = frozenset({"greedy:greedy-token", "honest:honest-token"})
-    return make_world(folder, redis, api_tokens=callers, write_limit_per_s=0, **settings)
+    return make_world(folder, redis, api_tokens=callers, **settings)
 
 
 def ready(world: World, caller: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
 from regnf_service.library import check_budget
-from regnf_service.problem import CLOSE, RETRY_LATER, Problem
+from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.records import CAMERAS, ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
@@ -84,11 +84,11 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
     known = held_field(services, caller, sha256)
     if known is not None:
         return room_for_bytes(services, caller, known)
-    check_workers(services, caller, CLOSE)
+    check_workers(services, caller)
     most = services.quota.fields
     while most is not None and services.records.stored(caller)[0] >= most:
         if not services.originals.free(caller):
-            raise Problem("QUOTA_FIELDS", headers=CLOSE)
+            raise Problem("QUOTA_FIELDS")
     return room_for_bytes(services, caller)
 
 
@@ -125,12 +125,12 @@ def _known(services: Services, reference: str) -> FieldRecord | None:
         return None
 
 
-def check_workers(services: Services, caller: str, headers: Mapping[str, str] | None = None) -> None:
+def check_workers(services: Services, caller: str) -> None:
     """Refuse an import that the workers have no time for. Raises Problem QUOTA_IMPORTS, QUOTA_WORKER_SECONDS."""
-    check_budget(services, caller, headers)
+    check_budget(services, caller)
     most = services.quota.imports
     if most is not None and services.records.importing(caller) >= most:
-        raise Problem("QUOTA_IMPORTS", headers={**(headers or {}), **RETRY_LATER})
+        raise Problem("QUOTA_IMPORTS", headers=RETRY_LATER)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_service.concurrency import Claim, in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, keep_held, store_upload
 from regnf_service.fields.uploads import Received, Upload, closing, open_upload
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.pieces import MOST_PIECES
 
@@ -46,9 +46,9 @@ async def check_piece(services: Services, caller: str, sha256: str, piece: Piece
     if piece.first != found.offset:
         raise _at("UPLOAD_OFFSET_MISMATCH", found.offset)
     if found.total not in (0, piece.total):
-        raise Problem("INVALID_HEADER", f"The earlier pieces are of a file of {found.total} bytes.", headers=CLOSE)
+        raise Problem("INVALID_HEADER", f"The earlier pieces are of a file of {found.total} bytes.")
     if found.pieces >= MOST_PIECES:
-        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.", headers=CLOSE)
+        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.")
 
 
 @asynccontextmanager
@@ -64,7 +64,7 @@ async def keep_piece(
 ) -> None:
     """Store a piece that has arrived whole. Raises Problem UPLOAD_INCOMPLETE."""
     if received.bytes != piece.length or piece.first is None:
-        raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.", headers=CLOSE)
+        raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.")
     await in_thread(services.pieces.make_room, caller, sha256, piece.first + received.bytes)
     await upload.commit(services.pieces.key(caller, sha256, piece.first, piece.total))
 
@@ -121,4 +121,4 @@ async def held(services: Services, caller: str, sha256: str) -> StoredUpload | N
 
 def _at(reason: str, offset: int) -> Problem:
     extra: dict[str, Any] = {"offset": offset}
-    return Problem(reason, extra=extra, headers={"Upload-Offset": str(offset), **CLOSE})
+    return Problem(reason, extra=extra, headers={"Upload-Offset": str(offset)})

@@ -16,7 +16,7 @@ import anyio
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_service.concurrency import UPLOADS, Claim
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter
 
@@ -61,7 +61,7 @@ class Upload:
         Raises Problem UPLOAD_TOO_LARGE, QUOTA_STORED_BYTES, FIELD_NOT_RECOGNIZED as soon as the bytes show it.
         """
         if self._bytes + len(self._pending) + len(data) > self._limit:
-            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.", headers=CLOSE)
+            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.")
         self._claim.arrive(len(data))
         self._pending += data
         if not self._recognized and len(self._pending) >= HEAD_BYTES:
@@ -94,7 +94,7 @@ class Upload:
         self.format = sniff_format(head)
         if self.format is None:
             _, sentence = explain_refusal(head)
-            raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.", headers=CLOSE)
+            raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.")
         self._recognized = True
 
     async def _flush(self) -> None:

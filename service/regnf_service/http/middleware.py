@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import heapq
 import ipaddress
 import logging
 import math
 import re
 import time
 import uuid
-from collections import OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from itertools import count
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from regnf_service.concurrency import Slots, whose
-from regnf_service.http.connections import site_of
 from regnf_service.http.problems import OPEN_PATHS, problem_response, secure
 from regnf_service.http.query import is_home_page
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
@@ -80,6 +77,20 @@ class WrongTokens:
         """Count a wrong token of this request: 0, or the seconds that its sender should wait."""
         self.count += 1
         return math.ceil(self._sites.take(site_of((scope.get("client") or ("",))[0])))
+
+
+_IPV6_SITE = 64
+
+
+def site_of(host: str) -> str:
+    """What counts as one address: IPv6 gives each network of 64 bits to somebody."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if address.version == 4 or address.ipv4_mapped is not None:
+        return str(getattr(address, "ipv4_mapped", None) or address)
+    return str(ipaddress.ip_network((address, _IPV6_SITE), strict=False))
 
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
@@ -194,18 +205,16 @@ class TokenGate:
 
     def _refusal(self, scope: Scope) -> Problem:
         if self._needs_token and "authorization" in Headers(scope=scope) and (wait := self._wrong.wait_s(scope)):
-            return Problem("TOO_MANY_WRONG_TOKENS", headers={"Retry-After": str(wait)} | CLOSE)
+            return Problem("TOO_MANY_WRONG_TOKENS", headers={"Retry-After": str(wait)})
         return Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)
 
 
 # In which order requests begin when more come in than can be answered at once, and how many of a caller go on.
 #
-# A few begin in each turn of the event loop. Callers take turns. Of one caller the connection goes first that was
-# answered longest ago: who asks now and then is not behind connections that ask without a pause, or are made anew.
+# A few begin in each turn of the event loop, and callers take turns.
 
 AT_ONCE = 4
 """In one turn of the event loop: a turn in which thousands of slow clients are read takes milliseconds."""
-_Waiting = list[tuple[float, int, asyncio.Future[None]]]
 
 
 def fair_key(scope: Scope, caller: str) -> str:
@@ -220,26 +229,25 @@ class Turns:
     """For one event loop."""
 
     def __init__(self) -> None:
-        self._waiting: OrderedDict[str, _Waiting] = OrderedDict()
-        self._numbers = count()
+        self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
         self._is_taken = False
 
-    async def come(self, who: str, quiet_since: float) -> None:
-        """Return when it is the turn of a connection of ``who`` that has been quiet since that time."""
+    async def come(self, who: str) -> None:
+        """Return when it is the turn of ``who``."""
         loop = asyncio.get_running_loop()
         if not self._is_taken:
             self._is_taken = True
             loop.call_soon(self._next)
             return
         turn = loop.create_future()
-        heapq.heappush(self._waiting.setdefault(who, []), (quiet_since, next(self._numbers), turn))
+        self._waiting.setdefault(who, deque()).append(turn)
         await turn
 
     def _next(self) -> None:
         begun = 0
         while self._waiting and begun < AT_ONCE:
             who, waiting = self._waiting.popitem(last=False)
-            _, _, turn = heapq.heappop(waiting)
+            turn = waiting.popleft()
             if waiting:
                 self._waiting[who] = waiting
             if not turn.done():
@@ -264,48 +272,84 @@ class TurnGate:
             state = scope.setdefault("state", {})
             owner = caller_of(self._callers, Headers(scope=scope).get("authorization", ""))
             state["owner"] = owner
-            connection = state.get("connection")  # the server's own; another server tells nothing
-            quiet_since = asyncio.get_running_loop().time() if connection is None else connection.quiet_since
             who = fair_key(scope, owner or ANONYMOUS)
             whose.set(who)
-            await self._turns.come(who, quiet_since)
+            await self._turns.come(who)
         await self._app(scope, receive, send)
 
 
+_BLOCK_BYTES = 64 * 1024
+"""Of an answer, that is handed to the connection at once."""
+_MOST_UNREAD = 16 * 1024 * 1024
+"""Bytes of answers of one caller that wait to be read, blocks aside that the connections have already."""
+
+
 class RequestGate:
-    """Refuses the requests of a caller that has ``slots`` of them in progress, before any of them waits for a thread.
+    """Refuses the requests of a caller that has ``slots`` of them in progress, before any of them waits for a thread,
+    and the answers to a caller that leaves very many unread. What is answered is sent in blocks: the server takes the
+    next one when its client has read enough, so a connection holds no more than a block or two.
 
-    Each uses a connection that cannot be closed for others.
-
-    Where no token is asked for, an address counts as a caller. What needs no token elsewhere is not counted.
+    Where no token is asked for, an address counts as a caller. The slots are not for what needs no token elsewhere.
     """
 
     def __init__(self, app: ASGIApp, slots: Slots) -> None:
         self._app = app
         self._slots = slots
+        self._unread: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or is_open(scope):
+        if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         who = fair_key(scope, scope["state"]["caller"])
-        try:
-            self._slots.take(who)
-        except Problem as problem:
-            await problem_response(problem, scope)(scope, receive, send)
-            return
-        held = [who]
+        held: list[str] = []
+        if not is_open(scope):
+            try:
+                self._slots.take(who)
+            except Problem as problem:
+                await problem_response(problem, scope)(scope, receive, send)
+                return
+            held.append(who)
+        refused = False
 
         def free() -> None:
             while held:
                 self._slots.free(held.pop())
 
-        async def send_last(message: Message) -> None:
+        async def send_in_blocks(message: Message) -> None:
+            nonlocal refused
+            if message["type"] == "http.response.start" and self._unread[who] > _MOST_UNREAD:
+                refused = True
+                problem = Problem("TOO_MANY_REQUESTS_AT_ONCE", headers=RETRY_LATER)
+                await problem_response(problem, scope)(scope, receive, send)
+            if refused:
+                return
             if message["type"] == "http.response.body" and not message.get("more_body", False):
                 free()  # whether its client reads the answer is not the caller's next request's concern
-            await send(message)
+            if message.get("body"):
+                await self._send_body(who, message, send)
+            else:
+                await send(message)
 
         try:
-            await self._app(scope, receive, send_last)
+            await self._app(scope, receive, send_in_blocks)
         finally:
             free()
+
+    async def _send_body(self, who: str, message: Message, send: Send) -> None:
+        body: bytes = message["body"]
+        left = len(body)
+        self._unread[who] += left
+        try:
+            for begin in range(0, len(body), _BLOCK_BYTES):
+                block = body[begin : begin + _BLOCK_BYTES]
+                more = message.get("more_body", False) or len(block) < left
+                await send({"type": message["type"], "body": block, "more_body": more})
+                self._unread[who] -= len(block)
+                left -= len(block)
+                if left:
+                    await asyncio.sleep(0)  # so that a connection that is lost is noticed before the next block
+        finally:
+            self._unread[who] -= left
+            if not self._unread[who]:
+                del self._unread[who]

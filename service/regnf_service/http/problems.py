@@ -127,6 +127,8 @@ def problem_response(problem: Problem, scope: Mapping[str, Any]) -> JSONResponse
     headers = SECURITY_HEADERS | problem.headers  # an internal error is answered outside of the middleware
     if request_id is not None:
         headers["X-Request-ID"] = request_id
+    if any(name == b"expect" for name, _ in scope.get("headers", ())):
+        headers["Connection"] = "close"  # nobody knows whether the body still comes
     instance = json_instance(scope.get("path", ""))
     return JSONResponse(
         problem.document(instance, request_id), status_code=problem.status, headers=headers, media_type=MEDIA_TYPE

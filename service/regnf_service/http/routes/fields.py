@@ -40,7 +40,7 @@ from regnf_service.http.routes.documentation import (
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
 from regnf_service.http.schemas.reading import reference
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.pieces import view_key
@@ -241,7 +241,6 @@ def list_fields(
             "INVALID_HEADER",
             "MALFORMED_JSON",
             "UPLOAD_INCOMPLETE",
-            "REQUEST_STALLED",
             "TOO_MANY_UPLOADS",
             "REQUEST_TOO_LARGE",
             "UNSUPPORTED_MEDIA_TYPE",
@@ -267,7 +266,7 @@ async def patch_field(
     The body may also be sent as `application/merge-patch+json`.
     """
     if body.media_type(request) not in _PATCHES:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.")
     change = await read_json(request, services, caller, FieldChange)
     record, imported = await in_thread(_changed, services, caller, sha256, change)
     headers = {"ETag": field_etag(record)} | ({"Retry-After": "1"} if imported else {})

@@ -32,7 +32,7 @@ from regnf_service.http.schemas.scenes import MOST_CAMERAS, RenderBody
 from regnf_service.http.strict_json import MOST_VALUES_WITH_CAMERAS
 from regnf_service.jobs.edits import plain_edits
 from regnf_service.jobs.submit import check_fields, check_idempotency_key
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.registration_request import RenderingRequest, objects_of
 
@@ -52,7 +52,6 @@ router = APIRouter(tags=["renderings"])
             "INVALID_HEADER",
             "REQUEST_TOO_LARGE",
             "UNSUPPORTED_MEDIA_TYPE",
-            "REQUEST_STALLED",
             "TOO_MANY_UPLOADS",
             "UPLOAD_INCOMPLETE",
             "INVALID_REQUEST",
@@ -93,7 +92,7 @@ async def render(
     """A job like a registration: the same request twice is one job. Edits that name a registration must be finished."""
     check_idempotency_key(idempotency_key)
     if body.media_type(request) != JSON:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.")
     said = await read_json(request, services, caller, RenderBody, MOST_VALUES_WITH_CAMERAS)
     asked = await in_thread(_checked, services, caller, said)
     return await answer(services, caller, prefix, asked, Asking(dry_run, prefer, idempotency_key))

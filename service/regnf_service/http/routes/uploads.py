@@ -20,7 +20,6 @@ from regnf_service.fields.uploads import Received, SettingsUpload, Upload, open_
 from regnf_service.http import body
 from regnf_service.http.body import (
     CallerDep,
-    Pace,
     Piece,
     PrefixDep,
     ServicesDep,
@@ -41,7 +40,7 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.schemas.fields import FieldDocument, UploadProgress, field_document
 from regnf_service.http.schemas.reading import read_model, reference
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 
 router = APIRouter(tags=["fields"])
@@ -116,23 +115,22 @@ async def put_field(
     one breaks off. `bytes */total` without a body asks how much has arrived, and finishes what has arrived whole.
     """
     if not is_sha256(sha256):
-        raise Problem("INVALID_DIGEST", headers=CLOSE)
+        raise Problem("INVALID_DIGEST")
     if body.media_type(request).startswith("multipart/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.")
     digest = announced_digest(content_digest)
     span = content_range(content_range_, services.settings.max_upload_bytes)
-    pace = Pace(services.settings)
     if span is not None:
         piece = Piece(caller, sha256, span, digest, upload_complete == "?1")
-        async with services.uploads.held(fair_key(request.scope, caller), pace):
-            found = await receive_piece(request, services, piece, pace)
+        with services.uploads.held(fair_key(request.scope, caller)):
+            found = await receive_piece(request, services, piece)
         return _progress(piece, found) if isinstance(found, int) else _answer(found, prefix)
     declared = body.declared_length(request)
-    async with services.uploads.held(fair_key(request.scope, caller), pace):
+    with services.uploads.held(fair_key(request.scope, caller)):
         room = await in_thread(check_room, services, caller, sha256)
         with services.under_way.claim(caller, room, declared) as claim:
             async with open_upload(services, claim) as upload:
-                received = await _receive_raw(request, services, upload, pace)
+                received = await _receive_raw(request, services, upload)
                 if received.sha256 != sha256 or digest not in (None, received.sha256):
                     raise Problem("DIGEST_MISMATCH")
                 taken = await store_upload(services, caller, upload, received)
@@ -178,31 +176,31 @@ async def post_field(
     An archive of a whole training run needs none of them. `upload` names a file whose pieces came by PUT.
     """
     if body.media_type(request).startswith("text/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.")
     digest = announced_digest(content_digest)
     in_parts = body.media_type(request) == "multipart/form-data"
     declared = body.declared_length(request, besides=2 * DESCRIPTION_BYTES if in_parts else 0)
-    pace = Pace(services.settings)
-    async with services.uploads.held(fair_key(request.scope, caller), pace), AsyncExitStack() as stack:
+    async with AsyncExitStack() as stack:
+        stack.enter_context(services.uploads.held(fair_key(request.scope, caller)))
         room = await in_thread(room_for_bytes, services, caller)
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
         upload = await stack.enter_async_context(open_upload(services, claim))
         if in_parts:
             files = {part: await stack.enter_async_context(open_settings(services, claim)) for part in _BESIDE}
-            received, beside = await _receive_parts(request, services, upload, files, pace, digest)
+            received, beside = await _receive_parts(request, services, upload, files, digest)
             if isinstance(received, str):
                 return _answer(await finish_pieces(services, caller, received, beside), prefix)
         else:
-            received, beside = await _receive_raw(request, services, upload, pace), Beside()
+            received, beside = await _receive_raw(request, services, upload), Beside()
             if digest not in (None, received.sha256):
                 raise Problem("DIGEST_MISMATCH")
         taken = await store_upload(services, caller, upload, received, beside)
     return _answer(taken, prefix)
 
 
-async def _receive_raw(request: Request, services: Services, upload: Upload, pace: Pace) -> Received:
+async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
     body.refuse_encoding(request)
-    async for data in body.chunks(request, services.settings.max_upload_bytes, pace):
+    async for data in body.chunks(request, services.settings.max_upload_bytes):
         await upload.feed(data)
     return await upload.finish()
 
@@ -212,13 +210,12 @@ async def _receive_parts(
     services: Services,
     upload: Upload,
     beside: Mapping[str, SettingsUpload],
-    pace: Pace,
     digest: str | None,
 ) -> tuple[Received | str, Beside]:
     """What came. In place of the file it may be the SHA-256 of one whose pieces came before."""
     body.refuse_encoding(request)
     limit = services.settings.max_upload_bytes + len(beside) * settings_limit(services) + 2 * DESCRIPTION_BYTES
-    data = body.chunks(request, limit, pace)
+    data = body.chunks(request, limit)
     if digest is not None:
         data = _compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES, "upload": _UPLOAD_BYTES}
