@@ -30,7 +30,7 @@ from regnf_service.http.contract import build_contract
 from regnf_service.http.hosts import OriginGate, allowed_hosts, cors_layer, cors_origins
 from regnf_service.http.middleware import RequestContext, RequestGate, TokenGate, TurnGate
 from regnf_service.http.query import refuse_unknown_parameters
-from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter
+from regnf_service.http.rate_limits import RateGate, RateLimiter
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
 from regnf_service.metrics import Measured, Metrics, served
 from regnf_service.services import Services
@@ -157,7 +157,7 @@ def create_app(
     callers = read_callers(settings.api_tokens)
     stores = stores or open_stores(settings, retries=None, storage_wait_s=_STORAGE_WAIT_S)
     if limiter is None and settings.calls_per_s:
-        limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
+        limiter = RateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
     webhooks = webhooks_of(settings, stores.redis)
     services = Services(settings, stores.redis, stores.records, stores.blobs, stores.queue, webhooks)
     metrics = Metrics(services)

@@ -6,8 +6,6 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
 from weakref import WeakValueDictionary
 
 from anyio import CapacityLimiter, to_thread
@@ -19,7 +17,7 @@ from regnf_state.batches import Batches
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.pieces import Pieces
-from regnf_state.records import JobNews, Quota, quota_of
+from regnf_state.records import JobNews, quota_of
 from regnf_state.redis.queue import JobQueue
 from regnf_state.room import Originals, Room
 from regnf_state.settings import Settings
@@ -96,70 +94,30 @@ _ASSEMBLIES = 4
 """Each holds a copy of a whole upload for a moment."""
 
 
-@dataclass(frozen=True)
 class Services:
     """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
 
-    settings: Settings
-    redis: Redis
-    records: JournaledRecordStore
-    blobs: BlobStore
-    queue: JobQueue
-    webhooks: Webhooks
-    stopping: asyncio.Event = field(default_factory=asyncio.Event)
-    waiters: Waiters = field(default_factory=Waiters)
-
-    @cached_property
-    def quota(self) -> Quota:
-        """What each caller may have."""
-        return quota_of(self.settings)
-
-    @cached_property
-    def room(self) -> Room:
-        """Room for new records."""
-        return Room(self.records, self.blobs, self.redis, self.settings)
-
-    @cached_property
-    def originals(self) -> Originals:
-        """The uploads that stay after their import."""
-        return Originals(self.records, self.blobs, self.settings)
-
-    @cached_property
-    def pieces(self) -> Pieces:
-        """Uploads that come in pieces and are not finished."""
-        return Pieces(self.blobs, self.settings)
-
-    @cached_property
-    def batches(self) -> Batches:
-        """Batches of registrations."""
-        return Batches(self.blobs)
-
-    @cached_property
-    def requests(self) -> Slots:
-        """Requests that are in progress."""
-        return Slots(self.settings.max_requests_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
-
-    @cached_property
-    def uploads(self) -> Slots:
-        """Uploads that are under way."""
-        return Slots(self.settings.max_uploads_per_caller, "TOO_MANY_UPLOADS")
-
-    @cached_property
-    def assembling(self) -> Assemblies:
-        """Uploads whose pieces are being put together."""
-        return Assemblies(_ASSEMBLIES)
-
-    @cached_property
-    def under_way(self) -> UnderWay:
-        """The bytes of these uploads."""
-        return UnderWay()
-
-    @cached_property
-    def streams(self) -> Slots:
-        """Event streams that are being read."""
-        return Slots(self.settings.max_streams_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
-
-    @cached_property
-    def job_watch(self) -> JobWatch:
-        """What all event streams look through."""
-        return JobWatch(self.records.news, self.stopping)
+    def __init__(
+        self,
+        settings: Settings,
+        redis: Redis,
+        records: JournaledRecordStore,
+        blobs: BlobStore,
+        queue: JobQueue,
+        webhooks: Webhooks,
+    ) -> None:
+        self.settings, self.redis, self.records = settings, redis, records
+        self.blobs, self.queue, self.webhooks = blobs, queue, webhooks
+        self.stopping = asyncio.Event()
+        self.waiters = Waiters()
+        self.quota = quota_of(settings)
+        self.room = Room(records, blobs, redis, settings)
+        self.originals = Originals(records, blobs, settings)
+        self.pieces = Pieces(blobs, settings)
+        self.batches = Batches(blobs)
+        self.requests = Slots(settings.max_requests_per_caller, "requests")
+        self.uploads = Slots(settings.max_uploads_per_caller, "uploads")
+        self.streams = Slots(settings.max_streams_per_caller, "event streams")
+        self.assembling = Assemblies(_ASSEMBLIES)
+        self.under_way = UnderWay()
+        self.job_watch = JobWatch(records.news, self.stopping)

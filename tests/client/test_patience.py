@@ -19,7 +19,7 @@ def refusal(status: int = 429, reason: str = "RATE_LIMITED", after: str | None =
     return httpx.Response(status, json={"reason": reason, "detail": "not now"}, headers=headers)
 
 
-@pytest.mark.parametrize("reason", ["RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE", "TOO_MANY_UPLOADS"])
+@pytest.mark.parametrize("reason", ["RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE"])
 def test_what_is_too_fast_is_asked_again_when_the_service_says(reason: str, slept: list[float]) -> None:
     answers = [refusal(reason=reason)] * 3 + [httpx.Response(200, json=JOB)]
     assert pretended(lambda _: answers.pop(0)).job("j").status == "running"

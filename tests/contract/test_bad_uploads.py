@@ -24,7 +24,7 @@ LEGACY_TAR = b"sys_info".ljust(257, b"\0") + b"ustar\0" + b"\0" * 600
 @pytest.mark.parametrize(
     ("method", "path", "content", "headers", "status", "reason"),
     [
-        pytest.param("PUT", f"/fields/{sha256(b'')}", b"", {}, 400, "UPLOAD_EMPTY", id="empty"),
+        pytest.param("PUT", f"/fields/{sha256(b'')}", b"", {}, 400, "UPLOAD_INCOMPLETE", id="empty"),
         pytest.param("PUT", f"/fields/{sha256(b'x')}", b"x", {}, 415, "FIELD_NOT_RECOGNIZED", id="one byte"),
         pytest.param(
             "PUT", f"/fields/{sha256(TOO_LARGE)}", TOO_LARGE, {}, 413, "UPLOAD_TOO_LARGE", id="too large by its header"

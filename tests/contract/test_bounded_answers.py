@@ -219,7 +219,7 @@ def test_the_bytes_that_nobody_reads_have_a_bound_for_each_caller() -> None:
     async def answer(scope: Any, receive: Any, send: Any) -> None:
         await PlainTextResponse("x" * scope["size"])(scope, receive, send)
 
-    gate = RequestGate(answer, Slots(100, "TOO_MANY_REQUESTS_AT_ONCE"))
+    gate = RequestGate(answer, Slots(100, "requests"))
 
     async def run() -> None:
         assert await unread(gate, "alice", [9 * MIB] * 3) == [200, 200, 429]

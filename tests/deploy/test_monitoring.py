@@ -53,7 +53,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         metrics.requests.labels("GET", "/", "200").inc()
         metrics.seconds.labels("/").observe(1)
         metrics.received.labels("/").inc()
-        metrics.quota_refusals.labels("QUOTA_IMPORTS").inc()
+        metrics.quota_refusals.labels("QUOTA_ACTIVE_JOBS").inc()
         text = generate_latest(metrics.registry).decode()
     found: dict[str, set[str]] = {}
     for line in text.splitlines():

@@ -73,9 +73,6 @@ def function_of(description: UploadDescription) -> dict[str, Any]:
     return {name: value for name, value in description.non_default().items() if name != "label"}
 
 
-_OF_ROOM = frozenset({"QUOTA_FIELDS", "QUOTA_STORED_BYTES"})
-
-
 def check_room(services: Services, caller: str, sha256: str) -> int | None:
     """Refuse an upload before it comes if the caller has no room for one more field. Raises Problem.
 
@@ -88,7 +85,7 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
     most = services.quota.fields
     while most is not None and services.records.stored(caller)[0] >= most:
         if not services.originals.free(caller):
-            raise Problem("QUOTA_FIELDS")
+            raise Problem("QUOTA_STORED", "You have the maximum number of fields. Delete some.")
     return room_for_bytes(services, caller)
 
 
@@ -126,11 +123,12 @@ def _known(services: Services, reference: str) -> FieldRecord | None:
 
 
 def check_workers(services: Services, caller: str) -> None:
-    """Refuse an import that the workers have no time for. Raises Problem QUOTA_IMPORTS, QUOTA_WORKER_SECONDS."""
+    """Refuse an import that the workers have no time for. Raises Problem QUOTA_ACTIVE_JOBS, QUOTA_WORKER_SECONDS."""
     check_budget(services, caller)
     most = services.quota.imports
     if most is not None and services.records.importing(caller) >= most:
-        raise Problem("QUOTA_IMPORTS", headers=RETRY_LATER)
+        detail = f"{most} of your imports wait or run. Wait for one to end."
+        raise Problem("QUOTA_ACTIVE_JOBS", detail, headers=RETRY_LATER)
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ async def store_upload(
 ) -> StoredUpload:
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
-    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_IMPORTS,
+    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_ACTIVE_JOBS,
     QUOTA_WORKER_SECONDS, and QuotaError.
     """
     beside = beside or Beside()
@@ -222,7 +220,7 @@ def _create(services: Services, field: FieldRecord) -> tuple[FieldRecord, bool]:
         try:
             return services.records.create_field(field, quota)
         except QuotaError as error:
-            if error.reason in _OF_ROOM and services.originals.free(field.owner):
+            if error.reason == "QUOTA_STORED" and services.originals.free(field.owner):
                 continue
             delete_upload(services.blobs, field)
             if field.state != "rejected":

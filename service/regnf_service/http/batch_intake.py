@@ -216,12 +216,12 @@ class Intake:
         self._identity = hashlib.sha256(f"batch {ENGINE_REVISION} {caller}\n".encode())
 
     def read(self, texts: Sequence[TextLine]) -> list[Read]:
-        """These lines as requests; with an error those that are none. Raises Problem TOO_MANY_PAIRS."""
+        """These lines as requests; with an error those that are none. Raises Problem REQUEST_TOO_LARGE."""
         most = self._services.settings.max_batch_pairs
         self._count += len(texts)
         if self._count > most:
             extra = {"fitting_lines": most}
-            raise Problem("TOO_MANY_PAIRS", f"A batch has at most {most} lines.", extra=extra)
+            raise Problem("REQUEST_TOO_LARGE", f"A batch has at most {most} lines.", extra=extra)
         return [self._read(text) for text in texts]
 
     def take(self, read: Sequence[Read]) -> None:

@@ -6,7 +6,6 @@ import email.message
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Annotated, Protocol, TypeVar
 
 from fastapi import Depends, Query
@@ -15,8 +14,6 @@ from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
 
 from regnf_service.concurrency import LOOKS, PARSING, in_thread, pause
-from regnf_service.fields.ingest import StoredUpload, check_room
-from regnf_service.fields.piecewise import PieceRange, arrived, check_piece, finish_pieces, held, keep_piece, open_piece
 from regnf_service.http.middleware import fair_key
 from regnf_service.http.schemas.reading import read_model
 from regnf_service.http.strict_json import MOST_VALUES
@@ -114,7 +111,7 @@ async def read_json(
     """The body of a request as ``model``.
 
     A large one counts among its caller's uploads until it is read: what a caller has in memory is bounded by their
-    number. Raises Problem as ``read_model`` and ``body.chunks``, REQUEST_TOO_LARGE, TOO_MANY_UPLOADS.
+    number. Raises Problem as ``read_model`` and ``body.chunks``, REQUEST_TOO_LARGE, TOO_MANY_REQUESTS_AT_ONCE.
     """
     refuse_encoding(request)
     text = bytearray()
@@ -131,58 +128,6 @@ async def read_text(model: type[_Model], text: bytes, most_values: int = MOST_VA
     if len(text) <= _SMALL_BYTES:
         return read_model(model, text, _REASON, most_values, what)
     return await PARSING.run(read_model, model, text, _REASON, most_values, what)
-
-
-# One request of an upload in pieces: the piece is read and kept, and the field made once all are here.
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One piece of a caller's upload. digest: of the piece, where it was announced · complete: whether the last piece
-    makes the field."""
-
-    caller: str
-    sha256: str
-    range: PieceRange
-    digest: str | None
-    complete: bool
-
-
-async def receive_piece(request: Request, services: Services, piece: Piece) -> StoredUpload | int:
-    """The field, once all pieces are here; before that how many bytes have arrived.
-
-    Raises Problem: what ``check_room``, ``check_piece``, ``keep_piece`` and ``finish_pieces`` raise, DIGEST_MISMATCH.
-    """
-    room = await in_thread(check_room, services, piece.caller, piece.sha256)
-    known = await held(services, piece.caller, piece.sha256)
-    if known is None:
-        await check_piece(services, piece.caller, piece.sha256, piece.range)
-    await _receive(request, services, piece, room, keep=known is None)
-    if known is not None:
-        return known
-    offset = await arrived(services, piece.caller, piece.sha256)
-    if piece.complete and offset == piece.range.total:
-        return await finish_pieces(services, piece.caller, piece.sha256)
-    return offset
-
-
-async def _receive(request: Request, services: Services, piece: Piece, room: int | None, keep: bool) -> None:
-    """Read the body to its end, and keep it if it is a piece that is wanted."""
-    refuse_encoding(request)
-    data = chunks(request, piece.range.length, too_large="INVALID_HEADER")  # more than Content-Range says
-    if piece.range.first is None:
-        async for _ in data:
-            pass
-        return
-    with services.under_way.claim(piece.caller, room, piece.range.length) as claim:
-        async with open_piece(services, claim, piece.range) as upload:
-            async for block in data:
-                await upload.feed(block)
-            received = await upload.finish()
-            if piece.digest not in (None, received.sha256):
-                raise Problem("DIGEST_MISMATCH")
-            if keep:
-                await keep_piece(services, piece.caller, piece.sha256, piece.range, upload, received)
 
 
 # Holding an answer back until there is news, without holding a thread.
@@ -328,7 +273,7 @@ async def read_parts(
     A file part that came appears in the answer too, empty. Looking for boundaries takes long where there is nearly one
     in every line, so it is done in a thread, a piece at a time.
 
-    Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, REQUEST_TOO_LARGE, and what the sinks raise.
+    Raises Problem: MALFORMED_MULTIPART, REQUEST_TOO_LARGE, and what the sinks raise.
     """
     collector = _Collector(boundary)
     parts: dict[str, _Part] = {}
@@ -351,7 +296,7 @@ async def read_parts(
 
 def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], texts: Mapping[str, int]) -> None:
     if part.name not in files and part.name not in texts:
-        raise Problem("UNKNOWN_PART", f"Known parts: {', '.join([*files, *texts])}.")
+        raise Problem("MALFORMED_MULTIPART", f"Known parts: {', '.join([*files, *texts])}.")
     if part.name in parts:
         raise Problem("MALFORMED_MULTIPART", "Two parts bear the same name.")
     if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):

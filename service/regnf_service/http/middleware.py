@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-import math
 import re
 import time
 import uuid
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -22,76 +20,6 @@ from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
-
-# Buckets of tokens in the memory of one process: how often each of many may do something.
-
-_MOST = 4096
-
-
-class Buckets:
-    """A bucket of ``burst`` for each, which fills by ``per_s``. For one thread.
-
-    No more than a few thousand are kept. Then the one goes that was asked longest ago: its next is full.
-    """
-
-    def __init__(self, per_s: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._per_s = per_s
-        self._burst = burst
-        self._clock = clock
-        self._held: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        """What is left in the bucket, and when that was so; the one that was asked longest ago comes first."""
-
-    def __len__(self) -> int:
-        return len(self._held)
-
-    def take(self, who: str) -> float:
-        """Take one out: 0.0, or nothing was taken and these seconds pass until there is one."""
-        now = self._clock()
-        left, at = self._held.pop(who, (self._burst, now))
-        left = min(self._burst, left + (now - at) * self._per_s)
-        wait_s = 0.0 if left >= 1 else (1 - left) / self._per_s
-        self._held[who] = (left if wait_s else left - 1, now)
-        if len(self._held) > _MOST:
-            self._held.popitem(last=False)
-        return wait_s
-
-
-# How many wrong tokens an address may send: a bucket for each in memory, and no more buckets than a few thousand.
-#
-# A right token is always taken, whatever else its address has sent: behind a proxy all callers share one, and a
-# guesser must not lock them out. Hence this does not keep guesses from being looked at. It answers them with 429 and
-# ends their connections. That tokens cannot be guessed is due to their length.
-
-_BURST = 20.0
-_PER_S = 0.2
-
-
-class WrongTokens:
-    """For one process."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._sites = Buckets(_PER_S, _BURST, clock)
-        self.count = 0
-
-    def wait_s(self, scope: Scope) -> int:
-        """Count a wrong token of this request: 0, or the seconds that its sender should wait."""
-        self.count += 1
-        return math.ceil(self._sites.take(site_of((scope.get("client") or ("",))[0])))
-
-
-_IPV6_SITE = 64
-
-
-def site_of(host: str) -> str:
-    """What counts as one address: IPv6 gives each network of 64 bits to somebody."""
-    try:
-        address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return host
-    if address.version == 4 or address.ipv4_mapped is not None:
-        return str(getattr(address, "ipv4_mapped", None) or address)
-    return str(ipaddress.ip_network((address, _IPV6_SITE), strict=False))
-
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -183,7 +111,6 @@ class TokenGate:
         self._app = app
         self._needs_token = needs_token
         self._allow_unauthenticated = allow_unauthenticated
-        self._wrong = WrongTokens()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -196,17 +123,12 @@ class TokenGate:
         else:
             known = self._allow_unauthenticated or not _came_from_outside(scope)
         scope["state"]["caller"] = caller
-        problem = None if known or is_open(scope) else self._refusal(scope)
         with log_context(caller=caller):
-            if problem is not None:
-                await problem_response(problem, scope)(scope, receive, send)
-            else:
+            if known or is_open(scope):
                 await self._app(scope, receive, send)
-
-    def _refusal(self, scope: Scope) -> Problem:
-        if self._needs_token and "authorization" in Headers(scope=scope) and (wait := self._wrong.wait_s(scope)):
-            return Problem("TOO_MANY_WRONG_TOKENS", headers={"Retry-After": str(wait)})
-        return Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)
+            else:
+                problem = Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)
+                await problem_response(problem, scope)(scope, receive, send)
 
 
 # In which order requests begin when more come in than can be answered at once, and how many of a caller go on.
@@ -222,7 +144,7 @@ def fair_key(scope: Scope, caller: str) -> str:
 
     A caller's name has no space in it, so that no caller is taken for an address.
     """
-    return caller if caller != ANONYMOUS else f"{ANONYMOUS} {site_of((scope.get('client') or ('',))[0])}"
+    return caller if caller != ANONYMOUS else f"{ANONYMOUS} {(scope.get('client') or ('',))[0]}"
 
 
 class Turns:
@@ -320,7 +242,8 @@ class RequestGate:
             nonlocal refused
             if message["type"] == "http.response.start" and self._unread[who] > _MOST_UNREAD:
                 refused = True
-                problem = Problem("TOO_MANY_REQUESTS_AT_ONCE", headers=RETRY_LATER)
+                detail = "Too much of what was answered waits to be read. Read it, then repeat."
+                problem = Problem("TOO_MANY_REQUESTS_AT_ONCE", detail, headers=RETRY_LATER)
                 await problem_response(problem, scope)(scope, receive, send)
             if refused:
                 return

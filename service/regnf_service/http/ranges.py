@@ -199,7 +199,7 @@ _RANGE = re.compile(r"bytes (?:([0-9]{1,15})-([0-9]{1,15})|\*)/([0-9]{1,15})", r
 
 
 def content_range(header: str | None, limit: int) -> PieceRange | None:
-    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_EMPTY."""
+    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_INCOMPLETE."""
     if header is None:
         return None
     match = _RANGE.fullmatch(header.strip())
@@ -211,7 +211,7 @@ def content_range(header: str | None, limit: int) -> PieceRange | None:
     if total > limit:
         raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.")
     if total == 0:
-        raise Problem("UPLOAD_EMPTY")
+        raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.")
     if first is None or last is None:
         return PieceRange(None, None, total)
     if not first <= last < total:

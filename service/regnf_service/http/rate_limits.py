@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 from redis import Redis
 from redis.exceptions import RedisError
@@ -31,15 +30,7 @@ return tostring(wait)
 """
 
 
-class RateLimiter(Protocol):
-    """Says whether a caller may call now."""
-
-    def take(self, caller: str) -> float:
-        """Count one call: 0.0 when it may go ahead, otherwise the seconds until one may."""
-        ...
-
-
-class RedisRateLimiter:
+class RateLimiter:
     """A bucket of ``burst`` calls for each caller that fills by ``rate`` calls a second."""
 
     def __init__(self, redis: Redis, rate: float, burst: int) -> None:
@@ -48,6 +39,7 @@ class RedisRateLimiter:
         self._burst = burst
 
     def take(self, caller: str) -> float:
+        """Count one call: 0.0 when it may go ahead, otherwise the seconds until one may."""
         answer: bytes | str = self._take(keys=[f"{PREFIX}rate:{caller}"], args=[self._rate, self._burst])
         return float(text(answer))
 
@@ -67,7 +59,7 @@ class RateGate:
             except RedisError:
                 wait = 0.0  # whatever the call needs of Redis will say that it is away
         if wait > 0:
-            problem = Problem("RATE_LIMITED", headers={"Retry-After": str(math.ceil(wait)), "Connection": "close"})
+            problem = Problem("RATE_LIMITED", headers={"Retry-After": str(math.ceil(wait))})
             await problem_response(problem, scope)(scope, receive, send)
         else:
             await self._app(scope, receive, send)

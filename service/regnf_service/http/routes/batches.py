@@ -52,21 +52,8 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "links": BATCH_LINKS,
         },
         **refusals(
-            "INVALID_QUERY",
-            "INVALID_HEADER",
-            "UNSUPPORTED_MEDIA_TYPE",
-            "MALFORMED_JSON",
-            "REQUEST_TOO_LARGE",
-            "TOO_MANY_PAIRS",
-            "UPLOAD_INCOMPLETE",
-            "TOO_MANY_UPLOADS",
-            "QUOTA_ACTIVE_JOBS",
-            "QUOTA_BATCHES",
-            "QUOTA_STORED_BYTES",
-            "QUOTA_WORKER_SECONDS",
-            "QUEUE_FULL",
-            "RECORDS_FULL",
-            "STORAGE_FULL",
+            "INVALID_QUERY INVALID_HEADER UNSUPPORTED_MEDIA_TYPE MALFORMED_JSON REQUEST_TOO_LARGE UPLOAD_INCOMPLETE "
+            "TOO_MANY_REQUESTS_AT_ONCE QUOTA_ACTIVE_JOBS QUOTA_STORED QUOTA_WORKER_SECONDS QUEUE_FULL STORAGE_FULL"
         ),
     },
     openapi_extra={"requestBody": {"required": True, "content": {MEDIA_TYPE: _BODY}}},

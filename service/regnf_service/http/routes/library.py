@@ -34,15 +34,8 @@ from regnf_state.record_store import LibraryEntry
 router = APIRouter(tags=["library"])
 _PATCHES = (JSON, "application/merge-patch+json")
 _BODY_REFUSALS = (
-    "INVALID_HEADER",
-    "MALFORMED_JSON",
-    "UPLOAD_INCOMPLETE",
-    "TOO_MANY_UPLOADS",
-    "REQUEST_TOO_LARGE",
-    "UNSUPPORTED_MEDIA_TYPE",
-    "INVALID_REQUEST",
-    "CONFLICT",
-    "LIBRARY_NAME_TAKEN",
+    "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
+    "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST CONFLICT LIBRARY_NAME_TAKEN"
 )
 NamePath = Annotated[str, Path(description="Of the entry.", max_length=4 * MAX_NAME)]
 
@@ -84,7 +77,7 @@ def list_library(
     responses={
         200: {"description": "It was one, and says the same.", "model": EntryDocument},
         201: {"headers": {"Location": header("The entry.")}},
-        **refusals(*_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY", "QUOTA_WORKER_SECONDS"),
+        **refusals(_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY", "QUOTA_WORKER_SECONDS"),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(NewEntry)}}}},
 )
@@ -119,7 +112,7 @@ def get_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep, 
     "/library/{name}",
     summary="Change an entry",
     response_model=EntryDocument,
-    responses=refusals(*_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND", "LIBRARY_ENTRY_INVALID"),
+    responses=refusals(_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND", "INVALID_REQUEST"),
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(EntryChange)}}}},
 )
 async def patch_library_entry(

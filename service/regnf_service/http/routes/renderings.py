@@ -47,30 +47,11 @@ router = APIRouter(tags=["renderings"])
     responses={
         **JOB_RESPONSES,
         **refusals(
-            *JOB_REFUSALS,
-            "MALFORMED_JSON",
-            "INVALID_HEADER",
-            "REQUEST_TOO_LARGE",
-            "UNSUPPORTED_MEDIA_TYPE",
-            "TOO_MANY_UPLOADS",
-            "UPLOAD_INCOMPLETE",
-            "INVALID_REQUEST",
-            "INVALID_OPTIONS",
-            "INVALID_TRANSFORM",
-            "INVALID_DETECTION",
-            "DETECTION_OUTSIDE_SCENE",
-            "EDIT_INVALID",
-            "EDIT_POSE_REJECTED",
-            "CAMERA_INVALID",
-            "RENDER_TOO_LARGE",
-            "FIELD_NOT_FOUND",
-            "FIELD_REJECTED",
-            "JOB_NOT_FOUND",
-            "JOB_EXPIRED",
-            "JOB_NOT_READY",
-            "JOB_DISMISSED",
-            "JOB_FAILED",
-            "QUOTA_WORKER_SECONDS",
+            JOB_REFUSALS,
+            "MALFORMED_JSON INVALID_HEADER REQUEST_TOO_LARGE UNSUPPORTED_MEDIA_TYPE TOO_MANY_REQUESTS_AT_ONCE "
+            "UPLOAD_INCOMPLETE INVALID_REQUEST INVALID_OPTIONS INVALID_TRANSFORM INVALID_DETECTION "
+            "DETECTION_OUTSIDE_SCENE EDIT_INVALID CAMERA_INVALID RENDER_TOO_LARGE FIELD_NOT_FOUND FIELD_REJECTED "
+            "JOB_NOT_FOUND JOB_EXPIRED JOB_NOT_READY JOB_DISMISSED JOB_FAILED QUOTA_WORKER_SECONDS",
         ),
     },
     openapi_extra={
