@@ -151,7 +151,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
 
 def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
     """Raises InvalidInputError, as a service refuses such a line."""
-    reasons = {"initial_transform": "INITIAL_TRANSFORM_UNSUPPORTED", "ground_truth": "INVALID_REQUEST"}
+    reasons = {"initial_transform": "PRESET_UNSUITABLE", "ground_truth": "INVALID_REQUEST"}
     for name, reason in reasons.items():
         if request.get(name) is not None:
             hint = f"Leave `{name}` out, or give `object` in place of `candidates`."

@@ -72,7 +72,7 @@ def register(
     if initial_transform and RegistrationOptions.from_dict(request["options"]).preset != "robust":
         raise InvalidInputError(
             "only the preset robust starts from a given transform",
-            reason="INITIAL_TRANSFORM_UNSUPPORTED",
+            reason="PRESET_UNSUITABLE",
             hint="Leave --initial-transform out, or use --preset robust.",
         )
     if initial_transform:
@@ -143,7 +143,7 @@ def search(
     if RegistrationOptions.from_dict(request["options"]).preset != "robust":
         message = f"{options}: only the preset robust searches a library"
         hint = "Leave the preset out of the options."
-        raise InvalidInputError(message, reason="LIBRARY_SEARCH_UNSUPPORTED", hint=hint)
+        raise InvalidInputError(message, reason="PRESET_UNSUITABLE", hint=hint)
     if server is None:
         require("engine")
     place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")

@@ -33,7 +33,7 @@ PIECE_BYTES = 8 << 20
 _MOST_PIECES = 900
 _BYTES = "application/octet-stream"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
+_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", ServiceError.reason})
 
 
 def source_of(

@@ -2,7 +2,7 @@
 
     RegnfError
     ├── InvalidInputError            the caller can mend it
-    │   ├── InvalidOptionsError      INVALID_OPTIONS, INITIAL_TRANSFORM_UNSUPPORTED, LIBRARY_SEARCH_UNSUPPORTED
+    │   ├── InvalidOptionsError      INVALID_OPTIONS, PRESET_UNSUITABLE
     │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
     │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
     │   └── DatasetError             DATASET_...: a folder of posed images, or what one is rendered from, cannot be used

@@ -114,7 +114,7 @@ def test_a_given_start(run: Run, exact: list[object], tmp_path: Path) -> None:
     (tmp_path / "start.json").write_text(json.dumps(np.eye(4).tolist()))
     outcome = run(*exact, "--preset", "paper", "--initial-transform", tmp_path / "start.json")
     assert outcome.code == 2
-    assert outcome.stderr.startswith("INITIAL_TRANSFORM_UNSUPPORTED ")
+    assert outcome.stderr.startswith("PRESET_UNSUITABLE ")
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,7 @@ def test_initial_transforms(world: World, start: Any, pointer: str) -> None:
 
 def test_the_published_method_takes_no_initial_transform(world: World) -> None:
     body = world.valid_request() | {"initial_transform": IDENTITY, "options": {"preset": "paper"}}
-    problem = assert_refused(post(world, body), 422, "INITIAL_TRANSFORM_UNSUPPORTED")
+    problem = assert_refused(post(world, body), 422, "PRESET_UNSUITABLE")
     assert [entry["pointer"] for entry in problem["errors"]] == ["/initial_transform"]
 
 
@@ -196,11 +196,11 @@ def test_a_rejected_candidate_is_refused(world: World) -> None:
 
 def test_the_published_method_searches_no_library(world: World) -> None:
     body = searching(world, options={"preset": "paper"})
-    assert_refused(post(world, body), 422, "LIBRARY_SEARCH_UNSUPPORTED")
+    assert_refused(post(world, body), 422, "PRESET_UNSUITABLE")
 
 
 def test_a_search_starts_from_no_given_transform(world: World) -> None:
-    assert_refused(post(world, searching(world, initial_transform=IDENTITY)), 422, "INITIAL_TRANSFORM_UNSUPPORTED")
+    assert_refused(post(world, searching(world, initial_transform=IDENTITY)), 422, "PRESET_UNSUITABLE")
 
 
 def test_of_an_unusable_preset_and_an_initial_transform_the_preset_is_refused(world: World) -> None:

@@ -63,7 +63,7 @@ def test_an_answer_makes_the_question_and_its_pictures_go(world: World) -> None:
     asked_about(world)
     assert set(world.blobs.blobs) == {ORIGINAL, *PICTURES}
     assert change(world, description=candidates(world)[0]["description"]).status_code == 202
-    assert_refused(world.client.get(f"{PLACE}/candidates/1.png"), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(f"{PLACE}/candidates/1.png"), 404, "FIELD_VIEW_NOT_FOUND")
     imported(world)
     document = world.client.get(PLACE).json()
     assert (document["state"], document["description"], document["error"]) == ("ready", SMOOTH, None)
@@ -85,7 +85,7 @@ def test_pictures_go_with_the_upload(world: World) -> None:
     assert Originals(world.records, world.blobs, world.settings).free("anonymous")
     assert world.blobs.blobs == {}
     assert [one["picture"] for one in candidates(world)] == [None] * 3
-    assert_refused(world.client.get(f"{PLACE}/candidates/1.png"), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(f"{PLACE}/candidates/1.png"), 404, "FIELD_VIEW_NOT_FOUND")
 
 
 def test_pictures_go_with_the_field(world: World) -> None:

@@ -111,13 +111,13 @@ def test_the_same_bytes_with_other_settings_are_another_function(world: World) -
 
 def test_settings_have_their_limit_and_are_not_empty(world: World) -> None:
     assert_refused(send(world, None, ("config.yml", b"x" * 5000)), 413, "UPLOAD_TOO_LARGE")
-    assert_refused(send(world, None, ("config.yml", b"")), 400, "UPLOAD_EMPTY")
+    assert_refused(send(world, None, ("config.yml", b"")), 400, "UPLOAD_INCOMPLETE")
     assert world.blobs.blobs == {}
 
 
 def test_settings_count_towards_the_quota(tmp_path: Path, any_redis: Redis) -> None:
     world = make_world(tmp_path, any_redis, quota_stored_bytes=1000)
-    assert_refused(send(world, None, ("config.yml", b"x" * 500)), 403, "QUOTA_STORED_BYTES")
+    assert_refused(send(world, None, ("config.yml", b"x" * 500)), 403, "QUOTA_STORED")
     assert send(world, None, ("config.yml", b"x" * 300)).status_code == 201
     assert world.records.stored("anonymous") == (1, 900)
 
@@ -272,14 +272,14 @@ def test_kept_bytes_count_and_give_way(tmp_path: Path, any_redis: Redis) -> None
     gone = world.client.get("/" + first.removesuffix("/original")).json()
     assert (gone["state"], gone["kept_until"]) == ("rejected", None)
     assert world.client.put(f"/fields/{sha256(field_bytes('4'))}", content=field_bytes("4")).status_code == 201
-    assert_refused(send(world, data=field_bytes("5")), 403, "QUOTA_STORED_BYTES")
+    assert_refused(send(world, data=field_bytes("5")), 403, "QUOTA_STORED")
 
 
 def test_kept_fields_give_way_too(tmp_path: Path, any_redis: Redis) -> None:
     world = make_world(tmp_path, any_redis, quota_fields=1)
     question(world, "1")
     assert world.client.put(f"/fields/{sha256(field_bytes('2'))}", content=field_bytes("2")).status_code == 201
-    assert_refused(send(world, data=field_bytes("3")), 403, "QUOTA_FIELDS")
+    assert_refused(send(world, data=field_bytes("3")), 403, "QUOTA_STORED")
 
 
 def test_the_same_question_is_asked_at_once_and_its_bytes_are_kept(world: World) -> None:

@@ -194,7 +194,7 @@ def test_a_ready_field_has_a_picture_if_its_import_made_one(world: World) -> Non
     known = world.ready_field("a")
     address = world.client.get(f"/v1/fields/{known}").json()["links"]["preview"]
     assert address == f"/v1/fields/{known}/preview.png"
-    assert_refused(world.client.get(address), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(address), 404, "FIELD_VIEW_NOT_FOUND")
     world.blobs.put(f"fields/{known}/preview.png", b"\x89PNG")
     answer = world.client.get(address)
     assert (answer.status_code, answer.content, answer.headers["content-type"]) == (200, b"\x89PNG", "image/png")
@@ -207,4 +207,4 @@ def test_a_ready_field_has_a_picture_if_its_import_made_one(world: World) -> Non
 def test_a_field_that_is_not_ready_has_no_picture(world: World) -> None:
     world.client.put(f"/fields/{sha256(A)}", content=A)
     assert "preview" not in world.client.get(f"/fields/{sha256(A)}").json()["links"]
-    assert_refused(world.client.get(f"/fields/{sha256(A)}/preview.png"), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(f"/fields/{sha256(A)}/preview.png"), 404, "FIELD_VIEW_NOT_FOUND")

@@ -81,14 +81,6 @@ def test_polls_are_answered_during_an_upload(live: Live) -> None:
     assert answers[0].status_code == 201
 
 
-def test_a_body_shorter_than_declared(live: Live) -> None:
-    data = field_bytes("short")
-    with live.connect() as connection:
-        connection.sendall(head_of("PUT", f"/fields/{sha256(data)}", Content_Length=len(data) + 10) + data)
-        status, text = answer_of(connection)
-    assert (status, b"REQUEST_STALLED" in text) == (408, True)
-
-
 def test_a_body_longer_than_declared_is_cut_where_it_was_declared_to_end(live: Live) -> None:
     data = field_bytes("long")
     with live.connect() as connection:
@@ -100,14 +92,6 @@ def test_a_body_longer_than_declared_is_cut_where_it_was_declared_to_end(live: L
         while b"validating" not in text:
             text += connection.recv(65536)
     assert text.startswith(b"HTTP/1.1 201")
-
-
-def test_a_client_that_stalls_hears_408(live: Live) -> None:
-    data = field_bytes("stalled")
-    with live.connect() as connection:
-        connection.sendall(head_of("POST", "/fields", Content_Length=len(data)) + data[:100])
-        status, text = answer_of(connection)
-    assert (status, b"REQUEST_STALLED" in text) == (408, True)
 
 
 def test_a_client_that_asks_first_is_spared_the_upload(live: Live) -> None:

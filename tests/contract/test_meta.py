@@ -56,7 +56,7 @@ def test_not_ready_when_something_is_missing(world: World, monkeypatch: pytest.M
         answer = world.client.get("/readyz")
     problem = assert_refused(answer, 503, "NOT_READY")
     assert [name for name, there in problem["checks"].items() if not there] == [missing]
-    reasons = {"records": "STORE_UNAVAILABLE", "storage": "STORAGE_UNAVAILABLE", "worker": "NO_WORKER"}
+    reasons = {"records": "STORAGE_UNAVAILABLE", "storage": "STORAGE_UNAVAILABLE", "worker": "NO_WORKER"}
     assert problem["reasons"] == {missing: reasons[missing]}
 
 
@@ -127,5 +127,5 @@ def test_what_takes_requests_needs_no_worker(world: World, monkeypatch: pytest.M
 
     monkeypatch.setattr(world.records, "probe", refuse)
     answer = world.client.get("/readyz", params={"worker": "false"})
-    assert assert_refused(answer, 503, "NOT_READY")["detail"] == "Missing: records (STORE_UNAVAILABLE)."
+    assert assert_refused(answer, 503, "NOT_READY")["detail"] == "Missing: records (STORAGE_UNAVAILABLE)."
     assert_refused(world.client.get("/readyz", params={"worker": "maybe"}), 400, "INVALID_QUERY")

@@ -60,7 +60,7 @@ def test_a_piece_elsewhere_is_refused_with_where_it_stopped(world: World) -> Non
     put(world, 0, 700)
     for first in (0, 600, 701):
         answer = put(world, first, 1000)
-        assert assert_refused(answer, 409, "UPLOAD_OFFSET_MISMATCH")["offset"] == 700
+        assert assert_refused(answer, 409, "UPLOAD_NOT_FINISHED")["offset"] == 700
         assert answer.headers["upload-offset"] == "700"
     assert ask(world).json()["offset"] == 700
 
@@ -113,7 +113,7 @@ def test_a_file_that_is_no_field_is_refused_with_its_first_piece(tmp_path: Path,
         ("bytes 0-9/*", 400, "INVALID_HEADER"),
         ("bytes 0-9/9999999999999999", 400, "INVALID_HEADER"),
         ("bytes 0-9/5000", 413, "UPLOAD_TOO_LARGE"),
-        ("bytes */0", 400, "UPLOAD_EMPTY"),
+        ("bytes */0", 400, "UPLOAD_INCOMPLETE"),
         ("bytes 0-9/2000", 400, "INVALID_HEADER"),
         ("bytes */2000", 400, "INVALID_HEADER"),
     ],
@@ -152,7 +152,7 @@ def test_settings_without_pieces_are_refused(world: World) -> None:
     files: dict[str, Any] = {"upload": (None, NAME)}
     assert assert_refused(world.client.post("/fields", files=files), 409, "UPLOAD_NOT_FINISHED")["offset"] == 0
     both: dict[str, Any] = {"upload": (None, NAME), "file": ("a", DATA)}
-    assert_refused(world.client.post("/fields", files=both), 400, "MISSING_PART")
+    assert_refused(world.client.post("/fields", files=both), 400, "MALFORMED_MULTIPART")
     assert_refused(world.client.post("/fields", files={"upload": (None, "../x")}), 400, "INVALID_DIGEST")
 
 
@@ -173,9 +173,9 @@ def test_pieces_count_towards_the_quota(worlds: Callable[..., World]) -> None:
     world = worlds(quota_stored_bytes=2500)
     put(world, 0, 1500)
     other = field_bytes("other", 1200)
-    assert_refused(world.client.put(f"/fields/{sha256(other)}", content=other), 403, "QUOTA_STORED_BYTES")
+    assert_refused(world.client.put(f"/fields/{sha256(other)}", content=other), 403, "QUOTA_STORED")
     assert put(world, 1500, 2000).status_code == 201
-    assert_refused(put(world, 0, 600, other), 403, "QUOTA_STORED_BYTES")
+    assert_refused(put(world, 0, 600, other), 403, "QUOTA_STORED")
 
 
 def test_each_caller_has_pieces_of_its_own(worlds: Callable[..., World]) -> None:
@@ -302,7 +302,7 @@ def test_what_the_field_has_no_room_for_is_not_put_together(
     other = field_bytes("other", 900)
     assert world.client.put(f"/fields/{sha256(other)}", content=other).status_code == 201
     writers = Writers(world, monkeypatch)
-    assert_refused(finish(world), 429, "QUOTA_IMPORTS")
+    assert_refused(finish(world), 429, "QUOTA_ACTIVE_JOBS")
     assert writers.bytes == 0
     assert world.client.delete(f"/fields/{sha256(other)}").status_code == 204
     assert finish(world).status_code == 201, "the field takes the place of its pieces in the quota"

@@ -331,7 +331,7 @@ def test_one_shot_keeps_nothing_of_a_request_that_is_refused(world: World) -> No
         "scene": ("scene", field_bytes("one")),
         "request": (None, json.dumps({"detection": BOX})),
     }
-    assert_refused(world.client.post("/register", files=missing), 400, "MISSING_PART")
+    assert_refused(world.client.post("/register", files=missing), 400, "MALFORMED_MULTIPART")
     assert world.blobs.blobs == {}
     assert world.records.list_fields(None, 10, None).records == []
 

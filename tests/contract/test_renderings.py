@@ -120,7 +120,7 @@ def test_edits_of_jobs_that_are_of_no_use(world: World, monkeypatch: pytest.Monk
         waiting: (409, "JOB_NOT_READY"),
         failed: (409, "JOB_FAILED"),
         dismissed: (409, "JOB_DISMISSED"),
-        rejected: (422, "EDIT_POSE_REJECTED"),
+        rejected: (422, "EDIT_INVALID"),
         elsewhere: (422, "EDIT_INVALID"),
         picture: (422, "EDIT_INVALID"),
     }

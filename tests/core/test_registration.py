@@ -98,7 +98,7 @@ def test_a_progress_callback_may_cancel() -> None:
 @pytest.mark.parametrize(
     ("known", "reason"),
     [
-        ({"initial_transform": Sim3.identity()}, "INITIAL_TRANSFORM_UNSUPPORTED"),
+        ({"initial_transform": Sim3.identity()}, "PRESET_UNSUITABLE"),
         ({"object_model": model_object(chair())}, "INVALID_OPTIONS"),
     ],
     ids=["initial transform", "object model"],

@@ -167,7 +167,7 @@ def refuse_lists(page: Page, answers: int) -> list[str]:
         asked.append(route.request.url)
         if len(asked) > answers:
             return route.continue_()
-        problem = '{"reason": "STORE_UNAVAILABLE", "detail": "The record store does not answer. Retry later."}'
+        problem = '{"reason": "STORAGE_UNAVAILABLE", "detail": "The record store does not answer. Retry later."}'
         return route.fulfill(status=503, headers={"Retry-After": "0"}, body=problem)
 
     page.route("**/fields?*", busy)

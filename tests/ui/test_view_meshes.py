@@ -58,9 +58,7 @@ def test_without_meshes_there_is_no_choice(visit: Visit) -> None:
 
 
 def test_a_mesh_that_is_gone_leaves_the_samples(visit: Visit) -> None:
-    visit.page.route(
-        "**/mesh.glb*", lambda route: route.fulfill(status=404, json={"reason": "FIELD_PREVIEW_NOT_FOUND"})
-    )
+    visit.page.route("**/mesh.glb*", lambda route: route.fulfill(status=404, json={"reason": "FIELD_VIEW_NOT_FOUND"}))
     page = visit.open("meshed")
     expect(page.locator("#surfaces-dial")).to_be_hidden()
     assert colored(canvas_pixels(page), "blue").mean() > 0.01
