@@ -38,23 +38,6 @@ def test_a_finished_job_says_when_it_expires(world: World) -> None:
     assert answer.json()["links"]["result"] == f"/jobs/{job_id}/result"
 
 
-def test_an_etag_saves_the_body_until_something_changes(world: World) -> None:
-    job_id = world.submit()
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    unchanged = world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag})
-    assert (unchanged.status_code, unchanged.content) == (304, b"")
-    world.run(job_id)
-    assert world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag}).status_code == 200
-
-
-def test_a_heartbeat_is_no_change(world: World) -> None:
-    job_id = world.submit()
-    world.run(job_id)
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    world.records.heartbeat(job_id, 1)
-    assert world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag}).status_code == 304
-
-
 def test_waiting_ends_with_the_job(world: World) -> None:
     job_id = world.submit()
     worker = threading.Timer(0.1, world.succeed, (job_id,))
@@ -62,16 +45,6 @@ def test_waiting_ends_with_the_job(world: World) -> None:
     answer = world.client.get(f"/jobs/{job_id}", params={"wait": 20})
     worker.join()
     assert answer.json()["status"] == "successful"
-
-
-def test_waiting_with_an_etag_ends_at_the_first_change(world: World) -> None:
-    job_id = world.submit()
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    worker = threading.Timer(0.1, world.run, (job_id,))
-    worker.start()
-    answer = world.client.get(f"/jobs/{job_id}", params={"wait": 20}, headers={"If-None-Match": etag})
-    worker.join()
-    assert (answer.status_code, answer.json()["status"]) == (200, "running")
 
 
 def test_lists_go_page_by_page_and_by_status(world: World) -> None:

@@ -40,6 +40,11 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+def put(client: httpx.Client, data: bytes, **headers: str) -> httpx.Response:
+    """Upload a field's file under its digest."""
+    return client.put(f"/fields/{sha256(data)}", content=data, headers=headers)
+
+
 def transform(scale: float = 1.0) -> dict[str, Any]:
     matrix = [[scale, 0, 0, 0], [0, scale, 0, 0], [0, 0, scale, 0], [0, 0, 0, 1]]
     return {"matrix": matrix, "scale": scale, "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]}
@@ -136,6 +141,11 @@ class World:
     def fail(self, job_id: str, **error: Any) -> None:
         attempt = self.run(job_id).attempt
         self.records.update_job(job_id, attempt, status="failed", error=error)
+
+
+def pointers(problem: dict[str, Any]) -> list[str]:
+    """The places in a body that a problem names."""
+    return [one["pointer"] for one in problem["errors"]]
 
 
 def share_routes(app: FastAPI) -> None:
