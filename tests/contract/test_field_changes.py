@@ -324,9 +324,9 @@ def test_an_answer_makes_the_question_and_its_pictures_go(world: World) -> None:
     asked_about(world, [Candidate("of two", {"sign": 1}), Candidate("the other", {"sign": -1}, b"\x89PNG -")])
     assert candidates(world, "name") == ["of two", "the other"], "another question takes the place of the first"
     assert set(world.blobs.blobs) == {ORIGINAL, f"{FOLDER}/candidates/2.png"}
-    assert change(world, description=SMOOTH).status_code == 202
+    assert change(world, description={"sign": -1}).status_code == 202
     imported(world)
-    assert [now(world)[name] for name in ("state", "description", "error")] == ["ready", SMOOTH, None]
+    assert [now(world)[name] for name in ("state", "description", "error")] == ["ready", SMOOTH | {"sign": -1}, None]
     assert set(world.blobs.blobs) == IMPORTED
 
 
