@@ -250,22 +250,6 @@ def test_what_is_kept_and_told_of_problems_is_bounded(world: World) -> None:
     assert int(page.headers["batch-left"]) > 0, "a page looks at some hundreds of pairs"
 
 
-def test_the_library_is_looked_up_once_for_all_lines(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    request = world.valid_request()
-    for name in ("a", "b"):
-        world.client.post("/library", json={"field": world.ready_field(name), "name": name, "tags": ["chair"]})
-    looks: list[str] = []
-    for look in ("list_entries", "entries_named"):
-        whole = getattr(world.records, look)
-        monkeypatch.setattr(world.records, look, lambda *args, f=whole, n=look: looks.append(n) or f(*args))
-    del request["object"]
-    lines = [{**request, "seed": n, "candidates": {"library": {"tags": ["chair"]}}} for n in range(30)]
-    lines += [{**request, "seed": n, "object": {"library": "a"}} for n in range(30)]
-    assert posted(world, lines)
-    assert len(looks) == 2
-    assert len(world.queue.registrations) == 60
-
-
 # stopping and forgetting
 
 

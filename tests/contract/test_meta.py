@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from html.parser import HTMLParser
 from typing import Any
 
 import pytest
@@ -68,44 +66,3 @@ def test_the_index_names_every_address_and_the_contract_is_served_as_json_too(wo
     answer = world.client.get("/openapi.json")
     assert (answer.headers["content-type"], answer.json()) == ("application/json", contract)
     assert answer.json()["x-reasons"]["QUEUE_FULL"]["status"] == 503
-
-
-class Links(HTMLParser):
-    """Collects every address that a page would load or lead to."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.ids: set[str] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = {name: value or "" for name, value in attrs}
-        self.found += [values[name] for name in ("src", "href", "action", "data") if name in values]
-        self.ids |= {values["id"]} if "id" in values else set()
-
-
-def test_the_documentation_loads_nothing_from_elsewhere(world: World) -> None:
-    page = world.client.get("/docs")
-    links = Links()
-    links.feed(page.text)
-    assert all(link.startswith(("#", "/")) for link in links.found)
-    assert {link[1:] for link in links.found if link.startswith("#")} <= links.ids
-    for address in links.found:
-        assert address.startswith("#") or world.client.get(address).status_code == 200
-    policy = page.headers["content-security-policy"]
-    assert policy.startswith("default-src 'self';")
-    assert "unsafe" not in policy
-
-
-def test_the_page_of_a_job(world: World) -> None:
-    job_id = world.submit()
-    page = world.client.get(f"/jobs/{job_id}/view")
-    assert page.status_code == 200
-    policy = dict(part.split(" ", 1) for part in page.headers["content-security-policy"].split("; "))
-    assert world.client.head(f"/jobs/{job_id}/view").headers["content-length"] == page.headers["content-length"]
-    assert (policy["default-src"], policy["object-src"]) == ("'self'", "'none'")
-    loaded = re.findall(r'(?:src|href)="(/static/[^"]+)"', page.text)
-    assert loaded
-    for address in loaded:
-        assert world.client.get(address).status_code == 200
-    assert_refused(world.client.get("/jobs/nobody/view"), 404, "JOB_NOT_FOUND")

@@ -5,8 +5,6 @@ Those try what pages can do to a service on this machine, and get nothing.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -27,9 +25,8 @@ from tests.stores import private_stores
 from tests.ui.conftest import ARGUMENTS, Visit, chromium
 from tests.ui.fixture_server import FixtureServer
 from tests.ui.home import served
-from tests.ui.pixels import blue
 from tests.ui.stories import field_picture
-from tests.ui.synthetic import JOB_ID, Synthetic, object_mesh, scene_mesh
+from tests.ui.synthetic import JOB_ID, Synthetic
 
 pytestmark = pytest.mark.browser
 SCENE, OBJECT = "a3" * 32, "7c" * 32
@@ -54,20 +51,9 @@ class RealService:
             JOB_ID, "registration", "accepted", request={"scene": SCENE}, inputs=inputs, created=now, updated=now
         )
         self.records.create_job(job, max_active=10)
-        for sha256, mesh in ((SCENE, scene_mesh()), (OBJECT, object_mesh())):
+        for sha256 in (SCENE, OBJECT):
             self.records.create_field(FieldRecord(sha256, "ready", bytes=1, created=now, updated=now))
             self.blobs.put(f"fields/{sha256}/preview.png", field_picture(sha256))
-            self.blobs.put(f"fields/{sha256}/mesh.glb", mesh)
-
-    def finish(self, data: Synthetic) -> None:
-        """What a worker does when the registration has ended well."""
-        result = {name: value for name, value in data.result.items() if name != "artifacts"}
-        listed = []
-        for name, content in {**data.artifacts, "result.json": json.dumps(result).encode()}.items():
-            self.blobs.put(f"jobs/{JOB_ID}/1/{name}", content)
-            listed.append({"name": name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()})
-        self.blobs.put(f"jobs/{JOB_ID}/manifest.json", json.dumps({"attempt": 1, "artifacts": listed}).encode())
-        self.records.update_job(JOB_ID, 1, status="successful")
 
 
 @contextmanager
@@ -221,9 +207,9 @@ def test_a_name_that_is_made_to_lead_here_opens_nothing(page: Page, service: Rea
 # the page itself
 
 
-def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:
-    page, data = visit.page, visit.server.stage.data
-    with real_service(data) as service:
+def test_follows_a_job_of_the_real_service_to_its_end(visit: Visit) -> None:
+    page = visit.page
+    with real_service(visit.server.stage.data) as service:
         page.goto(service.view)
         expect(page.locator("#message-title")).to_have_text("In the queue")
         service.records.update_job(JOB_ID, 1, status="running")
@@ -231,14 +217,10 @@ def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:
         expect(page.locator("#message-title")).to_have_text("Optimizing", timeout=30_000)
         service.records.update_job(JOB_ID, 1, progress=0.75)
         expect(page.locator("#message-text")).to_have_text("75 % done", timeout=30_000)
-        service.finish(data)
-        expect(page.locator("#verdict-word")).to_have_text("Registered", timeout=30_000)
-        page.wait_for_selector("#tools:not([hidden])")
-        assert blue(page).mean() > 0.01
-        page.locator("#color").select_option("residual")
-        page.wait_for_selector("#legend svg rect")
-        expect(page.locator("#box-chip")).to_be_visible()
-        expect(page.locator("#files")).to_contain_text("result.json")
+        error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "12 points were found; 500 are needed."}
+        service.records.update_job(JOB_ID, 1, status="failed", error=error)
+        expect(page.locator("#message-text")).to_have_text("12 points were found; 500 are needed.", timeout=30_000)
+        expect(page.locator("#message-title")).to_have_text("No surface in the detection")
         expect(page.locator("#field-pictures canvas")).to_have_count(2)
         assert visit.complaints == []
         assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
