@@ -171,7 +171,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
 def _require_nothing_of_one_object(start: object, truth: object) -> None:
     """Raises InvalidInputError, as a service refuses such a line."""
     for name, given, reason in (
-        ("initial_transform", start, "INITIAL_TRANSFORM_UNSUPPORTED"),
+        ("initial_transform", start, "PRESET_UNSUITABLE"),
         ("ground_truth", truth, "INVALID_REQUEST"),
     ):
         if given is not None:

@@ -102,7 +102,7 @@ def _request(
     if request["initial_transform"] and RegistrationOptions.from_dict(options).preset != "robust":
         raise InvalidInputError(
             "only the preset robust starts from a given transform",
-            reason="INITIAL_TRANSFORM_UNSUPPORTED",
+            reason="PRESET_UNSUITABLE",
             hint="Leave --initial-transform out, or use --preset robust.",
         )
     return request

@@ -215,7 +215,7 @@ def _request(box: Detection, options: Path | None, seed: int) -> dict[str, Any]:
     if RegistrationOptions.from_dict(request["options"]).preset != "robust":
         message = f"{options}: only the preset robust searches a library"
         hint = "Leave the preset out of the options."
-        raise InvalidInputError(message, reason="LIBRARY_SEARCH_UNSUPPORTED", hint=hint)
+        raise InvalidInputError(message, reason="PRESET_UNSUITABLE", hint=hint)
     return request
 
 

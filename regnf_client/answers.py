@@ -103,7 +103,6 @@ _Model = TypeVar("_Model", bound=BaseModel)
 HINTS = {  # in place of the service's own, which are of HTTP
     "UNAUTHENTICATED": "Give the service's token: token=..., --token, or the environment variable REGNF_API_TOKEN.",
     "RATE_LIMITED": "Wait a moment, and try again.",
-    "TOO_MANY_WRITES": "Wait a moment, and try again.",
     "QUEUE_FULL": "Try again later.",
     "JOB_NOT_FOUND": "Look at the id: `client.jobs()` lists your jobs. Another caller's jobs are not shown.",
     "JOB_NOT_READY": "Wait for the job first: `client.wait(job)`.",

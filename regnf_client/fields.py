@@ -47,7 +47,7 @@ PIECE_BYTES = 8 << 20
 _MOST_PIECES = 900
 _HOLD_S = 20
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
+_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", ServiceError.reason})
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,7 @@ from regnf_client.answers import NoWorkerError, unreachable
 
 # When a request is sent again, and after how long.
 
-_PASSING = frozenset(
-    {"RATE_LIMITED", "TOO_MANY_WRITES", "TOO_MANY_REQUESTS_AT_ONCE", "TOO_MANY_UPLOADS", "ARTIFACT_NOT_READY"}
-)
+_PASSING = frozenset({"RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE", "ARTIFACT_NOT_READY"})
 """Refusals that time mends by itself. Quotas are told at once: they may last for hours."""
 _PASSING_STATUSES = frozenset({409, 429})
 _AWAY = frozenset({502, 503, 504})

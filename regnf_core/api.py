@@ -367,10 +367,10 @@ def search(
 
     An object's model is made once and kept in the user's cache, for objects that are given by their paths. Other
     arguments as of ``register``. Raises InvalidInputError (LIBRARY_EMPTY), InvalidOptionsError
-    (LIBRARY_SEARCH_UNSUPPORTED), NoSurfaceError, and what ``register`` raises.
+    (PRESET_UNSUITABLE), NoSurfaceError, and what ``register`` raises.
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
-    chosen.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
+    chosen.require_robust("searches a library", reason="PRESET_UNSUITABLE")
     named = _named(objects)
     given: list[tuple[FieldLike | LibraryObject, Role]] = [
         (scene, "scene"),
@@ -446,7 +446,7 @@ def render(
 
     options: RenderOptions, or a dictionary of those that are not to have their defaults. ``cancelled`` is asked before
     each tile; CancelledError is raised once it says so.
-    Raises InvalidInputError: NO_FIELD, CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and
+    Raises InvalidInputError: NO_FIELD, CAMERA_INVALID, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and
     NoSurfaceError (NO_SURFACE_IN_SCENE).
     """
     chosen = _render_options(options)
@@ -458,7 +458,7 @@ def compose(
 ) -> EditedScene:
     """The scene, or that at a path, with all edits done: a field as any other. See docs/editing.md.
 
-    Raises InvalidInputError: NO_FIELD, INVALID_TRANSFORM, EDIT_INVALID, EDITS_OVERLAP, EDIT_OUTSIDE_SCENE; and
+    Raises InvalidInputError: NO_FIELD, INVALID_TRANSFORM, EDIT_INVALID; and
     NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
     if not isinstance(edits, Sequence):

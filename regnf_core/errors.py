@@ -2,7 +2,7 @@
 
     RegnfError
     ├── InvalidInputError            the caller can mend it
-    │   ├── InvalidOptionsError      INVALID_OPTIONS, INITIAL_TRANSFORM_UNSUPPORTED, LIBRARY_SEARCH_UNSUPPORTED
+    │   ├── InvalidOptionsError      INVALID_OPTIONS, PRESET_UNSUITABLE
     │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
     │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
     │   └── DatasetError             DATASET_...: a folder of posed images, or what one is rendered from, cannot be used
@@ -166,21 +166,17 @@ HINTS: dict[str, str] = {
     "RAW_PICKLE": "Save it again with torch.save.",
     "INVALID_DETECTION": "docs/api.md shows every form of a detection.",
     "INVALID_OPTIONS": "docs/api.md lists every option with its range.",
-    "UPLOAD_EMPTY": "Check the path of the file: `curl --data-binary @room.ckpt` sends one.",
     "DIGEST_MISMATCH": "Take the SHA-256 of the very bytes that are sent (`sha256sum FILE`), or POST /fields, which "
     "computes it.",
     "INVALID_DIGEST": "`sha256sum FILE` prints it; or POST /fields, which computes it.",
-    "MALFORMED_MULTIPART": "Let the client write the body and its boundary: `curl -F name=@file`.",
-    "MISSING_PART": "docs/api.md names the parts that each address takes.",
-    "UNKNOWN_PART": "docs/api.md names the parts that each address takes.",
+    "MALFORMED_MULTIPART": "Let the client write the body and its boundary: `curl -F name=@file`. docs/api.md names "
+    "the parts that each address takes.",
     "JOB_NOT_FOUND": "GET /jobs lists the jobs that there are.",
     "WORKER_LOST": "Most often memory ran out. Post the same request to start it again, or use a worker with more "
     "memory.",
     "JOB_TIMEOUT": "Use fewer samples, or set a longer time limit for the service (REGNF_JOB_TIMEOUT_S).",
     "OPTIONS_TOO_COSTLY": "Decrease the options that `errors` names. For the preset paper most often: fewer views, a "
     "smaller image_size or a larger pixel_stride.",
-    "JOB_MEMORY_LIMIT": "Use fewer rays or samples, or a smaller field; or set a higher limit for the service "
-    "(REGNF_JOB_MEMORY_BYTES).",
     "JOB_DISK_LIMIT": "Use fewer rays or samples, or set a higher limit for the service (REGNF_JOB_SCRATCH_BYTES).",
     "IMPORT_TIMEOUT": "Send it again when the service has less to do, or set a longer time limit for the service "
     "(REGNF_IMPORT_TIMEOUT_S).",
@@ -193,7 +189,8 @@ HINTS: dict[str, str] = {
     "IMPORT_CRASHED": "Try it once more. If it fails again, the service's log has the end of the import's output.",
     "FIELD_IMPORT_TIMEOUT": "Wait until the field is ready, then post the same request again.",
     "STORAGE_FULL": "Free space on the disk, or delete fields and jobs, then send it again.",
-    "OUT_OF_MEMORY": "Use fewer samples, or a worker with more memory.",
+    "OUT_OF_MEMORY": "Use fewer rays or samples, a smaller field or a worker with more memory; or set a higher limit "
+    "for the service (REGNF_JOB_MEMORY_BYTES).",
     "MESH_TOO_LARGE": "Reduce the number of its triangles, for example in MeshLab or Blender.",
     "MESH_EXTERNAL_REFERENCE": "Put everything into one file: export it as .glb.",
     "NO_ZERO_LEVEL": "Check its bounds and its sign: positive outside, negative inside. `regnf inspect FILE --picture "
@@ -213,7 +210,7 @@ HINTS: dict[str, str] = {
     "BOUNDS_INVALID": "Give two corners in a description, the lower one first: docs/import-gate.md shows it.",
     "INVALID_DESCRIPTION": "docs/import-gate.md lists every entry of a description.",
     "INVALID_SYMMETRY": "docs/how-to/symmetry.md shows how a symmetry is said.",
-    "INITIAL_TRANSFORM_UNSUPPORTED": "Leave the initial transform out, or use the preset robust.",
+    "PRESET_UNSUITABLE": "Use the preset robust; or name one object, and leave the initial transform out.",
     "NO_SURFACE_IN_SCENE": "Check the scene's bounds and its sign: positive outside, negative inside.",
     "NO_SURFACE_IN_TARGET": "Give a mesh with triangles that have an area, or a field with a surface; "
     "`regnf inspect FILE` shows what a file holds.",

@@ -63,11 +63,11 @@ def search_library(
     All are compared by signature, the nearest 12 searched coarsely, at most 4 refined on their fields and evaluated:
     the time hardly grows with the library. Deterministic for a seed. ``progress`` and ``clouds`` as in
     :func:`regnf_core.register`.
-    Raises InvalidOptionsError (LIBRARY_SEARCH_UNSUPPORTED) for options of another preset, InvalidInputError
+    Raises InvalidOptionsError (PRESET_UNSUITABLE) for options of another preset, InvalidInputError
     (LIBRARY_EMPTY, FIELD_NOT_FINITE), InvalidDetectionError, NoSurfaceError.
     """
     options = options or RegistrationOptions()
-    options.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
+    options.require_robust("searches a library", reason="PRESET_UNSUITABLE")
     if not library:
         raise InvalidInputError("the library has no objects", reason="LIBRARY_EMPTY")
     run = Run(progress)
@@ -174,7 +174,7 @@ def register(
     surroundings; this saves time when no pictures are drawn.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE), and
-    InvalidOptionsError (INITIAL_TRANSFORM_UNSUPPORTED, INVALID_OPTIONS) for a warm start under another preset.
+    InvalidOptionsError (PRESET_UNSUITABLE, INVALID_OPTIONS) for a warm start under another preset.
     """
     options = options or RegistrationOptions()
     if warm_start is not None:
@@ -199,6 +199,6 @@ def with_late_clouds(
 
 def _check_warm_start(warm_start: WarmStart, options: RegistrationOptions) -> None:
     if warm_start.T_object_scene is not None:
-        options.require_robust("starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED")
+        options.require_robust("starts from a given transform", reason="PRESET_UNSUITABLE")
     if warm_start.object_model is not None:
         options.require_robust("uses an object model")

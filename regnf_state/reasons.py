@@ -22,12 +22,6 @@ class Reason:
 
 REASONS: dict[str, Reason] = {
     # the request as such
-    "MALFORMED_REQUEST": Reason(400, "Malformed request", "The request's head or the framing of its body is no HTTP."),
-    "REQUEST_STALLED": Reason(408, "Request stalled", "The head or the body did not arrive in time. Nothing was kept."),
-    "HEADERS_TOO_LARGE": Reason(431, "Headers too large", "The request's head has too many lines or too many bytes."),
-    "TOO_MANY_CONNECTIONS": Reason(
-        503, "Too many connections", "The service, or your address, has the maximum number of connections. Close some."
-    ),
     "MALFORMED_JSON": Reason(
         400, "Malformed JSON", "The body is not one JSON value, names a member twice, or nests too deeply."
     ),
@@ -48,81 +42,70 @@ REASONS: dict[str, Reason] = {
         "Origin not allowed",
         "A browser sent this for a page of another site. A proxy must pass `Host` on unchanged, with its port.",
     ),
-    "TOO_MANY_WRONG_TOKENS": Reason(
-        429, "Too many wrong tokens", "Too many wrong tokens came from your address. A right one is taken at once."
-    ),
     "NOT_FOUND": Reason(404, "Not found", "There is nothing under this address. `GET /` names every address."),
     "METHOD_NOT_ALLOWED": Reason(405, "Method not allowed", "The header `Allow` lists what this address answers to."),
     "RATE_LIMITED": Reason(
         429, "Too many calls", "You send requests faster than the service allows. See `Retry-After`."
-    ),
-    "TOO_MANY_WRITES": Reason(
-        429,
-        "Too many writes",
-        "You post, change, cancel or delete faster than the service allows. Nothing was done. See `Retry-After`.",
     ),
     "TOO_MANY_REQUESTS_AT_ONCE": Reason(
         429, "Too many requests at once", "Wait until some of your requests have been answered, then repeat."
     ),
     "CONFLICT": Reason(409, "Conflict", "Another client changed it at the same time. Read it again, then repeat."),
     "REQUEST_TOO_LARGE": Reason(
-        413, "Request too large", "The JSON or a text part exceeds the service's limit of bytes or of values."
+        413,
+        "Request too large",
+        "The JSON, a text part or a batch exceeds the service's limit of bytes, values or lines.",
     ),
     "UNSUPPORTED_MEDIA_TYPE": Reason(
         415, "Unsupported media type", "The `Content-Type` or `Content-Encoding` is not one this address takes."
     ),
     "INVALID_REQUEST": Reason(422, "Invalid request", "`errors` points at the members that are wrong."),
     # multipart
-    "MALFORMED_MULTIPART": Reason(400, "Malformed multipart body", "The parts or their headers cannot be read."),
-    "MISSING_PART": Reason(400, "Missing part", "A part that this address needs is not there."),
-    "UNKNOWN_PART": Reason(400, "Unknown part", "The body has a part that this address does not know."),
+    "MALFORMED_MULTIPART": Reason(
+        400,
+        "Malformed multipart body",
+        "The parts cannot be read, one is missing, or one is not known at this address.",
+    ),
     # uploads
     "INVALID_DIGEST": Reason(400, "Invalid digest", "A SHA-256 is 64 lower-case hexadecimal digits."),
     "DIGEST_MISMATCH": Reason(400, "Digest mismatch", "The bytes that arrived are not the bytes that were announced."),
-    "UPLOAD_EMPTY": Reason(400, "Empty upload", "The upload has no bytes."),
-    "UPLOAD_INCOMPLETE": Reason(400, "Incomplete upload", "The body ended before its declared length."),
-    "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
-    "UPLOAD_OFFSET_MISMATCH": Reason(
-        409,
-        "Another piece is expected",
-        "The piece does not begin where the upload stopped: `offset` says how many bytes have arrived.",
+    "UPLOAD_INCOMPLETE": Reason(
+        400, "Incomplete upload", "The body has no bytes, or ended before its declared length."
     ),
+    "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
     "UPLOAD_NOT_FINISHED": Reason(
-        409, "Upload not finished", "The file's pieces are not all here: `offset` says how many bytes have arrived."
+        409,
+        "Upload not finished",
+        "The pieces are not all here, or this is not the next one: `offset` says how many bytes have arrived.",
     ),
     "TOO_MANY_PIECES": Reason(409, "Too many pieces", "The upload has too many pieces. Send larger ones."),
     "FIELD_NOT_RECOGNIZED": Reason(
         415, "Not a field file", "The file is not a field in any format that the service reads."
     ),
-    "TOO_MANY_UPLOADS": Reason(
-        429, "Too many uploads at once", "Wait until one of your uploads has ended, then repeat."
+    "QUOTA_STORED": Reason(
+        403, "Quota of storage used up", "You store as many fields or bytes as you may. Delete some."
     ),
-    "QUOTA_STORED_BYTES": Reason(
-        403, "Quota of bytes used up", "Your fields use all the bytes that you may store. Delete some."
-    ),
-    "QUOTA_FIELDS": Reason(403, "Quota of fields used up", "You have the maximum number of fields. Delete some."),
-    "QUOTA_IMPORTS": Reason(
-        429, "Quota of imports used up", "You have the maximum number of imports that wait or run. Wait for one to end."
+    "QUOTA_ACTIVE_JOBS": Reason(
+        429,
+        "Quota of jobs used up",
+        "You have the maximum number of jobs, imports or batches that wait or run. Wait for one to end.",
     ),
     "QUOTA_WORKER_SECONDS": Reason(
         429,
         "Quota of worker time used up",
         "Your imports and jobs of the last hour have used the time that you may use. See `Retry-After`.",
     ),
-    "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
+    "STORAGE_FULL": Reason(
+        507, "Storage full", "No space is left in the storage or the record store. Delete something, or retry later."
+    ),
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),
-    "FIELD_PREVIEW_NOT_FOUND": Reason(
+    "FIELD_VIEW_NOT_FOUND": Reason(
         404,
-        "No picture",
-        "Only fields that are `ready` have a picture, and not all of them do. With `Retry-After` it is still to be "
-        "made. Of a rejected field, candidates have one while its upload is kept.",
-    ),
-    "FIELD_MESH_NOT_FOUND": Reason(
-        404,
-        "No mesh",
-        "Only fields that are `ready` have a mesh to look at, and not those that are too slow for it. With "
-        "`Retry-After` it is still to be made.",
+        "No view",
+        "Only fields that are `ready` have a picture and a mesh to look at, and not those that are too slow for it. "
+        "With `Retry-After` it is still to be made. Candidates of a rejected field have pictures while its upload is "
+        "kept.",
     ),
     "FIELD_IN_USE": Reason(409, "Field in use", "Active jobs need the field. Wait for them, or cancel them."),
     "FIELD_DESCRIPTION_DIFFERS": Reason(
@@ -153,9 +136,6 @@ REASONS: dict[str, Reason] = {
         "Field in the library",
         "The field is an entry of your library already, or still: `GET /fields/{sha256}` has its name in `library`.",
     ),
-    "LIBRARY_ENTRY_INVALID": Reason(
-        422, "Invalid library entry", "`detail` says what is wrong with the name, a tag, the note or the symmetry."
-    ),
     "LIBRARY_EMPTY": Reason(422, "No objects in the library", "No entry of your library is meant. Check the tags."),
     "LIBRARY_TOO_LARGE": Reason(
         422,
@@ -180,15 +160,10 @@ REASONS: dict[str, Reason] = {
         "Invalid transform",
         "The matrix is no similarity transform: (s R, t) with s > 0, R a rotation, last row 0 0 0 1.",
     ),
-    "INITIAL_TRANSFORM_UNSUPPORTED": Reason(
+    "PRESET_UNSUITABLE": Reason(
         422,
-        "Initial transform unsupported",
-        "Only the preset `robust` starts from a given transform, and only with one `object`. Leave it out.",
-    ),
-    "LIBRARY_SEARCH_UNSUPPORTED": Reason(
-        422,
-        "Library search unsupported",
-        "The preset `paper` registers one object. Name it as `object`, or take the preset `robust`.",
+        "Not with this preset",
+        "Only the preset `robust` searches among several objects, or starts from a given transform, with one object.",
     ),
     "DETECTION_OUTSIDE_SCENE": Reason(
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."
@@ -199,20 +174,12 @@ REASONS: dict[str, Reason] = {
     "QUEUE_FULL": Reason(
         503, "Queue full", "The service has the maximum number of active jobs. Retry after `Retry-After`."
     ),
-    "QUOTA_ACTIVE_JOBS": Reason(
-        429, "Quota of jobs used up", "You have the maximum number of active jobs. Wait for one to end."
-    ),
     "QUOTA_WEBHOOKS": Reason(409, "Quota of webhooks used up", "The job has 16 webhooks, or 4 kB. Ask for its state."),
     # renderings
     "CAMERA_INVALID": Reason(
         422,
         "Invalid camera",
-        "A camera's pose, lens or size is none, or its path has no frame. `detail` says which.",
-    ),
-    "CAMERA_IN_MATTER": Reason(
-        422,
-        "Camera in matter",
-        "A camera stands inside of something. Move it, or set the option `cut_away`.",
+        "A camera's pose, lens or size is none, its path has no frame, or it stands in matter. `detail` says which.",
     ),
     "COLORS_MISSING": Reason(
         422,
@@ -222,24 +189,8 @@ REASONS: dict[str, Reason] = {
     "EDIT_INVALID": Reason(
         422,
         "Invalid edit",
-        "The edit is no substitution, replacement, removal or insertion, or its job is no registration in this scene. "
-        "`detail` says which.",
-    ),
-    "EDIT_POSE_REJECTED": Reason(
-        422,
-        "Pose was rejected",
-        "The registration that an edit names rejected its pose. To use it all the same, give `object` and "
-        "`T_object_scene` instead of `job`.",
-    ),
-    "EDIT_OUTSIDE_SCENE": Reason(
-        422,
-        "Edit outside the scene",
-        "What the edit changes lies outside of the scene's bounds. Check the transform's direction and the units.",
-    ),
-    "EDITS_OVERLAP": Reason(
-        422,
-        "Edits overlap",
-        "Two edits take away the same thing, or put matter in one place. Leave one out.",
+        "The edit is no substitution, replacement, removal or insertion, its job is of no use for it, it lies outside "
+        "of the scene, or two edits change the same place. `detail` says which.",
     ),
     "NO_SURFACE_IN_SCENE": Reason(
         422,
@@ -270,12 +221,6 @@ REASONS: dict[str, Reason] = {
     "RANGE_NOT_SATISFIABLE": Reason(416, "Range not satisfiable", "The range begins past the artifact's end."),
     # batches
     "BATCH_NOT_FOUND": Reason(404, "No such batch", "The id is unknown, or the batch is gone. Post its lines again."),
-    "TOO_MANY_PAIRS": Reason(
-        413, "Too many pairs", "The batch has more lines than the service takes. Send them as several batches."
-    ),
-    "QUOTA_BATCHES": Reason(
-        429, "Quota of batches used up", "You have the maximum number of batches, and none has ended. Wait for one."
-    ),
     # what a job can end with
     "NO_SURFACE_IN_DETECTION": Reason(
         422, "No surface in the detection", "Too few surface points were found in the box. Check the box, or the scene."
@@ -284,7 +229,6 @@ REASONS: dict[str, Reason] = {
     "NO_INITIAL_TRANSFORM": Reason(
         422, "No initial transform", "No initial transform was found. Object and scene may have no shape in common."
     ),
-    "CANCELLED": Reason(409, "Cancelled", "The job stopped because it was cancelled."),
     "FIELD_IMPORT_TIMEOUT": Reason(
         422,
         "Import took too long",
@@ -292,25 +236,24 @@ REASONS: dict[str, Reason] = {
     ),
     "JOB_TIMEOUT": Reason(500, "Job took too long", "The job exceeded its time and was stopped."),
     "WORKER_LOST": Reason(500, "Worker lost", "The worker vanished twice while it ran this job. Post it again."),
-    "OUT_OF_MEMORY": Reason(500, "Out of memory", "The job needed more memory than the worker has."),
-    "JOB_MEMORY_LIMIT": Reason(
-        500, "Job over its memory", "The job needed more memory than one job may have; `limit_bytes` says how much."
+    "OUT_OF_MEMORY": Reason(
+        500,
+        "Out of memory",
+        "The job needed more memory than the worker has, or than one job may have (`limit_bytes`).",
     ),
     "JOB_DISK_LIMIT": Reason(
         500, "Job over its disk space", "The job wrote more than one job may; `limit_bytes` says how much."
     ),
     # the service itself
     "NOT_READY": Reason(503, "Not ready", "`checks` says which part of the service is missing."),
-    "RECORDS_FULL": Reason(
-        507, "Records full", "The record store keeps its last room for what goes on. Delete jobs, or retry later."
-    ),
     "RECORD_UNREADABLE": Reason(
         503,
         "Record unreadable",
         "The record is damaged, or of a later release. The operator knows; a damaged job may be asked for anew.",
     ),
-    "STORE_UNAVAILABLE": Reason(503, "Records unavailable", "The record store does not answer. Retry later."),
-    "STORAGE_UNAVAILABLE": Reason(503, "Storage unavailable", "The blob storage does not answer. Retry later."),
+    "STORAGE_UNAVAILABLE": Reason(
+        503, "Storage unavailable", "The storage or the record store does not answer. Retry later."
+    ),
     "INTERNAL": Reason(500, "Internal error", "The service failed. Its log has the error under the request id."),
 }
 

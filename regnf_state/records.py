@@ -45,7 +45,7 @@ class QuotaError(RecordError):
 class RecordsFullError(RecordError):
     """The store keeps the room that it has left for what goes on already."""
 
-    reason = "RECORDS_FULL"
+    reason = "STORAGE_FULL"
 
 
 class StaleAttemptError(RecordError):

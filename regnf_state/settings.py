@@ -19,7 +19,6 @@ from regnf_core.texts import TextError, decode_text
 
 MIB = 1024 * 1024
 _RATE_BEYOND_LOOPBACK = 20.0
-_WRITES_OF_SEVERAL_CALLERS = 10.0
 
 
 def _default_state_dir() -> Path:
@@ -96,25 +95,8 @@ class Fixed(BaseModel):
 
     max_request_bytes: int = Field(default=1 * MIB, ge=1024)
     """Largest JSON body."""
-    upload_stall_s: float = Field(default=30.0, gt=0)
-    """An upload that sends nothing for this long is refused with 408."""
-    min_bytes_per_s: float = Field(default=4096.0, gt=0)
-    """Slower uploads, and slower readers of answers, are cut off after the time above."""
-    header_timeout_s: float = Field(default=10.0, gt=0)
-    """How long a request's head may take, from the connection or the answer before it."""
-    max_connections: int = Field(default=4096, ge=1)
-    """Less where the system allows fewer open files. Beyond it the connections that wait for their clients go."""
-    max_connections_per_address: int | None = Field(default=None, ge=1)
-    """None: half of all; behind a proxy, which is one address, all."""
     rate_limit_burst: int = Field(default=100, ge=1)
     """Calls that a caller may make at once after a pause."""
-    write_limit_per_s: float | None = Field(default=None, ge=0, allow_inf_nan=False)
-    """Requests a second of each caller that are no reads, in one process; 0: any.
-
-    None: any on loopback without tokens, 10 elsewhere.
-    """
-    write_limit_burst: int = Field(default=200, ge=1)
-    """Such requests that a caller may send at once after a pause."""
     max_requests_per_caller: int = Field(default=512, ge=1)
     """Requests of each caller that are in progress in one process; without tokens, of each address."""
     max_uploads_per_caller: int = Field(default=64, ge=2)
@@ -297,13 +279,6 @@ class Settings(Fixed, BaseSettings):
         if self.quota_calls_per_s is not None:
             return self.quota_calls_per_s
         return 0.0 if self.is_private else _RATE_BEYOND_LOOPBACK
-
-    @property
-    def writes_per_s(self) -> float:
-        """The rate of writes that holds; 0: none. Who is alone on a machine has nobody to keep waiting."""
-        if self.write_limit_per_s is not None:
-            return self.write_limit_per_s
-        return 0.0 if self.is_private and not self.needs_token else _WRITES_OF_SEVERAL_CALLERS
 
     @property
     def scratch_dir(self) -> Path:

@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from regnf_core.errors import InvalidDetectionError
@@ -30,16 +30,20 @@ class Detection:
     label: str | None = None
     score: float | None = None
 
+    def normal(self) -> Detection:
+        """The same box in its one spelling: equal boxes are equal, however they were written."""
+        x, y, z = self.center
+        quaternion = normal_quaternion(self.rotation_quaternion_xyzw)
+        # adding zero turns -0.0 into 0.0
+        return replace(self, center=(x + 0.0, y + 0.0, z + 0.0), rotation_quaternion_xyzw=quaternion)
+
+    def values(self) -> dict[str, Any]:
+        """Its members as plain (JSON) values."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+
     def canonical(self) -> dict[str, Any]:
-        """Plain values for job records: equal boxes have equal values, however they were written."""
-        return {
-            # adding zero turns -0.0 into 0.0
-            "center": [value + 0.0 for value in self.center],
-            "size": list(self.size),
-            "rotation_quaternion_xyzw": list(normal_quaternion(self.rotation_quaternion_xyzw)),
-            "label": self.label,
-            "score": self.score,
-        }
+        """The plain values of its one spelling, for requests."""
+        return self.normal().values()
 
 
 Bounds = tuple[Sequence[float], Sequence[float]]

@@ -100,14 +100,14 @@ class Occupied:
 
 
 def require_apart(edits: Sequence[Occupied]) -> None:
-    """Raises InvalidInputError (EDITS_OVERLAP): two edits take away the same thing, or put matter in one place."""
+    """Raises InvalidInputError (EDIT_INVALID): two edits take away the same thing, or put matter in one place."""
     for (first, one), (second, other) in combinations(enumerate(edits), 2):
         for a, b in _rivals(one, other):
             most = _MOST_COMMON if isinstance(a, PlacedObject) and isinstance(b, PlacedObject) else _MOST_OF_BOX
             if _common(a, b) > most:
                 message = f"edits {first} and {second} change the same place"
                 hint = "Leave one of them out, or make one after the other: an edited scene can be edited again."
-                raise InvalidInputError(message, reason="EDITS_OVERLAP", hint=hint)
+                raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)
 
 
 def _rivals(one: Occupied, other: Occupied) -> Iterator[tuple[Place, Place]]:
@@ -212,8 +212,8 @@ def compose(
 
     Distances are in scene units. Deterministic for a seed. ``progress`` is called with the share done, 0..1, before
     each edit; it may raise CancelledError to stop the work.
-    Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID, EDITS_OVERLAP (two edits change the same place),
-    EDIT_OUTSIDE_SCENE, FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
+    Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID (two edits change the same place),
+    EDIT_INVALID, FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
     surfaces: dict[int, OrientedBox] = {}
     scene, origin = near_origin(scene)
@@ -299,7 +299,7 @@ def _scene_units(residual: float | None, thing: PlacedObject) -> float:
 
 
 def _require_in_scene(scene: SdfField, plan: _Planned, number: int) -> None:
-    """Raises InvalidInputError (EDIT_OUTSIDE_SCENE): nothing of the thing lies within the scene's bounds."""
+    """Raises InvalidInputError (EDIT_INVALID): nothing of the thing lies within the scene's bounds."""
     low, high = scene.bounds
     for thing in (plan.removed, plan.placed):
         box = thing.box if isinstance(thing, PlacedObject) else thing
@@ -309,4 +309,4 @@ def _require_in_scene(scene: SdfField, plan: _Planned, number: int) -> None:
         if bool((corners.amin(0) > high).any()) or bool((corners.amax(0) < low).any()):
             message = f"edit {number}: what it changes lies outside of the scene's bounds"
             hint = "T_object_scene takes scene coordinates to object coordinates. Check its direction and the units."
-            raise InvalidInputError(message, reason="EDIT_OUTSIDE_SCENE", hint=hint)
+            raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)

@@ -195,7 +195,7 @@ def render_frames(
 
     ``cancelled`` is asked before each tile; CancelledError is raised once it says so. processes: forked copies of this
     process that share the tiles, where the system can and the field is on the CPU; the frames are the same.
-    Raises InvalidInputError: CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; NoSurfaceError
+    Raises InvalidInputError: CAMERA_INVALID, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; NoSurfaceError
     (NO_SURFACE_IN_SCENE); ProcessLostError (WORKER_LOST).
     """
     chosen = options or RenderOptions()
@@ -265,7 +265,7 @@ class Renderer:
         return cls(field, grid, painter, options)
 
     def check(self, camera: Camera, position: Tensor) -> None:
-        """Raises InvalidInputError (CAMERA_IN_MATTER): the camera stands within the bounds and in matter.
+        """Raises InvalidInputError (CAMERA_INVALID): the camera stands within the bounds and in matter.
 
         position: where it is, as its user says it.
         """
@@ -276,7 +276,7 @@ class Renderer:
         if float(finite_distance(self.field, camera.position[None].float().to(self.field.device))[0]) <= 0.0:
             place = ", ".join(f"{value:.4g}" for value in position.tolist())
             hint = "Move it into free space, or let what is before it be cut away: option cut_away."
-            raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_IN_MATTER", hint=hint)
+            raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_INVALID", hint=hint)
 
     def tiles(self, camera: Camera, processes: int) -> list[Tensor]:
         """The pixels of the frame in rectangles that fit the memory, and are enough for the processes."""

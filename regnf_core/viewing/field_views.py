@@ -229,7 +229,7 @@ class DisplayMeshes:
 class TooSlowError(RegnfError):
     """The field is too slow to be drawn in good time."""
 
-    reason = "FIELD_PREVIEW_NOT_FOUND"
+    reason = "FIELD_VIEW_NOT_FOUND"
 
 
 def display_meshes(field: SdfField, budget_s: float) -> DisplayMeshes:

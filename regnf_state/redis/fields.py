@@ -147,11 +147,11 @@ def _importing_key(owner: str) -> str:
 def _caps(record: FieldRecord, quota: Quota) -> list[Cap]:
     key, caps = _stored_key(record.owner), list[Cap]()
     if quota.imports is not None:
-        caps.append(("SCARD", _importing_key(record.owner), 1, quota.imports, "QUOTA_IMPORTS"))
+        caps.append(("SCARD", _importing_key(record.owner), 1, quota.imports, "QUOTA_ACTIVE_JOBS"))
     if quota.fields is not None:
-        caps.append(("HLEN", key, 1, quota.fields, "QUOTA_FIELDS"))
+        caps.append(("HLEN", key, 1, quota.fields, "QUOTA_STORED"))
     if quota.stored_bytes is not None:
-        caps.append(("HVALS", key, record.kept_bytes, quota.stored_bytes, "QUOTA_STORED_BYTES"))
+        caps.append(("HVALS", key, record.kept_bytes, quota.stored_bytes, "QUOTA_STORED"))
     return caps
 
 

@@ -108,7 +108,7 @@ class Posting:
             line.is_done = is_told and status in ("running", "successful")
 
     def require_room(self) -> None:
-        """Raises Problem QUOTA_BATCHES, QUOTA_STORED_BYTES, QUOTA_ACTIVE_JOBS, QUEUE_FULL, QUOTA_WORKER_SECONDS.
+        """Raises Problem QUOTA_ACTIVE_JOBS, QUOTA_STORED, QUOTA_ACTIVE_JOBS, QUEUE_FULL, QUOTA_WORKER_SECONDS.
 
         Then nothing is started.
         """
@@ -139,12 +139,13 @@ class Posting:
         while len(kept) >= services.settings.quota_batches:
             ended = next((entry for entry in reversed(kept) if not _is_active(services, caller, entry.key)), None)
             if ended is None:
-                raise Problem("QUOTA_BATCHES", headers=RETRY_LATER)
+                detail = "You have the maximum number of batches, and none has ended. Wait for one."
+                raise Problem("QUOTA_ACTIVE_JOBS", detail, headers=RETRY_LATER)
             services.batches.delete(caller, ended.key.rpartition("/")[2])
             kept.remove(ended)
         room = room_for_bytes(services, caller)
         if room is not None and len(self._batch().text()) > room:
-            raise Problem("QUOTA_STORED_BYTES")
+            raise Problem("QUOTA_STORED")
 
     def submit(self, lines: Sequence[Line]) -> None:
         """Start their jobs, as POST /register does. Raises what that raises, where it is not of one line alone."""

@@ -17,7 +17,7 @@ from regnf_state.records import FieldRecord
 _WINDOW_MINUTES = 60
 
 
-def check_budget(services: Services, caller: str, headers: Mapping[str, str] | None = None) -> None:
+def check_budget(services: Services, caller: str) -> None:
     """Refuse new work of a caller whose work of the last hour has used up the budget.
 
     Measured seconds count, of failed work too. Raises Problem QUOTA_WORKER_SECONDS.
@@ -27,7 +27,7 @@ def check_budget(services: Services, caller: str, headers: Mapping[str, str] | N
         return
     wait_s = seconds_until_free(services.queue.spent(caller), budget, services.records.now())
     if wait_s:
-        raise Problem("QUOTA_WORKER_SECONDS", headers={**(headers or {}), "Retry-After": str(wait_s)})
+        raise Problem("QUOTA_WORKER_SECONDS", headers={"Retry-After": str(wait_s)})
 
 
 def seconds_until_free(spent: Mapping[int, float], budget: float, now: float) -> int:

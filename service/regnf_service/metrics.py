@@ -2,80 +2,24 @@
 
 from __future__ import annotations
 
-import resource
-import socket
-import threading
 import time
 from collections import Counter as Tally
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from http import HTTPStatus
-from http.server import ThreadingHTTPServer
-from pathlib import Path
-from typing import Any
+from contextlib import contextmanager
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
-from prometheus_client.exposition import MetricsHandler
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 from redis.exceptions import RedisError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from regnf_service.http.connections import Connections
-from regnf_service.http.hosts import AllowedHosts, parse_authority
 from regnf_service.http.middleware import route_of
-from regnf_service.http.problems import SECURITY_HEADERS
 from regnf_service.services import Services
 from regnf_state.redis.counters import Counters
 from regnf_state.redis.fair_queue import FairQueue
 from regnf_state.redis.webhook_outbox import RedisOutbox
-
-# File descriptors of this process: raised to what the system allows, shared out, and counted.
-
-_ENOUGH = 65536
-_LARGEST_BACKLOG = 2048
-_LARGEST_RESERVE = 512
-
-
-@dataclass(frozen=True)
-class Share:
-    """backlog: connections that one look at the socket may take in · connections: how many may stay.
-
-    The rest is kept for stores, files, and whoever is just being refused: so `accept` never fails for want of one.
-    """
-
-    backlog: int
-    connections: int
-
-
-def raise_limit() -> int:
-    """Allow as many as the system does, up to a number that is enough; returns how many may be open now."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = resource.RLIM_INFINITY
-    wanted = _ENOUGH if hard == unlimited else min(hard, _ENOUGH)
-    if soft != unlimited and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-        soft = wanted
-    return _ENOUGH if soft == unlimited else soft
-
-
-def shared_out(limit: int, most_connections: int) -> Share:
-    """What connections may have of ``limit`` descriptors: at least a quarter of them are for nothing else."""
-    backlog = min(_LARGEST_BACKLOG, limit // 4)
-    reserve = min(_LARGEST_RESERVE, 3 * limit // 8)
-    return Share(backlog, max(1, min(most_connections, limit - backlog - reserve)))
-
-
-def open_descriptors() -> int:
-    """How many are open; 0 where the system does not tell."""
-    try:
-        return sum(1 for _ in Path("/proc/self/fd").iterdir())
-    except OSError:
-        return 0
-
 
 # How callers share the workers, for Prometheus. The names of callers are labels, so only so many are told apart.
 
@@ -148,7 +92,7 @@ _TIMES = {
 class Metrics:
     """The registry of one application. Routes are counted by their templates, never by the ids in them."""
 
-    def __init__(self, services: Services, connections: Connections | None = None) -> None:
+    def __init__(self, services: Services) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "regnf_http_requests", "Requests answered.", ("method", "route", "status"), registry=self.registry
@@ -160,7 +104,7 @@ class Metrics:
         self.redis_errors = Counter(
             "regnf_redis_errors", "Answers and scrapes for which Redis was away.", registry=self.registry
         )
-        self.registry.register(_Process(connections))
+        ProcessCollector(registry=self.registry)
         self.quota_refusals = Counter(
             "regnf_quota_refusals",
             "Calls refused because of what their caller has.",
@@ -168,25 +112,6 @@ class Metrics:
             registry=self.registry,
         )
         self.registry.register(_Held(self, services))
-
-
-class _Process(Collector):
-    """Connections and descriptors of this process."""
-
-    def __init__(self, connections: Connections | None) -> None:
-        self._connections = connections
-
-    def collect(self) -> Iterator[Metric]:
-        yield _gauge("open_file_descriptors", "Files and connections that are open.", open_descriptors())
-        yield _gauge("file_descriptor_limit", "How many may be open.", resource.getrlimit(resource.RLIMIT_NOFILE)[0])
-        if self._connections is not None:
-            yield _gauge("connections", "Open connections.", len(self._connections))
-            refused = CounterMetricFamily(
-                "regnf_connections_refused", "Connections that were refused or closed early.", labels=("cause",)
-            )
-            for cause, count in sorted(self._connections.ended.items()):
-                refused.add_metric((cause,), count)
-            yield refused
 
 
 class _Held(Collector):
@@ -284,87 +209,17 @@ class Measured:
                 self._metrics.received.labels(route).inc(received)
 
 
-# `/metrics` on a port of its own: for Prometheus, not for web pages, and with few connections at once.
-
-_MOST_CONNECTIONS = 16
-_SILENCE_S = 5.0
-"""How long a scraper may send nothing, or read nothing."""
-_LONGEST_S = 15.0
-"""How long one scrape may take in all: who sends a byte now and then must not keep a connection for hours."""
-
-
 @contextmanager
-def served(registry: CollectorRegistry, hosts: AllowedHosts, address: str | None) -> Iterator[None]:
-    """Answer scrapes at `host:port` while the context lasts; no address: not at all."""
+def served(registry: CollectorRegistry, address: str | None) -> Iterator[None]:
+    """Answer scrapes at `host:port` while the context lasts, whoever asks; no address: not at all."""
     if address is None:
         yield
         return
-    handler = type("_Handler", (_Handler,), {"registry": registry, "hosts": hosts})
     host, _, port = address.rpartition(":")
-    server = _Server((host.strip("[]"), int(port)), handler)
-    thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
-    thread.start()
+    server, thread = start_http_server(int(port), host.strip("[]"), registry)
     try:
         yield
     finally:
         server.shutdown()
         server.server_close()
         thread.join()
-
-
-class _Handler(MetricsHandler):
-    hosts: AllowedHosts
-    timeout = _SILENCE_S
-
-    def do_GET(self) -> None:  # noqa: N802 -- the base class dispatches by this name
-        given = self.headers.get_all("Host") or []
-        host = parse_authority(given[0]) if len(given) == 1 else None
-        if host is None or not self.hosts.knows(host, str(self.connection.getsockname()[0])):
-            self.send_error(HTTPStatus.MISDIRECTED_REQUEST, "Host not allowed: see REGNF_ALLOWED_HOSTS")
-        elif self.headers.get("Origin") is not None or self.headers.get("Sec-Fetch-Site", "none") != "none":
-            self.send_error(HTTPStatus.FORBIDDEN, "Origin not allowed")
-        else:
-            super().do_GET()
-
-    def end_headers(self) -> None:
-        for name, value in SECURITY_HEADERS.items():
-            self.send_header(name, value)
-        super().end_headers()
-
-
-class _Server(ThreadingHTTPServer):
-    """A thread a connection, and no more of them than a few: others are closed at once."""
-
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, address: tuple[str, int], handler: type[MetricsHandler]) -> None:
-        found = socket.getaddrinfo(*address, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        self.address_family = found[0]
-        self._slots = threading.BoundedSemaphore(_MOST_CONNECTIONS)
-        super().__init__((str(found[4][0]), int(found[4][1])), handler)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if self._slots.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        ending = threading.Timer(_LONGEST_S, _cut_off, (request,))
-        ending.daemon = True
-        ending.start()
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            ending.cancel()
-            self._slots.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """A scraper that leaves is no error of ours."""
-
-
-def _cut_off(connection: socket.socket) -> None:
-    """Whoever reads from or writes to the connection finds that it has ended."""
-    with suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)

@@ -69,7 +69,7 @@ def test_a_pose_may_be_said_in_either_direction(folder: Path, member: str) -> No
         (
             "initial_transform",
             [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-            "INITIAL_TRANSFORM_UNSUPPORTED",
+            "PRESET_UNSUITABLE",
         ),
         (
             "ground_truth",

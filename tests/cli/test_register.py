@@ -118,7 +118,7 @@ def test_the_published_method_starts_from_nothing_given(run: Run, exact: list[ob
     (tmp_path / "start.json").write_text(json.dumps(np.eye(4).tolist()))
     outcome = run(*exact, "--preset", "paper", "--initial-transform", tmp_path / "start.json")
     assert outcome.code == 2
-    assert outcome.stderr.startswith("INITIAL_TRANSFORM_UNSUPPORTED ")
+    assert outcome.stderr.startswith("PRESET_UNSUITABLE ")
 
 
 @pytest.mark.parametrize(

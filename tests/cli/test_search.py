@@ -100,7 +100,7 @@ def test_the_published_method_searches_nothing(run: Run, tmp_path: Path) -> None
     (tmp_path / "options.json").write_text('{"preset": "paper"}')
     outcome = run(*DEMO, "--options", tmp_path / "options.json")
     assert outcome.code == 2
-    assert outcome.stderr.startswith("LIBRARY_SEARCH_UNSUPPORTED ")
+    assert outcome.stderr.startswith("PRESET_UNSUITABLE ")
 
 
 def candidate(name: str, stage: str, score: float | None, verdict: str | None = None) -> dict[str, Any]:

@@ -14,12 +14,12 @@ from tests.client.conftest import pretended
 JOB = {"id": "j", "kind": "registration", "status": "running"}
 
 
-def refusal(status: int = 429, reason: str = "TOO_MANY_WRITES", after: str | None = "3") -> httpx.Response:
+def refusal(status: int = 429, reason: str = "RATE_LIMITED", after: str | None = "3") -> httpx.Response:
     headers = {} if after is None else {"Retry-After": after}
     return httpx.Response(status, json={"reason": reason, "detail": "not now"}, headers=headers)
 
 
-@pytest.mark.parametrize("reason", ["TOO_MANY_WRITES", "RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE", "TOO_MANY_UPLOADS"])
+@pytest.mark.parametrize("reason", ["RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE"])
 def test_what_is_too_fast_is_asked_again_when_the_service_says(reason: str, slept: list[float]) -> None:
     answers = [refusal(reason=reason)] * 3 + [httpx.Response(200, json=JOB)]
     assert pretended(lambda _: answers.pop(0)).job("j").status == "running"
@@ -36,7 +36,7 @@ def test_a_file_that_is_still_to_come_is_waited_for(slept: list[float]) -> None:
 def test_patience_ends(slept: list[float]) -> None:
     with pytest.raises(ServiceError) as caught:
         pretended(lambda _: refusal(after="10")).job("j")
-    assert (caught.value.reason, caught.value.status) == ("TOO_MANY_WRITES", 429)
+    assert (caught.value.reason, caught.value.status) == ("RATE_LIMITED", 429)
     assert 100 < sum(slept) <= 120
 
 

@@ -44,7 +44,7 @@ def guarded(worlds: Callable[..., World]) -> World:
 @pytest.fixture(scope="session")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """A real API without a worker, so that what was uploaded lies still. Its users are the group `live api`."""
-    with live_service(tmp_path_factory.mktemp("live-api"), with_worker=False, upload_stall_s=1.0) as started:
+    with live_service(tmp_path_factory.mktemp("live-api"), with_worker=False) as started:
         yield started
 
 

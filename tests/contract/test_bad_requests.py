@@ -183,10 +183,10 @@ def test_what_does_not_go_together(world: World) -> None:
     """The published method searches no library and starts from no transform; a search starts from none either."""
     paper, start = {"options": {"preset": "paper"}}, {"initial_transform": IDENTITY}
     one = world.valid_request()
-    problem = assert_refused(post(world, one | paper | start), 422, "INITIAL_TRANSFORM_UNSUPPORTED")
+    problem = assert_refused(post(world, one | paper | start), 422, "PRESET_UNSUITABLE")
     assert pointers(problem) == ["/initial_transform"]
-    assert_refused(post(world, searching(world, **start)), 422, "INITIAL_TRANSFORM_UNSUPPORTED")
-    assert_refused(post(world, searching(world, **paper)), 422, "LIBRARY_SEARCH_UNSUPPORTED")
+    assert_refused(post(world, searching(world, **start)), 422, "PRESET_UNSUITABLE")
+    assert_refused(post(world, searching(world, **paper)), 422, "PRESET_UNSUITABLE")
     assert_refused(post(world, one | start | {"options": {"preset": "fastest"}}), 422, "INVALID_OPTIONS")
 
 

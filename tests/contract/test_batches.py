@@ -155,7 +155,7 @@ def test_what_is_no_batch(worlds: Any) -> None:
         (b"\n \n", NDJSON, 422, "INVALID_REQUEST"),
         (b"{}", {"Content-Type": "application/json"}, 415, "UNSUPPORTED_MEDIA_TYPE"),
         (b"{}", NDJSON | {"Content-Encoding": "gzip"}, 415, "UNSUPPORTED_MEDIA_TYPE"),
-        (b"{}\n" * 6, NDJSON, 413, "TOO_MANY_PAIRS"),
+        (b"{}\n" * 6, NDJSON, 413, "REQUEST_TOO_LARGE"),
         (b" " * 3000, NDJSON, 413, "REQUEST_TOO_LARGE"),
         (b"\xff\xfe{\x00\n", NDJSON, 400, "MALFORMED_JSON"),
         ('{"a": 1}\n'.encode("utf-16-le")[:-1] + b"\x00\xd8", NDJSON, 400, "MALFORMED_JSON"),
@@ -213,18 +213,18 @@ def test_a_caller_has_a_share_of_the_queue(worlds: Callable[..., World]) -> None
 def test_batches_count_among_the_bytes_of_their_caller(worlds: Callable[..., World]) -> None:
     world = worlds(quota_stored_bytes=1700)
     long = [{**one, "key": str(one["seed"]) * 190} for one in pairs(world, 2)]
-    assert_refused(post(world, long), 403, "QUOTA_STORED_BYTES")
+    assert_refused(post(world, long), 403, "QUOTA_STORED")
     assert world.queue.registrations == []
     posted(world, long[:1])
     data = field_bytes("another", 500)
-    assert_refused(world.client.put(f"/fields/{sha256(data)}", content=data), 403, "QUOTA_STORED_BYTES")
+    assert_refused(world.client.put(f"/fields/{sha256(data)}", content=data), 403, "QUOTA_STORED")
 
 
 def test_a_caller_has_so_many_batches_and_the_oldest_that_has_ended_goes(worlds: Any) -> None:
     world = worlds(quota_batches=2)
     lines = pairs(world, 4)
     first, second = posted(world, lines[:1]), posted(world, lines[1:2])
-    assert_refused(post(world, lines[2:]), 429, "QUOTA_BATCHES")
+    assert_refused(post(world, lines[2:]), 429, "QUOTA_ACTIVE_JOBS")
     assert len(world.queue.registrations) == 2, "nothing was started"
     assert posted(world, lines[:1]) == first, "it has it already"
     ((job_id, _),) = [one for one in world.queue.registrations if world.records.get_job(one[0]).inputs["seed"] == 1]

@@ -12,7 +12,6 @@ import pytest
 from redis import Redis
 
 from regnf_service.http import body as parsing
-from regnf_service.http.middleware import WrongTokens
 from regnf_service.http.schemas import reading
 from regnf_service.http.strict_json import MOST_VALUES, count_values
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world
@@ -101,42 +100,3 @@ def test_labels_break_no_lines_and_turn_no_text(world: World, label: str) -> Non
     assert_refused(world.client.post("/register", json=request), 422, "INVALID_DETECTION")
     files = {"file": ("f", field_bytes("labeled")), "description": (None, json.dumps({"label": label}))}
     assert_refused(world.client.post("/fields", files=files), 422, "INVALID_DESCRIPTION")
-
-
-# wrong tokens
-
-
-def test_wrong_tokens_become_429_and_right_ones_stay_right(guarded: World) -> None:
-    def guess(token: str) -> Any:
-        return guarded.client.get("/jobs", headers={"Authorization": f"Bearer {token}"})
-
-    statuses = [guess(f"guess-{n}").status_code for n in range(60)]
-    assert statuses[:20] == [401] * 20
-    assert statuses[-1] == 429
-    refused = guess("another")
-    assert_refused(refused, 429, "TOO_MANY_WRONG_TOKENS")
-    assert 1 <= int(refused.headers["retry-after"]) <= 5
-    assert refused.headers["connection"] == "close"
-    assert guarded.client.get("/jobs", headers=ALICE).status_code == 200
-    # no token at all is no guess
-    assert_refused(guarded.client.get("/jobs"), 401, "UNAUTHENTICATED")
-
-
-def test_buckets_are_of_addresses_and_few() -> None:
-    now = 0.0
-    wrong = WrongTokens(lambda: now)
-
-    def send(address: str, times: int = 1) -> int:
-        return [wrong.wait_s({"client": (address, 1)}) for _ in range(times)][-1]
-
-    assert send("10.0.0.1", 20) == 0
-    assert send("10.0.0.1") == 5
-    assert send("10.0.0.2") == 0
-    assert send("2001:db8::1", 20) == 0
-    assert send("2001:db8::ffff") == 5
-    now = 5.0
-    assert send("10.0.0.1") == 0
-    assert send("10.0.0.1") == 5
-    for number in range(10_000):
-        send(f"10.1.{number // 256}.{number % 256}")
-    assert len(wrong._sites) == 4096

@@ -108,8 +108,8 @@ def test_the_same_bytes_with_other_settings_are_another_function(world: World) -
 def test_settings_have_their_limit_are_not_empty_and_count_towards_the_quota(worlds: Worlds) -> None:
     world = worlds(quota_stored_bytes=1000)
     assert_refused(send(world, None, ("config.yml", b"x" * 5000)), 413, "UPLOAD_TOO_LARGE")
-    assert_refused(send(world, None, ("config.yml", b"")), 400, "UPLOAD_EMPTY")
-    assert_refused(send(world, None, ("config.yml", b"x" * 500)), 403, "QUOTA_STORED_BYTES")
+    assert_refused(send(world, None, ("config.yml", b"")), 400, "UPLOAD_INCOMPLETE")
+    assert_refused(send(world, None, ("config.yml", b"x" * 500)), 403, "QUOTA_STORED")
     assert world.blobs.blobs == {}
     assert send(world, None, ("config.yml", b"x" * 300)).status_code == 201
     assert world.records.stored("anonymous") == (1, 900)
@@ -244,14 +244,14 @@ def test_kept_bytes_count_and_give_way(worlds: Worlds) -> None:
     gone = world.client.get("/" + first.removesuffix("/original")).json()
     assert (gone["state"], gone["kept_until"]) == ("rejected", None)
     assert put(world.client, field_bytes("4")).status_code == 201
-    assert_refused(send(world, data=field_bytes("5")), 403, "QUOTA_STORED_BYTES")
+    assert_refused(send(world, data=field_bytes("5")), 403, "QUOTA_STORED")
 
 
 def test_kept_fields_give_way_too(worlds: Worlds) -> None:
     world = worlds(quota_fields=1)
     question(world, "1")
     assert put(world.client, field_bytes("2")).status_code == 201
-    assert_refused(send(world, data=field_bytes("3")), 403, "QUOTA_FIELDS")
+    assert_refused(send(world, data=field_bytes("3")), 403, "QUOTA_STORED")
 
 
 def test_the_same_question_is_asked_at_once_and_its_bytes_are_kept(world: World) -> None:
@@ -320,7 +320,7 @@ def test_an_answer_makes_the_question_and_its_pictures_go(world: World) -> None:
     asked_about(world)
     assert set(world.blobs.blobs) == {ORIGINAL, *PICTURES}
     assert change(world, description=candidates(world, "description")[0]).status_code == 202
-    assert_refused(world.client.get(FIRST), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(FIRST), 404, "FIELD_VIEW_NOT_FOUND")
     asked_about(world, [Candidate("of two", {"sign": 1}), Candidate("the other", {"sign": -1}, b"\x89PNG -")])
     assert candidates(world, "name") == ["of two", "the other"], "another question takes the place of the first"
     assert set(world.blobs.blobs) == {ORIGINAL, f"{FOLDER}/candidates/2.png"}
@@ -335,7 +335,7 @@ def test_pictures_go_with_the_upload_and_with_the_field(world: World) -> None:
     asked_about(world)
     assert Originals(world.records, world.blobs, world.settings).free("anonymous")
     assert (world.blobs.blobs, candidates(world, "picture")) == ({}, [None] * 3)
-    assert_refused(world.client.get(FIRST), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(FIRST), 404, "FIELD_VIEW_NOT_FOUND")
     assert world.client.delete(PLACE).status_code == 204
     assert send(world).json()["state"] == "rejected"
     assert candidates(world, "picture") == [None] * 3

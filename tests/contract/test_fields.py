@@ -156,11 +156,11 @@ def test_uploads_far_larger_than_a_block_arrive_whole(worlds: Callable[..., Worl
 def test_a_ready_field_has_a_picture_if_its_import_made_one(world: World) -> None:
     put(world.client, A)
     assert "preview" not in world.client.get(PLACE).json()["links"]
-    assert_refused(world.client.get(f"{PLACE}/preview.png"), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(f"{PLACE}/preview.png"), 404, "FIELD_VIEW_NOT_FOUND")
     world.records.update_field(sha256(A), attempt=1, state="ready")
     address = world.client.get(f"/v1{PLACE}").json()["links"]["preview"]
     assert address == f"/v1{PLACE}/preview.png"
-    assert_refused(world.client.get(address), 404, "FIELD_PREVIEW_NOT_FOUND")
+    assert_refused(world.client.get(address), 404, "FIELD_VIEW_NOT_FOUND")
     world.blobs.put(f"fields/{sha256(A)}/preview.png", b"\x89PNG")
     answer, head = world.client.get(address), world.client.head(address)
     assert (answer.status_code, answer.content, answer.headers["content-type"]) == (200, b"\x89PNG", "image/png")

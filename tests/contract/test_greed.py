@@ -62,7 +62,7 @@ def test_imports_that_wait_are_bounded_for_each_caller(shared: Callable[..., Wor
     world = shared()
     answers = [put(world.client, str(number)) for number in range(100)]
     assert [answer.status_code for answer in answers] == [201] * 64 + [429] * 36
-    assert_refused(answers[-1], 429, "QUOTA_IMPORTS")
+    assert_refused(answers[-1], 429, "QUOTA_ACTIVE_JOBS")
     assert int(answers[-1].headers["Retry-After"]) >= 1
     assert len(list(world.blobs.list("fields"))) == 64
     with client_of(world.app, headers=HONEST) as honest:

@@ -67,7 +67,7 @@ def test_the_detected_symmetry_holds_until_another_is_said(world: World) -> None
     assert said(TURNED) == (UNIT, "said")
     assert said({"order": 1}) == (UNIT | {"order": 1}, "said")
     refused = world.client.patch("/library/office chair", json={"symmetry": {"order": 4}})
-    assert_refused(refused, 422, "LIBRARY_ENTRY_INVALID")  # a continuous one has the order 1 or 2
+    assert_refused(refused, 422, "INVALID_REQUEST")  # a continuous one has the order 1 or 2
     assert world.client.get("/library/office chair").json()["symmetry"] == UNIT | {"order": 1}
     assert said(None) == (FOUND, "detected")
     assert said({"order": 4}) == ({"order": 4, "axis": None, "continuous": False}, "said")

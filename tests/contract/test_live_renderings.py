@@ -122,12 +122,12 @@ def test_what_only_the_fields_can_tell(
 ) -> None:
     edit = substitution(demo_fields)
     twice = [edit, {"kind": "removal", "detection": DETECTION}]
-    assert "edits 0 and 1" in failed(live_client, live_stack, demo_fields, "EDITS_OVERLAP", edits=twice)["detail"]
+    assert "edits 0 and 1" in failed(live_client, live_stack, demo_fields, "EDIT_INVALID", edits=twice)["detail"]
     far = [*([*row[:3], row[3] + 1000.0] for row in TRUTH[:3]), TRUTH[3]]
     away = [edit | {"T_object_scene": far}]
-    failed(live_client, live_stack, demo_fields, "EDIT_OUTSIDE_SCENE", edits=away)
+    failed(live_client, live_stack, demo_fields, "EDIT_INVALID", edits=away)
     station = {"position": deepest_place(), "target": DETECTION["center"]}
-    failed(live_client, live_stack, demo_fields, "CAMERA_IN_MATTER", orbit=None, look_at=[station])
+    failed(live_client, live_stack, demo_fields, "CAMERA_INVALID", orbit=None, look_at=[station])
 
 
 def test_a_rendering_that_is_cancelled_leaves_nothing(

@@ -35,7 +35,7 @@ def broken() -> None:
 @pytest.mark.parametrize(
     ("missing", "reason", "holder", "name", "stand_in"),
     [
-        ("records", "STORE_UNAVAILABLE", "records", "probe", away),
+        ("records", "STORAGE_UNAVAILABLE", "records", "probe", away),
         ("storage", "STORAGE_UNAVAILABLE", "blobs", "probe", broken),
         ("worker", "NO_WORKER", "queue", "workers", 0),
     ],

@@ -191,7 +191,7 @@ def test_the_same_bytes_are_each_callers_own(shared: World, bob: httpx.Client, a
 
 def test_a_put_without_the_bytes_tells_nothing(bob: httpx.Client, alices_job: str) -> None:
     for known in (sha256(SCENE), "0" * 64):
-        assert_refused(bob.put(f"/fields/{known}", content=b""), 400, "UPLOAD_EMPTY")
+        assert_refused(bob.put(f"/fields/{known}", content=b""), 400, "UPLOAD_INCOMPLETE")
         assert_refused(bob.put(f"/fields/{known}", content=field_bytes("other")), 400, "DIGEST_MISMATCH")
 
 

@@ -50,7 +50,7 @@ def test_mesh_of_a_ready_field(world: World) -> None:
     known = world.ready_field("a")
     address = world.client.get(f"/v1/fields/{known}").json()["links"]["mesh"]
     assert address == f"/v1/fields/{known}/mesh.glb"
-    assert_refused(world.client.get(address), 404, "FIELD_MESH_NOT_FOUND")
+    assert_refused(world.client.get(address), 404, "FIELD_VIEW_NOT_FOUND")
     world.blobs.put(f"fields/{known}/mesh.glb", b"glTF fine")
     for detail in ("fine", "coarse"):
         assert world.client.get(address, params={"detail": detail}).content == b"glTF fine"
@@ -71,7 +71,7 @@ def test_mesh_that_is_still_to_be_made(world: World) -> None:
         address = f"/fields/{field}"
         assert world.client.get(address).json()["views"] is None, "of an earlier release"
         refused = world.client.get(f"{address}/mesh.glb")
-        assert_refused(refused, 404, "FIELD_MESH_NOT_FOUND")
+        assert_refused(refused, 404, "FIELD_VIEW_NOT_FOUND")
         assert refused.headers["retry-after"] == "1"
         assert world.client.get(address).json()["views"] == "pending"
     assert world.records.undrawn_fields() == [other, known]
@@ -79,7 +79,7 @@ def test_mesh_that_is_still_to_be_made(world: World) -> None:
     assert world.records.undrawn_fields() == [known, other], "the one asked for last is drawn first"
     world.records.update_field(known, views="none")
     refused = world.client.get(f"/fields/{known}/mesh.glb")
-    assert_refused(refused, 404, "FIELD_MESH_NOT_FOUND")
+    assert_refused(refused, 404, "FIELD_VIEW_NOT_FOUND")
     assert "retry-after" not in refused.headers
 
 

@@ -70,7 +70,7 @@ def test_a_piece_that_is_no_next_one_is_refused_and_not_kept(world: World) -> No
     put(world, 0, 700)
     for first in (0, 600, 701):
         answer = put(world, first, 1000)
-        assert assert_refused(answer, 409, "UPLOAD_OFFSET_MISMATCH")["offset"] == 700
+        assert assert_refused(answer, 409, "UPLOAD_NOT_FINISHED")["offset"] == 700
         assert answer.headers["upload-offset"] == "700"
     assert_refused(put(world, 700, 2000, sent=DATA[700:1500]), 400, "UPLOAD_INCOMPLETE")
     assert_refused(put(world, 700, 1000, **{"Content-Digest": announced(DATA)}), 400, "DIGEST_MISMATCH")
@@ -100,7 +100,7 @@ def test_a_wrong_range_is_refused(world: World) -> None:
         "INVALID_HEADER": (400, ["bytes 0-9", "bytes 9-0/2000", "bytes 0-2000/2000", "items 0-9/2000", "bytes 0-9/*",
                                  "bytes 0-9/9999999999999999", "bytes 0-9/2000", "bytes */2000"]),
         "UPLOAD_TOO_LARGE": (413, ["bytes 0-9/5000"]),
-        "UPLOAD_EMPTY": (400, ["bytes */0"]),
+        "UPLOAD_INCOMPLETE": (400, ["bytes */0"]),
     }  # fmt: skip
     for reason, (status, spans) in wrong.items():
         for span in spans:
@@ -123,7 +123,7 @@ def test_settings_go_with_pieces(world: World, encoding: str) -> None:
 
 def test_settings_before_all_pieces_lose_nothing_and_without_any_are_refused(world: World) -> None:
     assert assert_refused(finish(world), 409, "UPLOAD_NOT_FINISHED")["offset"] == 0
-    assert_refused(finish(world, file=("a", DATA)), 400, "MISSING_PART")
+    assert_refused(finish(world, file=("a", DATA)), 400, "MALFORMED_MULTIPART")
     assert_refused(finish(world, "../x"), 400, "INVALID_DIGEST")
     put(world, 0, 700)
     refused = finish(world, settings=("config.yml", b"method: neus"))
@@ -147,9 +147,9 @@ def test_pieces_count_towards_the_quota(worlds: Worlds) -> None:
     world = worlds(quota_stored_bytes=2500)
     put(world, 0, 1500)
     other = field_bytes("other", 1200)
-    assert_refused(contract.put(world.client, other), 403, "QUOTA_STORED_BYTES")
+    assert_refused(contract.put(world.client, other), 403, "QUOTA_STORED")
     assert put(world, 1500, 2000).status_code == 201
-    assert_refused(put(world, 0, 600, other), 403, "QUOTA_STORED_BYTES")
+    assert_refused(put(world, 0, 600, other), 403, "QUOTA_STORED")
 
 
 def test_each_caller_has_pieces_of_its_own(worlds: Worlds) -> None:
@@ -259,7 +259,7 @@ def test_what_the_field_has_no_room_for_is_not_put_together(worlds: Worlds, monk
     other = field_bytes("other", 900)
     assert contract.put(world.client, other).status_code == 201
     writers = Writers(world, monkeypatch)
-    assert_refused(finish(world), 429, "QUOTA_IMPORTS")
+    assert_refused(finish(world), 429, "QUOTA_ACTIVE_JOBS")
     assert writers.bytes == 0
     assert world.client.delete(f"/fields/{sha256(other)}").status_code == 204
     assert finish(world).status_code == 201, "the field takes the place of its pieces in the quota"

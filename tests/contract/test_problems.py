@@ -72,7 +72,7 @@ def test_records_that_are_away_are_said_to_be_away(world: World, monkeypatch: py
         with monkeypatch.context() as patch:
             patch.setattr(world.records, name, away)
             answer = world.client.request(method, path, json=request)
-        assert_refused(answer, 503, "STORE_UNAVAILABLE")
+        assert_refused(answer, 503, "STORAGE_UNAVAILABLE")
         assert int(answer.headers["retry-after"]) > 0
         assert "10.0.0.7" not in answer.text
 

@@ -287,7 +287,7 @@ def test_one_shot_keeps_nothing_of_a_request_that_is_refused_or_a_dry_run(world:
     assert_refused(world.client.post("/register", files=unknown), 422, "INVALID_OPTIONS")
     good = one_shot(one, two, {"detection": BOX})
     missing = {name: part for name, part in good.items() if name != "object"}
-    assert_refused(world.client.post("/register", files=missing), 400, "MISSING_PART")
+    assert_refused(world.client.post("/register", files=missing), 400, "MALFORMED_MULTIPART")
     assert world.client.post("/register?dry_run=true", files=good).json()["valid"] is True
     assert (world.blobs.blobs, world.records.list_fields(None, 10, None).records) == ({}, [])
 

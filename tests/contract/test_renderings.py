@@ -136,7 +136,7 @@ def test_edits_of_jobs_that_are_of_no_use(world: World, monkeypatch: pytest.Monk
     elsewhere = registered(world, seed=5, scene=world.ready_field("another scene"))
     jobs = {
         "0" * 32: (404, "JOB_NOT_FOUND"), waiting: (409, "JOB_NOT_READY"), failed: (409, "JOB_FAILED"),
-        dismissed: (409, "JOB_DISMISSED"), expired: (410, "JOB_EXPIRED"), rejected: (422, "EDIT_POSE_REJECTED"),
+        dismissed: (409, "JOB_DISMISSED"), expired: (410, "JOB_EXPIRED"), rejected: (422, "EDIT_INVALID"),
         elsewhere: (422, "EDIT_INVALID"), render(world).json()["id"]: (422, "EDIT_INVALID"),
     }  # fmt: skip
     before = len(world.queue.registrations)

@@ -28,7 +28,7 @@ def redis() -> Iterator[Redis]:
 def served(folder: Path, redis: Redis, **settings: Any) -> World:
     """No rate of writes protects Redis here: its own bounds have to."""
     callers = frozenset({"greedy:greedy-token", "honest:honest-token"})
-    return make_world(folder, redis, api_tokens=callers, write_limit_per_s=0, **settings)
+    return make_world(folder, redis, api_tokens=callers, **settings)
 
 
 def ready(world: World, caller: str) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def test_a_reserve_is_kept_for_what_goes_on(tmp_path: Path, redis: Redis) -> Non
         refused = [answer for answer in answers if answer.status_code != 202]
         assert refused
         for answer in refused:
-            assert_refused(answer, 507, "RECORDS_FULL")
+            assert_refused(answer, 507, "STORAGE_FULL")
             assert "retry-after" in answer.headers
         answer = register(world, "honest", requests["honest"], 1)
         assert answer.status_code == 202, answer.text
@@ -100,8 +100,8 @@ def test_a_reserve_is_kept_for_what_goes_on(tmp_path: Path, redis: Redis) -> Non
         assert world.client.delete(f"/jobs/{waiting}", headers=TOKENS["greedy"]).status_code == 204
         redis.config_set("maxmemory", 1)
         problem = assert_refused(world.client.get("/readyz", headers=TOKENS["honest"]), 503, "NOT_READY")
-        assert problem["reasons"] == {"records": "RECORDS_FULL"}
-        assert_refused(register(world, "honest", requests["honest"], 2), 507, "RECORDS_FULL")
+        assert problem["reasons"] == {"records": "STORAGE_FULL"}
+        assert_refused(register(world, "honest", requests["honest"], 2), 507, "STORAGE_FULL")
 
 
 def test_a_caller_s_oldest_finished_jobs_go_beyond_its_quota(tmp_path: Path, redis: Redis) -> None:

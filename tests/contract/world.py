@@ -159,7 +159,7 @@ def share_routes(app: FastAPI) -> None:
 
 def make_world(folder: Path, redis: Redis, **settings: Any) -> World:
     """A fresh service; ``settings`` override what suits tests. Redis is emptied."""
-    usual = {"state_dir": folder, "redis_url": None, "upload_stall_s": 2.0, "max_upload_bytes": 4096}
+    usual = {"state_dir": folder, "redis_url": None, "max_upload_bytes": 4096}
     chosen = Settings(**(usual | settings))
     stores = stores_over(redis, chosen.blob_dir, chosen.job_retention_s)
     app = create_app(chosen, stores)

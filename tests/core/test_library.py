@@ -110,5 +110,5 @@ def test_options_of_another_preset_are_refused_before_any_work() -> None:
     scene, paper = CountingField(room(chair_pose())), RegistrationOptions(preset="paper")
     with pytest.raises(InvalidOptionsError) as raised:
         search_library(scene, detection(), library({"chair": chair()}, Counter()), paper)
-    assert raised.value.reason == "LIBRARY_SEARCH_UNSUPPORTED"
+    assert raised.value.reason == "PRESET_UNSUITABLE"
     assert scene.evaluations == 0

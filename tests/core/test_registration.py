@@ -112,7 +112,7 @@ def test_a_progress_callback_may_cancel() -> None:
 @pytest.mark.parametrize(
     ("warm_start", "reason"),
     [
-        (WarmStart(T_object_scene=Sim3.identity()), "INITIAL_TRANSFORM_UNSUPPORTED"),
+        (WarmStart(T_object_scene=Sim3.identity()), "PRESET_UNSUITABLE"),
         (WarmStart(object_model=model_object(chair())), "INVALID_OPTIONS"),
     ],
     ids=["initial transform", "object model"],

@@ -103,6 +103,14 @@ def ended(connection: socket.socket) -> bool:
     return True
 
 
+def test_a_refusal_reaches_a_client_that_goes_on_sending(proxy: int) -> None:
+    """The API stops reading, and the proxy passes its answer on."""
+    headers = {"Authorization": "Bearer key"}
+    with httpx.Client(base_url=f"http://localhost:{proxy}", headers=headers) as client:
+        answers = [client.put(f"/fields/{'0' * 64}", content=b"\x89PNG" + bytes(8 << 20)) for _ in range(5)]
+    assert [one.json()["reason"] for one in answers] == ["FIELD_NOT_RECOGNIZED"] * 5
+
+
 def test_one_address_has_so_many_connections(proxy: int) -> None:
     head = b"PUT /fields/0 HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
     with ExitStack() as stack:

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -68,7 +67,8 @@ def test_waiting_ends_when_the_service_stops(tmp_path: Path, any_redis: Redis) -
 
 def test_where_many_answers_are_held_no_more_are(tmp_path: Path, any_redis: Redis) -> None:
     """A held answer keeps its connection: enough of them would leave none for anybody else."""
-    services = replace(make_world(tmp_path, any_redis).app.state.services, waiters=Waiters(most=1))
+    services = make_world(tmp_path, any_redis).app.state.services
+    services.waiters = Waiters(most=1)
     looks: list[int] = []
 
     async def ask() -> int:

@@ -249,7 +249,7 @@ def test_meshes_are_drawn_where_the_samples_lie(visit: Visit) -> None:
 
 
 def test_a_mesh_that_is_gone_leaves_the_samples(visit: Visit) -> None:
-    problem = {"reason": "FIELD_PREVIEW_NOT_FOUND"}
+    problem = {"reason": "FIELD_VIEW_NOT_FOUND"}
     visit.page.route("**/mesh.glb*", lambda route: route.fulfill(status=404, json=problem))
     page = visit.open("meshed")
     expect(page.locator("#surfaces-dial")).to_be_hidden()

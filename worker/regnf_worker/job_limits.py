@@ -65,7 +65,7 @@ class JobLimits:
     def exceeded_by(self, pid: int, scratch: Path) -> str | None:
         """The reason to end the job's process, if it is over a limit."""
         if private_bytes(pid) > self.memory + RESERVE:
-            return "JOB_MEMORY_LIMIT"
+            return "OUT_OF_MEMORY"
         return "JOB_DISK_LIMIT" if folder_bytes(scratch) > self.scratch else None
 
     def is_near(self, peak_memory: int) -> bool:
@@ -147,9 +147,9 @@ def _limit(kind: int, soft: int, hard: int) -> None:
 
 # What went wrong, as the problem object that a record carries. No traceback and no path ever leaves through here.
 
-OVER_LIMIT = {"JOB_MEMORY_LIMIT": "memory", "JOB_DISK_LIMIT": "temporary files"}
+OVER_LIMIT = {"OUT_OF_MEMORY": "memory", "JOB_DISK_LIMIT": "temporary files"}
 """Reasons of jobs that were over a limit, and of what."""
-_LIMIT_OF = {"JOB_MEMORY_LIMIT": "memory", "JOB_DISK_LIMIT": "scratch"}
+_LIMIT_OF = {"OUT_OF_MEMORY": "memory", "JOB_DISK_LIMIT": "scratch"}
 _SETTING_OF = {
     "IMPORT_TIMEOUT": "REGNF_IMPORT_TIMEOUT_S",
     "IMPORT_TOO_COSTLY": "REGNF_IMPORT_WORK_S",
@@ -184,7 +184,7 @@ def fault(error: Exception, incident: str, limits: JobLimits | None = None) -> d
     """
     if is_out_of_memory(error):
         of_gpu = "cuda" in str(error).lower()
-        return problem_document("OUT_OF_MEMORY") if limits is None or of_gpu else over_limit("JOB_MEMORY_LIMIT", limits)
+        return problem_document("OUT_OF_MEMORY") if limits is None or of_gpu else over_limit("OUT_OF_MEMORY", limits)
     if limits is not None and isinstance(error, OSError) and error.errno == errno.EFBIG:
         return over_limit("JOB_DISK_LIMIT", limits)
     if isinstance(error, StorageFullError) or (isinstance(error, OSError) and error.errno in _FULL):
@@ -193,7 +193,7 @@ def fault(error: Exception, incident: str, limits: JobLimits | None = None) -> d
 
 
 def over_limit(reason: str, limits: JobLimits) -> dict[str, Any]:
-    """The problem of a job that was over one of its limits: JOB_MEMORY_LIMIT or JOB_DISK_LIMIT."""
+    """The problem of a job that was over one of its limits: OUT_OF_MEMORY or JOB_DISK_LIMIT."""
     what, limit = OVER_LIMIT[reason], getattr(limits, _LIMIT_OF[reason])
     detail = f"The job needed more than the {limit / _GIB:.1f} GiB of {what} that one job may use here."
     return problem_document(reason, detail, limit_bytes=limit)

@@ -208,7 +208,7 @@ class ChildExit:
     given_back: bool = False
     """The worker itself was told to stop and ended its job."""
     because: str | None = None
-    """The worker ended it, or could not begin it, for this: JOB_MEMORY_LIMIT, JOB_DISK_LIMIT, STORAGE_FULL,
+    """The worker ended it, or could not begin it, for this: OUT_OF_MEMORY, JOB_DISK_LIMIT, STORAGE_FULL,
     STORAGE_UNAVAILABLE."""
     crashed_near_limit: bool = False
     """It ended by itself, not well, after it had used most of the memory that it may: native code that gets no memory
@@ -219,7 +219,7 @@ class ChildExit:
     @property
     def worth_another_try(self) -> bool:
         """Usually Redis or storage was away, or somebody killed it; it was neither too slow nor too large."""
-        if self.late or self.because not in (None, "STORAGE_UNAVAILABLE") or self.reason() == "JOB_MEMORY_LIMIT":
+        if self.late or self.because not in (None, "STORAGE_UNAVAILABLE") or self.reason() == "OUT_OF_MEMORY":
             return False
         return self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory)
 
@@ -229,7 +229,7 @@ class ChildExit:
         if self.because:
             return self.because
         if self.crashed_near_limit and self.signal not in _FROM_OUTSIDE:
-            return "JOB_MEMORY_LIMIT"
+            return "OUT_OF_MEMORY"
         if self.out_of_memory and self.signal == signal.SIGKILL:
             return "OUT_OF_MEMORY"
         return "WORKER_LOST" if self.signal is not None else "INTERNAL"
@@ -304,6 +304,6 @@ def _problem(context: Context, end: ChildExit) -> dict[str, Any]:
     reason = end.reason()
     if end.late:
         return timeout(reason, context.settings.job_timeout_s)
-    if end.limits is not None and reason in OVER_LIMIT:
+    if end.limits is not None and reason in OVER_LIMIT and (end.because or not end.out_of_memory):
         return over_limit(reason, end.limits)
     return problem_document(reason, _DETAILS.get(reason))

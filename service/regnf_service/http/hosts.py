@@ -18,7 +18,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from regnf_service.http.problems import problem_response
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_state.settings import Settings
 
 _NAME = r"[a-z0-9_](?:[a-z0-9_-]{0,62})(?:\.[a-z0-9_](?:[a-z0-9_-]{0,62}))*"
@@ -207,14 +207,17 @@ class OriginGate:
 
     def _refusal(self, scope: Scope) -> Problem | None:
         headers = Headers(scope=scope)
+        if "transfer-encoding" in headers and "content-length" in headers:
+            # a proxy in front may see the body's end at another place than this server
+            return Problem("INVALID_HEADER", "The body has two lengths.", headers={"Connection": "close"})
         given = headers.getlist("host")
         host = parse_authority(given[0]) if len(given) == 1 and scope["path"].startswith("/") else None
         arrived_on = (scope.get("server") or ("",))[0] or ""
         if host is None or not self._hosts.knows(host, arrived_on):
-            return Problem("HOST_NOT_ALLOWED", headers=CLOSE)
+            return Problem("HOST_NOT_ALLOWED")
         if self._is_named(headers) or _is_visit(scope, headers) or not _is_foreign(headers, host):
             return None
-        return Problem("ORIGIN_NOT_ALLOWED", headers=CLOSE)
+        return Problem("ORIGIN_NOT_ALLOWED")
 
     def _is_named(self, headers: Headers) -> bool:
         """Whether the page behind the request is of a site that the operator has named (``origins``)."""

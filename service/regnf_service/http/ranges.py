@@ -20,7 +20,7 @@ from starlette.types import Receive, Scope, Send
 
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.piecewise import PieceRange
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_state.blobs.base import BlobStore
 from regnf_state.records import FieldRecord
 
@@ -199,23 +199,23 @@ _RANGE = re.compile(r"bytes (?:([0-9]{1,15})-([0-9]{1,15})|\*)/([0-9]{1,15})", r
 
 
 def content_range(header: str | None, limit: int) -> PieceRange | None:
-    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_EMPTY."""
+    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_INCOMPLETE."""
     if header is None:
         return None
     match = _RANGE.fullmatch(header.strip())
     if match is None:
         detail = "Content-Range is not `bytes first-last/total` or `bytes */total`."
-        raise Problem("INVALID_HEADER", detail, headers=CLOSE)
+        raise Problem("INVALID_HEADER", detail)
     first, last, total = (None if text is None else int(text) for text in match.groups())
     assert total is not None
     if total > limit:
-        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.", headers=CLOSE)
+        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.")
     if total == 0:
-        raise Problem("UPLOAD_EMPTY", headers=CLOSE)
+        raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.")
     if first is None or last is None:
         return PieceRange(None, None, total)
     if not first <= last < total:
-        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.", headers=CLOSE)
+        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.")
     return PieceRange(first, last + 1, total)
 
 
@@ -240,7 +240,7 @@ def announced_digest(header: str | None) -> str | None:
     for member in header.split(","):
         match = _MEMBER.fullmatch(member)
         if match is None:
-            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.", headers=CLOSE)
+            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.")
         if match.group(1) == "sha-256":
             return _decoded(match.group(2))
     return None
@@ -252,5 +252,5 @@ def _decoded(text: str) -> str:
     except binascii.Error:
         value = b""
     if len(value) != 32:
-        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.", headers=CLOSE)
+        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.")
     return value.hex()

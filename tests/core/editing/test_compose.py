@@ -254,9 +254,9 @@ FAR = Sim3.from_translation(torch.tensor([50.0, 0.0, 0.0], dtype=torch.float64))
             "EDIT_INVALID",
             lambda: compose(room(), [Replacement(sphere(0.2), Sim3.identity(), sphere(0.2), up_object="up")]),
         ),
-        ("EDIT_OUTSIDE_SCENE", lambda: compose(room(), [Insertion(sphere(0.2), FAR)])),
-        ("EDITS_OVERLAP", lambda: compose(room(*STOOL), [Removal(obj=stool(turned()), T_object_scene=turned())] * 2)),
-        ("EDITS_OVERLAP", lambda: compose(room(), [Insertion(stool(turned()), turned())] * 2)),
+        ("EDIT_INVALID", lambda: compose(room(), [Insertion(sphere(0.2), FAR)])),
+        ("EDIT_INVALID", lambda: compose(room(*STOOL), [Removal(obj=stool(turned()), T_object_scene=turned())] * 2)),
+        ("EDIT_INVALID", lambda: compose(room(), [Insertion(stool(turned()), turned())] * 2)),
     ],
 )
 def test_bad_edits_have_reasons(reason: str, make: object) -> None:

@@ -171,7 +171,7 @@ def test_a_camera_in_matter() -> None:
     inside = Camera.look_at([0.1, 0.0, 0.0], [1.0, 0.0, 0.0], SIZE)
     with pytest.raises(InvalidInputError) as caught:
         render(field, inside)
-    assert caught.value.reason == "CAMERA_IN_MATTER"
+    assert caught.value.reason == "CAMERA_INVALID"
     assert (render(field, inside, RenderOptions(cut_away=True)).depth == 0).all()
 
 

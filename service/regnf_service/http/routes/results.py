@@ -39,13 +39,7 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
     response_model=ResultDocument | RenderResultDocument,
     responses={
         200: {"links": links("name", "/artifacts/0/name", "get_artifact", "head_artifact", id="id")},
-        **refusals(
-            "JOB_NOT_FOUND",
-            "JOB_NOT_READY",
-            "JOB_DISMISSED",
-            "JOB_FAILED",
-            "JOB_EXPIRED",
-        ),
+        **refusals("JOB_NOT_FOUND JOB_NOT_READY JOB_DISMISSED JOB_FAILED JOB_EXPIRED"),
     },
 )
 @blocking
@@ -80,15 +74,8 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
     },
     304: NOT_MODIFIED,
     **refusals(
-        "JOB_NOT_FOUND",
-        "ARTIFACT_NOT_FOUND",
-        "ARTIFACT_NOT_READY",
-        "JOB_NOT_READY",
-        "JOB_DISMISSED",
-        "JOB_FAILED",
-        "JOB_EXPIRED",
-        "RANGE_NOT_SATISFIABLE",
-        "INVALID_QUERY",
+        "JOB_NOT_FOUND ARTIFACT_NOT_FOUND ARTIFACT_NOT_READY JOB_NOT_READY JOB_DISMISSED JOB_FAILED JOB_EXPIRED "
+        "RANGE_NOT_SATISFIABLE INVALID_QUERY"
     ),
 }
 

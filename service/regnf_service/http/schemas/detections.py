@@ -117,7 +117,7 @@ _Corners = Annotated[
 
 def _read(value: Any) -> ParsedDetection:
     try:
-        return parse_detection(value)
+        return parse_detection(value).normal()
     except InvalidDetectionError as error:
         context = {"message": str(error), "hint": error.hint, "place": list(error.place)}
         raise PydanticCustomError(DETECTION_FAULT, "{message}", context) from error
@@ -126,5 +126,5 @@ def _read(value: Any) -> ParsedDetection:
 Detection = Annotated[
     ParsedDetection,
     PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | _Corners),
-    PlainSerializer(ParsedDetection.canonical, return_type=dict[str, Any]),
+    PlainSerializer(ParsedDetection.values, return_type=dict[str, Any]),
 ]

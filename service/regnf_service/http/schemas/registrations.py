@@ -35,7 +35,7 @@ from regnf_service.http.schemas.library import (
     Selected,
 )
 from regnf_service.http.schemas.results import Coordinate, Incoming
-from regnf_state.registration_request import RegistrationRequest, recorded_detection
+from regnf_state.registration_request import RegistrationRequest
 
 # Similarity transforms as clients send them: a bare 4x4, or the transform object that results carry.
 
@@ -166,8 +166,7 @@ def start_rows(start: Rows | TransformObject | ObjectPose) -> Rows:
     return start.rows if isinstance(start, ObjectPose) else rows_of(start)
 
 
-START_UNSUPPORTED = "initial_transform_unsupported"
-SEARCH_UNSUPPORTED = "library_search_unsupported"
+PRESET_FAULT = "preset_unsuitable"
 
 
 class FieldReference(Incoming):
@@ -237,7 +236,7 @@ class RegistrationSpec(Incoming):
     def _is_of_use(cls, start: Any, info: ValidationInfo) -> Any:
         options = info.data.get("options")  # absent when they were refused themselves
         if start is not None and options is not None and options.preset != "robust":
-            raise PydanticCustomError(START_UNSUPPORTED, "only the preset `robust` starts from a given transform")
+            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` starts from a given transform")
         return start
 
     def to_request(
@@ -252,7 +251,7 @@ class RegistrationSpec(Incoming):
             scene=scene,
             object=object_,
             candidates=None if candidates is None else tuple(sorted(candidates)),
-            detection=recorded_detection(self.detection.canonical()),
+            detection=self.detection,
             options=self.options,
             seed=self.seed,
             initial_transform=None if start is None else start_rows(start),
@@ -293,9 +292,9 @@ class RegisterRequest(RegistrationSpec):
             return None
         options = info.data.get("options")
         if options is not None and options.preset != "robust":
-            raise PydanticCustomError(SEARCH_UNSUPPORTED, "only the preset `robust` searches a library")
+            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` searches a library")
         if info.data.get("initial_transform") is not None:
-            raise PydanticCustomError(START_UNSUPPORTED, "a search of a library starts from no given transform")
+            raise PydanticCustomError(PRESET_FAULT, "a search of a library starts from no given transform")
         if info.data.get("ground_truth") is not None:
             raise ValueError("a ground truth applies to one object, not to several candidates")
         return names
