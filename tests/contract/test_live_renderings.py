@@ -94,8 +94,8 @@ def test_the_edited_scene_is_a_field_like_any_other(
     again = {"scene": sha, "object": demo_fields["object"]}
     picture = result_of(live_client, rendered(live_client, again, edits=[substitution(demo_fields)]))
     assert picture["frames"] == 2
-    answer = live_client.post("/register", json=demo_request(again))
-    assert finished(live_client, answer.json()["id"])["status"] == "successful"
+    answer = live_client.post("/register?dry_run=true", json=demo_request(again))
+    assert (answer.status_code, answer.json()["valid"]) == (200, True)
 
 
 def test_a_registration_and_then_its_rendering(live_client: httpx.Client, demo_fields: dict[str, str]) -> None:
