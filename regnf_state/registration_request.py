@@ -106,7 +106,8 @@ class RegistrationRequest:
 
 def _recorded(values: Mapping[str, Any]) -> Detection:
     """The box of recorded values, as they are: to normalize the quaternion again might change its last bits."""
-    return Detection(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+    members: dict[str, Any] = {n: tuple(one) if isinstance(one, list) else one for n, one in values.items()}
+    return Detection(**members)
 
 
 # What a rendering job is asked to do: one typed value, from the HTTP route through the record to the engine.

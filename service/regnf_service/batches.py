@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from regnf_core.pairs import short_result
+from regnf_service.concurrency import portions
 from regnf_service.fields.ingest import room_for_bytes
 from regnf_service.jobs.edits import manifest_of, result_of
 from regnf_service.jobs.submit import FieldLookup, check_fields, future_job_id, start
@@ -67,17 +68,8 @@ class Posting:
         self._fields = FieldLookup(services, caller)
 
     def portions(self) -> Iterator[Sequence[Line]]:
-        """A few lines at a time, so that other callers' requests are served in between."""
-        few: list[Line] = []
-        names = 0
-        for line in self.lines:
-            few.append(line)
-            names += 1 + len(_fields_of(line))
-            if names >= _NAMES_AT_ONCE or len(few) == _AT_ONCE:
-                yield few
-                few, names = [], 0
-        if few:
-            yield few
+        """A few lines at a time."""
+        return portions(self.lines, lambda line: 1 + len(_fields_of(line)), _NAMES_AT_ONCE, _AT_ONCE)
 
     def check(self, lines: Sequence[Line]) -> None:
         """Refuse what POST /register would refuse, and find out which jobs there are."""
@@ -125,7 +117,6 @@ class Posting:
             raise Problem(reason, detail, headers=RETRY_LATER, extra=fitting)
 
     def _fitting(self, free: int) -> int:
-        """How many of the first lines need no more than so many new jobs."""
         new: set[str | None] = set()
         for place, line in enumerate(self.lines):
             new |= {line.job} if line.is_new else set()
@@ -180,7 +171,6 @@ def _fields_of(line: Line) -> list[str]:
 
 
 def _is_active(services: Services, caller: str, key: str) -> bool:
-    """Whether a job of a stored batch waits or runs."""
     try:
         batch = services.batches.find(caller, key.rpartition("/")[2])
     except UnreadableRecordError:
@@ -291,7 +281,6 @@ def _possible(pair: Pair, job: _Held) -> tuple[str, ...]:
 
 
 def _result(services: Services, pair: Pair, job: _Held) -> dict[str, Any]:
-    """What is told of a pair that has ended."""
     told: dict[str, Any] = {"line": pair.line, "key": pair.key, "job": pair.job}
     if pair.error is not None:
         return told | {"status": "refused", "error": pair.error}

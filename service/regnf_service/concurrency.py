@@ -6,7 +6,7 @@ import asyncio
 import random
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial, wraps
@@ -20,6 +20,7 @@ from regnf_service.problem import RETRY_LATER, Problem
 _LOOK_EVERY_S = 0.02
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
+_Item = TypeVar("_Item")
 whose: ContextVar[str] = ContextVar("whose", default="")
 """Whom the work at hand is done for: a caller, without tokens an address; "" for the service itself."""
 
@@ -119,6 +120,20 @@ def blocking(route: Callable[_Given, _Result]) -> Callable[_Given, Awaitable[_Re
         return await in_thread(partial(route, *args, **kwargs))
 
     return run
+
+
+def portions(items: Iterable[_Item], size: Callable[[_Item], int], most: int, count: int) -> Iterator[list[_Item]]:
+    """A few at a time, so that other callers' requests are served in between: of this size, or as many."""
+    few: list[_Item] = []
+    total = 0
+    for item in items:
+        few.append(item)
+        total += size(item)
+        if total >= most or len(few) == count:
+            yield few
+            few, total = [], 0
+    if few:
+        yield few
 
 
 async def pause(seconds: float, stopping: asyncio.Event) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter as Tally
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -13,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 from redis.exceptions import RedisError
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Scope
 
 from regnf_service.http.middleware import route_of
 from regnf_service.services import Services
@@ -113,6 +112,15 @@ class Metrics:
         )
         self.registry.register(_Held(self, services))
 
+    def count(self, scope: Scope, status: int, seconds: float, received: int) -> None:
+        """One request. seconds: until its answer began · received: bytes of its body."""
+        route, method = route_of(scope), scope["method"]
+        known = method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE") else "other"
+        self.requests.labels(known, route, str(status)).inc()
+        self.seconds.labels(route).observe(seconds)
+        if received:
+            self.received.labels(route).inc(received)
+
 
 class _Held(Collector):
     """Asks Redis at each scrape."""
@@ -170,43 +178,6 @@ class _Held(Collector):
 
 def _gauge(name: str, about: str, value: float) -> GaugeMetricFamily:
     return GaugeMetricFamily(f"regnf_{name}", about, value=value)
-
-
-class Measured:
-    """Counts every request that passes."""
-
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app = app
-        self._metrics = metrics
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        began, status, received = time.perf_counter(), 500, 0
-        answered: float | None = None
-
-        async def counting_receive() -> Message:
-            nonlocal received
-            message = await receive()
-            received += len(message.get("body", b""))
-            return message
-
-        async def noting_send(message: Message) -> None:
-            nonlocal status, answered
-            if message["type"] == "http.response.start":
-                status, answered = message["status"], time.perf_counter()
-            await send(message)
-
-        try:
-            await self._app(scope, counting_receive, noting_send)
-        finally:
-            route, method = route_of(scope), scope["method"]
-            known = method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE") else "other"
-            self._metrics.requests.labels(known, route, str(status)).inc()
-            self._metrics.seconds.labels(route).observe((answered or time.perf_counter()) - began)
-            if received:
-                self._metrics.received.labels(route).inc(received)
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from regnf_service.http.middleware import RequestContext, RequestGate, TokenGate
 from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
-from regnf_service.metrics import Measured, Metrics, served
+from regnf_service.metrics import Metrics, served
 from regnf_service.services import Services
 from regnf_service.tokens import Callers, read_callers
 from regnf_service.upkeep.housekeeping import Housekeeper
@@ -58,25 +58,20 @@ def stopping_on_signals(stopping: asyncio.Event) -> Iterator[None]:
         yield
         return
     loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-
-    def listener(earlier: Any) -> Callable[[int, FrameType | None], None]:
-        def listen(number: int, frame: FrameType | None) -> None:
-            loop.call_soon_threadsafe(stopping.set)
-            if callable(earlier):
-                earlier(number, frame)
-
-        return listen
-
     # a signal without a Python handler keeps its default, which ends the process anyway
-    handled = [number for number in _SIGNALS if callable(before[number])]
-    for number in handled:
-        signal.signal(number, listener(before[number]))
+    earlier = {number: handler for number in _SIGNALS if callable(handler := signal.getsignal(number))}
+
+    def listen(number: int, frame: FrameType | None) -> None:
+        loop.call_soon_threadsafe(stopping.set)
+        earlier[signal.Signals(number)](number, frame)
+
+    for number in earlier:
+        signal.signal(number, listen)
     try:
         yield
     finally:
-        for number in handled:
-            signal.signal(number, before[number])
+        for number, handler in earlier.items():
+            signal.signal(number, handler)
 
 
 # What the application does beside requests: it finds lost jobs, sends webhooks, serves metrics, and stops in order.
@@ -93,9 +88,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
         app.openapi()  # takes a while, so not during the first request
         await in_thread(_check_storage, services)
         reaping = asyncio.create_task(_reap(services))
-        delivering = asyncio.create_task(
-            deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
-        )
+        delivering = asyncio.create_task(deliver_until_stopped(services.webhooks, services.records, services.stopping))
         with served(metrics.registry, services.settings.metrics_address), stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
@@ -120,7 +113,6 @@ def _check_storage(services: Services) -> None:
 
 
 async def _reap(services: Services) -> None:
-    """Look after lost jobs every fifteen seconds until the service stops."""
     records, queue, redis, blobs = services.records, services.queue, services.redis, services.blobs
     rebuilder = Rebuilder(records, queue, blobs)
     housekeeper = Housekeeper(records, blobs, redis, services.settings)
@@ -199,8 +191,7 @@ def _middleware(
     hosts = Middleware(OriginGate, hosts=allowed_hosts(settings), origins=origins)
     turns = Middleware(TurnGate, callers=callers if settings.needs_token else {})
     return [
-        Middleware(RequestContext),
-        Middleware(Measured, metrics=metrics),
+        Middleware(RequestContext, count=metrics.count),
         turns,
         hosts,
         *cors_layer(origins),

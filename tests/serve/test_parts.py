@@ -21,36 +21,23 @@ from tests.worker.bench import eventually
 
 
 @pytest.mark.parametrize(
-    ("host", "expected"),
+    ("hosts", "expected"),
     [
-        ("127.0.0.1", True),
-        ("127.9.9.9", True),
-        ("::1", True),
-        ("localhost", True),
-        ("0.0.0.0", False),
-        ("::", False),
-        ("10.0.0.1", False),
-        ("localhost.example.org", False),
-        ("", False),
+        (("127.0.0.1", "127.9.9.9", "::1", "localhost"), True),
+        (("0.0.0.0", "::", "10.0.0.1", "localhost.example.org", ""), False),
     ],
 )
-def test_what_is_loopback(host: str, expected: bool) -> None:
-    assert is_loopback(host) is expected
+def test_what_is_loopback(hosts: tuple[str, ...], expected: bool) -> None:
+    assert {host: is_loopback(host) for host in hosts} == dict.fromkeys(hosts, expected)
 
 
 @pytest.mark.parametrize(
     ("publish", "private"),
     [
-        ("127.0.0.1:8080", True),
-        ("127.0.0.1:9000-9010", True),
-        ("[::1]:8080", True),
-        ("0.0.0.0:8080", False),
-        ("[::]:8080", False),
-        ("192.0.2.1:8080", False),
-        ("8080", False),
-        ("127.0.0.1:8080:8080", False),
+        ("127.0.0.1:8080", True), ("127.0.0.1:9000-9010", True), ("[::1]:8080", True), ("0.0.0.0:8080", False),
+        ("[::]:8080", False), ("192.0.2.1:8080", False), ("8080", False), ("127.0.0.1:8080:8080", False),
     ],
-)
+)  # fmt: skip
 def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: str, private: bool) -> None:
     settings = Settings(host="0.0.0.0", publish=publish, behind_proxy=True)
     assert settings.is_private is private
@@ -75,6 +62,7 @@ def test_beyond_loopback_a_proxy_stands_before_it() -> None:
         check_access(Settings(behind_proxy=True))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
     check_access(Settings(behind_proxy=True, api_tokens=tokens))
+    check_access(Settings(behind_proxy=True, host="0.0.0.0", allow_unauthenticated=True))
 
 
 def test_a_published_loopback_is_not_private() -> None:
@@ -89,10 +77,19 @@ def test_addresses_to_open() -> None:
         assert address_of(listener).startswith("http://127.0.0.1:")
 
 
-def test_a_host_that_is_not_ours() -> None:
-    with pytest.raises(StartError) as caught:
-        open_socket(Settings(port=0, host="192.0.2.1", allow_unauthenticated=True, behind_proxy=True))
-    assert caught.value.reason == "ADDRESS_UNAVAILABLE"
+def test_a_host_that_is_not_ours_and_a_port_that_is_taken() -> None:
+    with open_socket(Settings(port=0)) as taken:
+        for host, port in (("192.0.2.1", 0), ("127.0.0.1", taken.getsockname()[1])):
+            with pytest.raises(StartError) as caught:
+                open_socket(Settings(host=host, port=port, allow_unauthenticated=True, behind_proxy=True))
+            assert caught.value.reason == "ADDRESS_UNAVAILABLE"
+
+
+def test_a_state_folder_in_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StartError) as caught, StateLock(tmp_path / "file" / "state"):
+        pass
+    assert caught.value.reason == "STATE_DIR_UNUSABLE"
 
 
 def test_a_missing_redis_server_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,8 +20,9 @@ from tests.worker.bench import eventually
 
 @contextmanager
 def started(state_dir: Path, *arguments: str, **settings: object) -> Iterator[Service]:
-    """A service that has ended with all its processes once the context is left. A worker takes most of the start."""
-    service = start(state_dir, *arguments, **settings)
+    """A service that has ended with all its processes once the context is left. A worker that loads the engine takes
+    most of the start: unless the settings say so, none does."""
+    service = start(state_dir, *arguments, **{"preload": "false"} | settings)
     try:
         yield service
     finally:
@@ -35,7 +36,7 @@ NO_WORKER = ("--workers", "0")
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """One for the tests that leave it as they found it."""
-    with started(tmp_path_factory.mktemp("shared") / "state") as service:
+    with started(tmp_path_factory.mktemp("shared") / "state", preload="true") as service:
         yield service
 
 
@@ -99,7 +100,7 @@ def test_a_killed_supervisor_takes_everything_along(tmp_path: Path) -> None:
 
 
 def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> None:
-    process = subprocess.Popen(command(tmp_path / "state"), env=environment(), stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command(tmp_path / "state"), env=environment(preload="false"), stderr=subprocess.DEVNULL)
     started = Service(process, tmp_path / "state", "")
     eventually(started.look, "a first child", DEADLINE_S)
     process.kill()
@@ -120,22 +121,13 @@ def test_a_part_that_dies_is_started_anew(shared: Service, part: str) -> None:
     assert shared.process.poll() is None
 
 
-def test_state_survives_a_restart(tmp_path: Path) -> None:
-    with started(tmp_path / "state", *NO_WORKER) as first:
-        sha256 = upload(first.address, b"no field, but bytes")
-        first.process.terminate()
-        assert first.process.wait(DEADLINE_S) == 0
-    with started(tmp_path / "state", *NO_WORKER) as second:
-        assert httpx.get(f"{second.address}/fields/{sha256}").json()["state"] == "validating"
-
-
 def upload(address: str, content: bytes) -> str:
     answer = httpx.post(f"{address}/fields", content=b"PK\x03\x04" + content)
     assert answer.status_code == 201, answer.text
     return str(answer.json()["sha256"])
 
 
-def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
+def test_whoever_waits_is_answered_before_the_end_and_state_survives_it(tmp_path: Path) -> None:
     """Without a worker there is no news: the stop alone ends what is waited for, in order."""
     with started(tmp_path / "state", *NO_WORKER) as service:
         scene, object_ = (upload(service.address, name) for name in (b"scene", b"object"))
@@ -154,6 +146,9 @@ def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
         assert service.process.wait(DEADLINE_S) == 0
         log = service.log()
         assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
+    with started(tmp_path / "state", *NO_WORKER) as again:
+        assert httpx.get(f"{again.address}/fields/{scene}").json()["state"] == "validating"
+        assert httpx.get(f"{again.address}/jobs/{job}").json()["status"] == "accepted"
 
 
 @contextmanager
@@ -182,25 +177,12 @@ def test_one_service_to_a_state_folder(shared: Service) -> None:
     assert shared.is_ready()
 
 
-def test_an_unusable_state_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    assert "STATE_DIR_UNUSABLE" in refused(state_dir=tmp_path / "file" / "state")
-
-
-def test_a_port_that_is_taken(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert "ADDRESS_UNAVAILABLE" in refused("--port", port, state_dir=tmp_path / "state")
-
-
-def test_beyond_loopback_only_behind_a_proxy_and_with_tokens_or_on_request(tmp_path: Path) -> None:
+def test_beyond_loopback_over_a_redis_of_its_own_operator(tmp_path: Path) -> None:
+    """Only behind a proxy, and with tokens. Without an embedded Redis there is one child less."""
     assert "UNAUTHENTICATED_PUBLIC_BIND" in refused("--host", "0.0.0.0", state_dir=tmp_path / "state")
-    for settings in ({"allow_unauthenticated": "true"}, {"api_tokens": '["0123456789abcdef0123456789abcdef"]'}):
-        with started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, behind_proxy="true", **settings):
-            pass
-
-
-def test_without_an_embedded_redis_there_is_one_child_less(tmp_path: Path) -> None:
-    with private_redis() as url, started(tmp_path / "state", *NO_WORKER, redis_url=url) as service:
-        assert [command_of(pid) for pid in service.look() if "regnf_cli.api_process" not in command_of(pid)] == []
-        assert len(service.look()) == 1
+    settings = {"behind_proxy": "true", "api_tokens": '["0123456789abcdef0123456789abcdef"]'}
+    with (
+        private_redis() as url,
+        started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, redis_url=url, **settings) as service,
+    ):
+        assert ["regnf_cli.api_process" in command_of(pid) for pid in service.look()] == [True]

@@ -70,25 +70,6 @@ async def _begin(watch: JobWatch, late: list[asyncio.Task[JobNews]]) -> None:
     await asyncio.sleep(0)
 
 
-def test_a_client_that_leaves_is_not_looked_for() -> None:
-    looks: list[Sequence[Position]] = []
-
-    def look(positions: Sequence[Position]) -> list[JobNews]:
-        looks.append(positions)
-        return [JobNews(None, []) for _ in positions]
-
-    async def run() -> None:
-        watch = JobWatch(look, asyncio.Event())
-        left = asyncio.create_task(watch.news("gone", None))
-        stays = asyncio.create_task(watch.news("stays", None))
-        await asyncio.sleep(0)
-        left.cancel()
-        assert (await stays).record is None
-
-    asyncio.run(run())
-    assert looks == [[("stays", None)]]
-
-
 def test_a_store_that_is_away_ends_the_streams_not_the_watch() -> None:
     answers: list[object] = [RedisConnectionError("away"), [JobNews(None, [])]]
 

@@ -162,7 +162,7 @@ def test_a_receiver_that_does_not_answer_keeps_no_other_waiting(
 
     async def serve() -> None:
         stopping = asyncio.Event()
-        serving = asyncio.create_task(deliver_until_stopped(webhooks, RecordStore(redis), redis, stopping))
+        serving = asyncio.create_task(deliver_until_stopped(webhooks, RecordStore(redis), stopping))
         await asyncio.to_thread(until, lambda: slow.opened == 4 and len(receiver.received) == 2)
         assert not slow.closed.acquire(timeout=0)
         stopping.set()

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from regnf_service.webhooks.service import Deliverer, HttpSender
-from regnf_service.webhooks.targets import AllowList, read_secrets
+from regnf_service.webhooks.service import Deliverer
+from regnf_service.webhooks.targets import AllowList, Webhooks, read_secrets
 from regnf_state.ownership import reference_of
 from regnf_state.records import JobRecord
 from regnf_state.redis.jobs import RecordStore
@@ -71,22 +71,20 @@ def receiver() -> Iterator[Receiver]:
 class OneByOne:
     """Delivers in this thread, one message after the other."""
 
-    def __init__(self, inner: Deliverer) -> None:
-        self._inner = inner
+    def __init__(self, records: RecordStore, webhooks: Webhooks, back_off_s: tuple[float, ...]) -> None:
+        self._outbox, self._inner = webhooks.outbox, Deliverer(records, webhooks, back_off_s)
 
     def run_once(self) -> bool:
         """Whether a message was due."""
-        message = self._inner.claim()
+        message = self._outbox.claim()
         if message is not None:
             asyncio.run(self._inner.deliver(message))
         return message is not None
 
 
 def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> OneByOne:
-    hosts = AllowList(allowed)
     secrets = read_secrets([f"alice:{SECRET}"])
-    store, outbox = RecordStore(redis), RedisOutbox(redis)
-    return OneByOne(Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s))
+    return OneByOne(RecordStore(redis), Webhooks(AllowList(allowed), secrets, RedisOutbox(redis)), back_off_s)
 
 
 def due(url: str) -> str:

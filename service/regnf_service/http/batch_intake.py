@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import hashlib
 import json
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from regnf_core.texts import TextError, TextStream
@@ -184,23 +184,7 @@ def asked_by_reference(library: Library, spec: RegisterRequest) -> tuple[Registr
 
 
 _ID_DIGITS = 32
-_LINES_AT_ONCE = 50
-_BYTES_AT_ONCE = 64 * 1024
 Read = tuple[Line, TextLine, BatchPair | None]
-
-
-def portions(lines: Iterable[TextLine]) -> Iterator[list[TextLine]]:
-    """A few at a time, so that other callers' requests are read in between."""
-    few: list[TextLine] = []
-    size = 0
-    for line in lines:
-        few.append(line)
-        size += len(line.text or b"")
-        if len(few) == _LINES_AT_ONCE or size >= _BYTES_AT_ONCE:
-            yield few
-            few, size = [], 0
-    if few:
-        yield few
 
 
 class Intake:

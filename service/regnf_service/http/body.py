@@ -180,8 +180,6 @@ class Sink(Protocol):
 
 
 class _Part:
-    """One part: its name, and its text if it is no file."""
-
     def __init__(self) -> None:
         self.headers: dict[str, str] = {}
         self.name = ""

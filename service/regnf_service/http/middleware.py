@@ -9,6 +9,7 @@ import re
 import time
 import uuid
 from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -30,10 +31,14 @@ _NO_TOKENS = "Beyond loopback this service answers with tokens only, and none is
 
 
 class RequestContext:
-    """Gives each request its id, the caller's own if it is well formed, and writes it on every answer."""
+    """Gives each request its id, the caller's own if it is well formed, and writes it on every answer.
 
-    def __init__(self, app: ASGIApp) -> None:
+    ``count`` is told of each: its scope, status, seconds until the answer began, and bytes of its body.
+    """
+
+    def __init__(self, app: ASGIApp, count: Callable[[Scope, int, float, int], None]) -> None:
         self._app = app
+        self._count = count
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -42,12 +47,19 @@ class RequestContext:
         given = Headers(scope=scope).get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
-        began, status = time.perf_counter(), 500
+        began, status, received = time.perf_counter(), 500, 0
+        answered: float | None = None
+
+        async def receive_counted() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            return message
 
         async def send_marked(message: Message) -> None:
-            nonlocal status
+            nonlocal status, answered
             if message["type"] == "http.response.start":
-                status = message["status"]
+                status, answered = message["status"], time.perf_counter()
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id
                 secure(headers)
@@ -55,9 +67,11 @@ class RequestContext:
 
         with log_context(request_id=request_id):
             try:
-                await self._app(scope, receive, send_marked)
+                await self._app(scope, receive_counted, send_marked)
             finally:
-                _log_access(scope, status, time.perf_counter() - began)
+                ended = time.perf_counter()
+                self._count(scope, status, (answered or ended) - began, received)
+                _log_access(scope, status, ended - began)
 
 
 def _log_access(scope: Scope, status: int, seconds: float) -> None:
@@ -91,7 +105,6 @@ def is_open(scope: Scope) -> bool:
 
 
 def _came_from_outside(scope: Scope) -> bool:
-    """Whether the connection arrived on an address that other machines reach. Names and Unix sockets are not such."""
     try:
         address = ipaddress.ip_address((scope.get("server") or ("",))[0] or "")
     except ValueError:

@@ -96,7 +96,6 @@ def plain_edits(
 
 
 def _named(services: Services, caller: str, scene: str, job_id: str, pointer: str) -> dict[str, Any]:
-    """What a registration found, as the members of an edit."""
     try:
         record = find_job(services, job_id, caller)
         _require_of_scene(record, reference_of(caller, scene))

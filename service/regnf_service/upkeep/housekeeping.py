@@ -141,7 +141,6 @@ class Housekeeper:
         return self._keep_unused_s is not None and used + self._keep_unused_s <= now
 
     def _folders(self) -> dict[str, Kept]:
-        """Everything below jobs/ and fields/, by folder."""
         found: dict[str, Kept] = defaultdict(Kept)
         for top in ("jobs", "fields"):
             for entry in self._blobs.entries(top):

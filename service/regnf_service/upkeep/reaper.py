@@ -123,7 +123,6 @@ class Reaper:
         return dict(done)
 
     def _lead(self, term: Term, done: Done) -> None:
-        """Look after everything. Raises LeaseLostError."""
         now = self._records.now()
         self._staleness.begin_round()
         self._mend_queue()

@@ -9,9 +9,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from regnf_service.batches import Posting, cancel, find_batch, is_waiting, results_page, state_of
-from regnf_service.concurrency import PARSING, blocking, in_thread
+from regnf_service.concurrency import PARSING, blocking, in_thread, portions
 from regnf_service.http import body
-from regnf_service.http.batch_intake import Intake, lines_of, portions, read_library
+from regnf_service.http.batch_intake import Intake, lines_of, read_library
 from regnf_service.http.body import (
     CallerDep,
     LimitQuery,
@@ -36,6 +36,8 @@ router = APIRouter(tags=["batches"])
 MEDIA_TYPE = "application/x-ndjson"
 _MOST_LINES = 2**31 - 1
 """More than any batch has; what a query may ask for at most."""
+_LINES_AT_ONCE = 50
+_BYTES_AT_ONCE = 64 * 1024
 _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
 
 
@@ -86,7 +88,7 @@ async def _read(request: Request, services: Services, intake: Intake) -> Posting
     """The lines as they arrive, a few at a time beside the event loop."""
     chunks = body.chunks(request, services.settings.max_batch_bytes, "REQUEST_TOO_LARGE")
     async for lines in lines_of(chunks):
-        for few in portions(lines):
+        for few in portions(lines, lambda line: len(line.text or b""), _BYTES_AT_ONCE, _LINES_AT_ONCE):
             read = await PARSING.run(intake.read, few)
             await read_library(intake.library, [spec for _, _, spec in read if spec is not None])
             await in_thread(intake.take, read)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Any, Literal
 
@@ -12,6 +13,7 @@ from starlette.responses import JSONResponse, Response
 
 from regnf_core.errors import MOST_CANDIDATES
 from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import missing_view, redescribe
 from regnf_service.http import body
@@ -25,7 +27,6 @@ from regnf_service.http.body import (
     read_json,
     wait_for,
 )
-from regnf_service.http.description_change import described_anew
 from regnf_service.http.query import decode_token, encode_token, wants_page
 from regnf_service.http.ranges import IfNoneMatch, IfNoneMatchDep, field_etag, file_answer, is_sha256
 from regnf_service.http.routes.documentation import (
@@ -39,7 +40,7 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
-from regnf_service.http.schemas.reading import reference
+from regnf_service.http.schemas.reading import read_model, reference
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
@@ -61,7 +62,6 @@ _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
 
 
 def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
-    """The caller's field. Raises Problem FIELD_NOT_FOUND."""
     record = services.records.get_field(reference_of(caller, sha256)) if is_sha256(sha256) else None
     if record is None:
         raise Problem("FIELD_NOT_FOUND")
@@ -262,10 +262,33 @@ async def patch_field(
 
 def _changed(services: Services, caller: str, sha256: str, change: FieldChange) -> tuple[FieldRecord, bool]:
     known = _require(services, caller, sha256)
-    said = described_anew(known, change.description_change(known.said))
+    said = _described_anew(known, change.description_change(known.said))
     label = change.label if "label" in change.model_fields_set else (said.label or known.label)
     imported = redescribe(services, caller, known, said, label)
     return _require(services, caller, sha256), imported
+
+
+def _described_anew(known: FieldRecord, change: Mapping[str, Any]) -> UploadDescription:
+    """What is said of a field after a change as RFC 7396 has it. Raises Problem INVALID_DESCRIPTION."""
+    merged = _merged(known.said, change)
+    try:
+        return read_model(UploadDescription, json.dumps(merged).encode(), "INVALID_DESCRIPTION")
+    except Problem as problem:
+        faults = [{**fault, "pointer": "/description" + fault.get("pointer", "")} for fault in problem.errors]
+        raise Problem(problem.reason, problem.detail, errors=faults, hint=problem.hint) from problem
+
+
+def _merged(held: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(held)
+    for name, value in change.items():
+        if value is None:
+            merged.pop(name, None)
+        elif isinstance(value, dict):
+            inner = merged.get(name)
+            merged[name] = _merged(inner if isinstance(inner, dict) else {}, value)
+        else:
+            merged[name] = value
+    return merged
 
 
 @router.delete(

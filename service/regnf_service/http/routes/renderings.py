@@ -80,7 +80,6 @@ async def render(
 
 
 def _checked(services: Services, caller: str, said: RenderBody) -> RenderingRequest:
-    """The request with a transform for every edit. Raises Problem."""
     edits = plain_edits(services, caller, said.scene, [one.plain() for one in said.edits])
     try:
         rendering = said.rendering(edits, _poses(said))
@@ -92,7 +91,6 @@ def _checked(services: Services, caller: str, said: RenderBody) -> RenderingRequ
 
 
 def _poses(said: RenderBody) -> list[dict[str, Any]] | None:
-    """The cameras of the file that came, if one did. Raises InvalidInputError."""
     file = said.transforms
     if file is None:
         return None

@@ -77,8 +77,6 @@ _Model = TypeVar("_Model")
 
 
 class _Fault(NamedTuple):
-    """One fault of a body."""
-
     kind: str
     place: tuple[str | int, ...]
     detail: str
@@ -162,7 +160,6 @@ def _meant(place: Sequence[str | int], model: Any) -> str | None:
 
 
 def _hash_fault(text: str) -> str:
-    """What is wrong with a field's name, without repeating it."""
     expected = f"expected {_HASH_DIGITS} lower-case hexadecimal digits"
     if len(text) == _HASH_DIGITS and text.lower() != text:
         return f"It has upper-case letters, {expected}."

@@ -67,31 +67,21 @@ class TransformObject(Incoming):
 
     @model_validator(mode="after")
     def _agrees(self) -> TransformObject:
-        if not (self._same_scale() and self._same_rotation() and self._same_translation()):
+        scale = math.sqrt(sum(value * value for row in self.matrix[:3] for value in row[:3]) / 3)
+        agrees = self.scale is None or math.isclose(self.scale, scale, rel_tol=_AGREE)
+        if self.translation is not None:
+            agrees = agrees and _close(self.translation, [row[3] for row in self.matrix[:3]])
+        if self.rotation_quaternion_xyzw is not None:
+            agrees = agrees and any(self.rotation_quaternion_xyzw) and self._is_turned(scale)
+        if not agrees:
             raise ValueError("scale, rotation_quaternion_xyzw or translation contradict the matrix")
         return self
 
-    def _matrix_scale(self) -> float:
-        return math.sqrt(sum(value * value for row in self.matrix[:3] for value in row[:3]) / 3)
-
-    def _same_scale(self) -> bool:
-        return self.scale is None or math.isclose(self.scale, self._matrix_scale(), rel_tol=_AGREE)
-
-    def _same_translation(self) -> bool:
-        return self.translation is None or _close(self.translation, [row[3] for row in self.matrix[:3]])
-
-    def _same_rotation(self) -> bool:
-        if self.rotation_quaternion_xyzw is None:
-            return True
-        if not any(self.rotation_quaternion_xyzw):
-            return False
-        scale = self._matrix_scale()
-        columns = rotation_columns(normal_quaternion(self.rotation_quaternion_xyzw))
-        turned = zip(*columns, strict=True)
-        return all(
-            _close(row, [value / scale for value in held[:3]])
-            for row, held in zip(turned, self.matrix[:3], strict=True)
-        )
+    def _is_turned(self, scale: float) -> bool:
+        assert self.rotation_quaternion_xyzw is not None
+        turned = zip(*rotation_columns(normal_quaternion(self.rotation_quaternion_xyzw)), strict=True)
+        held = ([value / scale for value in row[:3]] for row in self.matrix[:3])
+        return all(map(_close, turned, held))
 
 
 def _close(a: Sequence[float], b: Sequence[float]) -> bool:
