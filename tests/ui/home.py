@@ -99,9 +99,11 @@ def register(address: str, fields: Sequence[str], **more: Any) -> dict[str, Any]
     answer = httpx.post(f"{address}/register", json={"scene": scene, "detection": BOX, **asked, **more}, timeout=30)
     assert answer.status_code == 202, answer.text
 
-    job: dict[str, Any] = httpx.get(f"{address}/jobs/{answer.json()['id']}", params={"wait": 20}, timeout=30).json()
-    assert job["status"] == "successful", job
-    return job
+    def ended() -> dict[str, Any] | None:
+        job: dict[str, Any] = httpx.get(f"{address}/jobs/{answer.json()['id']}", params={"wait": 5}, timeout=30).json()
+        return job if job["status"] == "successful" else None
+
+    return eventually(ended, "the end of a job")
 
 
 def give_files(page: Page, files: Sequence[Path]) -> None:
