@@ -57,7 +57,7 @@ def test_home_page_empty_and_at_work(visit: Visit, service: str, files: Files) -
 
 def test_page_of_a_job(visit: Visit) -> None:
     page = visit.page
-    for story in ("running", "done", "failed", "searched", "rendered", "locked"):
+    for story in ("running", "failed", "searched", "locked"):
         page.goto(visit.server.view(story))
         if story == "running":
             expect(page.locator("#message-title")).to_have_text("Optimizing")

@@ -80,7 +80,6 @@ def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(visit: Visit, 
     page.get_by_role("button", name="Delete").click()
     expect(page.locator("dialog[open]")).to_contain_text("in room.ply”?")
     expect(page.get_by_role("button", name="Keep")).to_be_focused()
-    assert in_both_themes(page) == NONE
     page.keyboard.press("Escape")
     expect(page.locator("dialog")).to_have_count(2)  # those of the page itself
     expect(page.get_by_role("button", name="Delete")).to_be_focused()
