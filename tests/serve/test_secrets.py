@@ -25,7 +25,6 @@ def test_secrets_stay_where_they_belong(tmp_path: Path) -> None:
         "webhook_secrets": json.dumps([f"alice:whsec_{SECRET}"]),
         "webhook_hosts": '["http://127.0.0.1:1"]',
         "log_format": "json",
-        "preload": "false",
     }
     with running_service(state, **settings) as address, httpx.Client(base_url=address, timeout=30) as client:
         texts = []

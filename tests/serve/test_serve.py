@@ -21,8 +21,8 @@ from tests.worker.bench import eventually
 @contextmanager
 def started(state_dir: Path, *arguments: str, **settings: object) -> Iterator[Service]:
     """A service that has ended with all its processes once the context is left. A worker that loads the engine takes
-    most of the start: unless the settings say so, none does."""
-    service = start(state_dir, *arguments, **{"preload": "false"} | settings)
+    most of the start: none does, tests/serve/test_secrets.py aside."""
+    service = start(state_dir, *arguments, preload="false", **settings)
     try:
         yield service
     finally:
@@ -36,7 +36,7 @@ NO_WORKER = ("--workers", "0")
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """One for the tests that leave it as they found it."""
-    with started(tmp_path_factory.mktemp("shared") / "state", preload="true") as service:
+    with started(tmp_path_factory.mktemp("shared") / "state") as service:
         yield service
 
 

@@ -95,13 +95,13 @@ async def get_artifact(
     id: str,  # noqa: A002
     name: str,
     services: ServicesDep,
-    caller: CallerDep,
     held: IfNoneMatchDep,
     range_: RangeHeader = None,
     if_range: IfRangeHeader = None,
     wait: ArtifactWaitQuery = _ARTIFACT_WAIT_S,
 ) -> Response:
     """The names are those of the result's `artifacts` list. The answer is held back while the file is still to come."""
+    caller = request.state.caller
     manifest = await wait_for(
         lambda: _manifest(services, id, caller), lambda now: name not in now.pending, wait, services, caller
     )
