@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -10,39 +11,34 @@ from redis import Redis
 
 from tests.contract.bad_input import nothing_of_a_request_stays, nothing_of_an_upload_stays
 from tests.contract.live import Live, eventually, live_service
-from tests.contract.world import World, field_bytes, make_world, sha256
+from tests.contract.world import World, field_bytes, make_world, put
 
 __all__ = ["nothing_of_a_request_stays", "nothing_of_an_upload_stays", "world"]
 
 
 @pytest.fixture
-def world(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
-    """A service with an upload limit of 4 KiB."""
-    made = make_world(tmp_path, any_redis)
-    with made.client:
-        yield made
-
-
-@pytest.fixture
 def worlds(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
     """Makes services with settings of their own."""
-    made: list[World] = []
+    with ExitStack() as stack:
 
-    def make(**settings: object) -> World:
-        made.append(make_world(tmp_path, any_redis, **settings))
-        return made[-1]
+        def make(**settings: object) -> World:
+            made = make_world(tmp_path, any_redis, **settings)
+            stack.enter_context(made.client)
+            return made
 
-    yield make
-    for world in made:
-        world.client.close()
+        yield make
 
 
 @pytest.fixture
-def guarded(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
+def world(worlds: Callable[..., World]) -> World:
+    """A service with an upload limit of 4 KiB."""
+    return worlds()
+
+
+@pytest.fixture
+def guarded(worlds: Callable[..., World]) -> World:
     """A service that asks for one of two tokens."""
-    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"first-token", "second-token"}))
-    with made.client:
-        yield made
+    return worlds(api_tokens=frozenset({"first-token", "second-token"}))
 
 
 @pytest.fixture(scope="session")
@@ -61,5 +57,6 @@ def nothing_stays_live(live: Live) -> Iterator[None]:
             client.delete(f"/fields/{field['sha256']}")
         eventually(lambda: live.files() == set(), "an empty store")
         good = field_bytes("the next good one")
-        assert client.put(f"/fields/{sha256(good)}", content=good).status_code == 201
-        assert client.delete(f"/fields/{sha256(good)}").status_code == 204
+        answer = put(client, good)
+        assert answer.status_code == 201
+        assert client.delete(answer.headers["location"]).status_code == 204

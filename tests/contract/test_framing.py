@@ -6,6 +6,7 @@ import pytest
 
 from tests.contract.live import Live
 
+pytestmark = pytest.mark.xdist_group("live api")
 HIDDEN = b"GET /version HTTP/1.1\r\nHost: localhost\r\n\r\n"
 BODY = b"0\r\n\r\n" + HIDDEN
 

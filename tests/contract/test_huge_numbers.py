@@ -17,7 +17,7 @@ from regnf_core.rendering.request import RenderOptions
 from tests.contract.world import World, field_bytes, sha256, transform
 
 _CONTRACT: dict[str, Any] = yaml.safe_load((Path(__file__).parents[2] / "openapi.yaml").read_text(encoding="utf-8"))
-HUGE = [2**31, 2**63, -(2**63), 10**30, 10**309, -(10**309), 10**4000, 1e308, -1e308, 5e-324]
+HUGE = [2**31, 2**63, -(2**63), 10**309, 10**4000, -1e308, 5e-324]
 """Beyond what 32 and 64 bits hold, what a float holds, and what a number of digits can be read; and the least float."""
 OBJECT, MATRIX = sha256(field_bytes("object")), transform(2.0)["matrix"]
 EDIT = {"kind": "substitution", "object": OBJECT, "T_object_scene": MATRIX, "tint": [1, 0, 0]}
@@ -29,55 +29,35 @@ QUERIES = [
     for parameter in item.get("get", {}).get("parameters", ())
     if parameter["in"] == "query" and "integer" in json.dumps(parameter["schema"])
 ]
+ORBIT: dict[str, Any] = {
+    "edits": [EDIT], "orbit": {"edit": 0, "frames": 2}, "size": [64, 48], "options": asdict(RenderOptions()),
+    "mesh_resolution": 64, "field_resolution": 64, "seed": 1,
+}  # fmt: skip
+TURNED = {"center": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_wxyz": [1, 0, 0, 0]}
+STARTED = {"seed": 1, "initial_transform": {"matrix": MATRIX}, "options": asdict(RegistrationOptions())}
+ENTRY = {"field": OBJECT, "name": "chair", "symmetry": {"order": 2, "axis": [0, 0, 1], "continuous": True}}
+SAID = {"bounds": [[-1, -1, -1], [1, 1, 1]], "latent_index": 0, "output_column": 0}
 BODIES: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "a registration": (
-        "POST",
-        "/register",
-        {"seed": 1, "initial_transform": {"matrix": MATRIX}, "options": asdict(RegistrationOptions())},
-    ),
-    "a box that is turned": (
-        "POST",
-        "/register",
-        {"detection": {"center": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_wxyz": [1, 0, 0, 0]}},
-    ),
-    "a rendering of an orbit": (
-        "POST",
-        "/render",
-        {
-            "edits": [EDIT],
-            "orbit": {"edit": 0, "frames": 2},
-            "size": [64, 48],
-            "options": asdict(RenderOptions()),
-            "mesh_resolution": 64,
-            "field_resolution": 64,
-            "seed": 1,
-        },
-    ),
+    "a registration": ("POST", "/register", STARTED),
+    "a box that is turned": ("POST", "/register", {"detection": TURNED}),
+    "a rendering of an orbit": ("POST", "/render", ORBIT),
     "a rendering of poses": ("POST", "/render", {"poses": [POSE]}),
     "a rendering of stations": ("POST", "/render", {"look_at": [STATION]}),
-    "an entry of the library": (
-        "POST",
-        "/library",
-        {"field": OBJECT, "name": "chair", "symmetry": {"order": 2, "axis": [0, 0, 1], "continuous": True}},
-    ),
-    "a description": (
-        "PATCH",
-        f"/fields/{OBJECT}",
-        {"description": {"bounds": [[-1, -1, -1], [1, 1, 1]], "latent_index": 0, "output_column": 0}},
-    ),
+    "an entry of the library": ("POST", "/library", ENTRY),
+    "a description": ("PATCH", f"/fields/{OBJECT}", {"description": SAID}),
 }
 
 
-@pytest.mark.parametrize(("path", "name"), QUERIES)
-@pytest.mark.parametrize("value", HUGE, ids=[str(value)[:6] + str(len(str(value))) for value in HUGE])
-def test_in_an_address(world: World, path: str, name: str, value: float) -> None:
+def test_in_an_address(world: World) -> None:
     request = world.valid_request()
     job = world.client.post("/register", json=request).json()["id"]
-    batch = world.client.post(
-        "/batches", content=json.dumps(request), headers={"Content-Type": "application/x-ndjson"}
-    ).json()["id"]
-    place = path.format(id=batch if path.startswith("/batches") else job, sha256=OBJECT, name="result.json")
-    assert world.client.get(f"{place}?{name}={value}").status_code < 500
+    headers = {"Content-Type": "application/x-ndjson"}
+    batch = world.client.post("/batches", content=json.dumps(request), headers=headers).json()["id"]
+    for path, name in QUERIES:
+        place = path.format(id=batch if path.startswith("/batches") else job, sha256=OBJECT, name="result.json")
+        for value in HUGE:
+            answer = world.client.get(f"{place}?{name}={value}")
+            assert answer.status_code < 500, (place, name, str(value)[:12])
 
 
 @pytest.mark.parametrize("body", BODIES)
@@ -119,13 +99,13 @@ def numbers_of(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, .
         yield place
 
 
-@pytest.mark.parametrize("value", [value for value in HUGE if isinstance(value, int)])
-def test_in_a_header(world: World, value: int) -> None:
+def test_in_a_header(world: World) -> None:
     job = world.client.post("/register", json=world.valid_request()).json()["id"]
     world.succeed(job, {"result.glb": bytes(100)})
     artifact, put = f"/jobs/{job}/artifacts/result.glb", f"/fields/{sha256(field_bytes('other'))}"
-    for span in (f"bytes={value}-", f"bytes=-{value}", f"bytes=0-{value}", f"bytes={value}-{value}"):
-        assert world.client.get(artifact, headers={"Range": span}).status_code < 500, span
-    for span in (f"bytes 0-{value}/{value}", f"bytes */{value}", f"bytes {value}-{value}/10"):
-        assert world.client.put(put, content=b"12", headers={"Content-Range": span}).status_code < 500, span
-    assert world.client.get(f"/jobs/{job}/events", headers={"Last-Event-ID": str(value)}).status_code < 500
+    for value in HUGE[:5]:
+        for span in (f"bytes={value}-", f"bytes=-{value}", f"bytes=0-{value}", f"bytes={value}-{value}"):
+            assert world.client.get(artifact, headers={"Range": span}).status_code < 500, span
+        for span in (f"bytes 0-{value}/{value}", f"bytes */{value}", f"bytes {value}-{value}/10"):
+            assert world.client.put(put, content=b"12", headers={"Content-Range": span}).status_code < 500, span
+        assert world.client.get(f"/jobs/{job}/events", headers={"Last-Event-ID": str(value)}).status_code < 500

@@ -17,42 +17,17 @@ def test_the_document_follows_the_record(world: World) -> None:
     assert waiting.headers["retry-after"] == "1"
     assert "cancel" in waiting.json()["links"]
     world.run(job_id)
-    world.records.update_job(job_id, 1, phase="optimizing", progress=0.5, engine={"version": "0.1.0", "device": "cpu"})
+    engine = {"version": "0.1.0", "device": "cpu"}
+    world.records.update_job(job_id, 1, phase="optimizing", progress=0.5, engine=engine)
     running = world.client.get(f"/jobs/{job_id}").json()
-    assert [running[name] for name in ("status", "phase", "progress", "queue_position")] == [
-        "running",
-        "optimizing",
-        0.5,
-        None,
-    ]
-    assert running["engine"] == {"version": "0.1.0", "device": "cpu"}
+    expected = {"status": "running", "phase": "optimizing", "progress": 0.5, "queue_position": None, "engine": engine}
+    assert {name: running[name] for name in expected} == expected
     assert running["started_at"].endswith("Z")
-
-
-def test_a_finished_job_says_when_it_expires(world: World) -> None:
-    job_id = world.submit()
     world.succeed(job_id)
     answer = world.client.get(f"/jobs/{job_id}")
     assert "retry-after" not in answer.headers
     assert answer.json()["expires_at"] > answer.json()["finished_at"]
     assert answer.json()["links"]["result"] == f"/jobs/{job_id}/result"
-
-
-def test_an_etag_saves_the_body_until_something_changes(world: World) -> None:
-    job_id = world.submit()
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    unchanged = world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag})
-    assert (unchanged.status_code, unchanged.content) == (304, b"")
-    world.run(job_id)
-    assert world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag}).status_code == 200
-
-
-def test_a_heartbeat_is_no_change(world: World) -> None:
-    job_id = world.submit()
-    world.run(job_id)
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    world.records.heartbeat(job_id, 1)
-    assert world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag}).status_code == 304
 
 
 def test_waiting_ends_with_the_job(world: World) -> None:
@@ -62,16 +37,6 @@ def test_waiting_ends_with_the_job(world: World) -> None:
     answer = world.client.get(f"/jobs/{job_id}", params={"wait": 20})
     worker.join()
     assert answer.json()["status"] == "successful"
-
-
-def test_waiting_with_an_etag_ends_at_the_first_change(world: World) -> None:
-    job_id = world.submit()
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    worker = threading.Timer(0.1, world.run, (job_id,))
-    worker.start()
-    answer = world.client.get(f"/jobs/{job_id}", params={"wait": 20}, headers={"If-None-Match": etag})
-    worker.join()
-    assert (answer.status_code, answer.json()["status"]) == (200, "running")
 
 
 def test_lists_go_page_by_page_and_by_status(world: World) -> None:
@@ -103,17 +68,8 @@ def test_the_event_stream_tells_everything_and_ends_with_the_job(world: World) -
     worker.join()
     assert answer.headers["content-type"].startswith("text/event-stream")
     events = events_of(answer.text)
-    assert [event["data"]["status"] for event in events if event["event"] == "status"] == [
-        "accepted",
-        "running",
-        "successful",
-    ]
-
-
-def test_a_stream_resumes_after_the_last_event_and_then_has_no_more(world: World) -> None:
-    job_id = world.submit()
-    world.succeed(job_id)
-    events = events_of(world.client.get(f"/jobs/{job_id}/events").text)
+    states = [event["data"]["status"] for event in events if event["event"] == "status"]
+    assert states == ["accepted", "running", "successful"]
     rest = world.client.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": events[0]["id"]})
     assert events_of(rest.text) == events[1:]
     done = world.client.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": events[-1]["id"]})
@@ -127,27 +83,21 @@ def test_the_stream_of_a_failed_job_carries_the_problem(world: World) -> None:
     assert (last["data"]["status"], last["data"]["error"]["reason"]) == ("failed", "NO_INITIAL_TRANSFORM")
 
 
-def test_cancelling_a_waiting_job_dismisses_it_once(world: World) -> None:
-    job_id = world.submit()
-    first = world.client.post(f"/jobs/{job_id}/cancel")
-    assert (first.status_code, first.json()["status"]) == (202, "dismissed")
-    assert world.queue.stopped == [(job_id, 1)]
-    second = world.client.post(f"/jobs/{job_id}/cancel")
-    assert (second.status_code, second.json()["status"]) == (200, "dismissed")
+def test_cancelling_dismisses_a_waiting_job_once_asks_a_running_ones_worker_and_refuses_a_finished_one(
+    world: World,
+) -> None:
+    def cancelled(job_id: str) -> tuple[int, str, bool]:
+        answer = world.client.post(f"/jobs/{job_id}/cancel")
+        return answer.status_code, answer.json()["status"], answer.json()["cancel_requested"]
 
-
-def test_cancelling_a_running_job_asks_its_worker(world: World) -> None:
-    job_id = world.submit()
-    world.run(job_id)
-    answer = world.client.post(f"/jobs/{job_id}/cancel")
-    assert (answer.status_code, answer.json()["status"], answer.json()["cancel_requested"]) == (202, "running", True)
-    assert world.queue.stopped == [(job_id, 1)]
-
-
-def test_a_finished_job_is_not_cancelled(world: World) -> None:
-    job_id = world.submit()
-    world.succeed(job_id)
-    assert_refused(world.client.post(f"/jobs/{job_id}/cancel"), 409, "JOB_FINISHED")
+    waiting, running, finished = (world.submit(seed=seed) for seed in range(3))
+    assert cancelled(waiting)[:2] == (202, "dismissed")
+    assert cancelled(waiting)[:2] == (200, "dismissed")
+    world.run(running)
+    assert cancelled(running) == (202, "running", True)
+    assert world.queue.stopped == [(waiting, 1), (running, 1)]
+    world.succeed(finished)
+    assert_refused(world.client.post(f"/jobs/{finished}/cancel"), 409, "JOB_FINISHED")
 
 
 def test_deleting_takes_the_artifacts_along(world: World) -> None:

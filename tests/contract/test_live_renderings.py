@@ -21,6 +21,7 @@ from tests.live_stack import DATA, LIVE, demo_request, finished
 pytestmark = LIVE
 TRUTH = json.loads((DATA / "truth.json").read_text())["T_object_scene"]["matrix"]
 DETECTION = json.loads((DATA / "detection.json").read_text())
+OUTPUTS = ["color", "depth", "normal", "animation", "strip", "mesh", "field"]
 SMALL: dict[str, Any] = {"size": [32, 24], "orbit": {"frames": 2}, "outputs": ["color"], "before": False}
 
 
@@ -55,9 +56,8 @@ def failed(client: httpx.Client, stack: Live, fields: dict[str, str], reason: st
 @pytest.fixture(scope="module")
 def everything(live_stack: Live, demo_fields: dict[str, str]) -> dict[str, Any]:
     """The result of a substitution with every output."""
-    outputs = ["color", "depth", "normal", "animation", "strip", "mesh", "field"]
     with live_stack.client() as client:
-        asked = {"outputs": outputs, "before": True, "mesh_resolution": 32, "field_resolution": 48}
+        asked = {"outputs": OUTPUTS, "before": True, "mesh_resolution": 32, "field_resolution": 48}
         return result_of(client, rendered(client, demo_fields, edits=[substitution(demo_fields)], **asked))
 
 
@@ -67,14 +67,7 @@ def test_every_output_is_a_file_that_opens(live_client: httpx.Client, everything
         data = live_client.get(entry["url"]).content
         assert (len(data), sha256(data)) == (entry["bytes"], entry["sha256"])
         files[entry["name"]] = data
-    assert {one.get("kind") for one in everything["artifacts"]} >= {
-        "color",
-        "depth",
-        "normal",
-        "animation",
-        "strip",
-        "mesh",
-    }
+    assert {one.get("kind") for one in everything["artifacts"]} >= set(OUTPUTS) - {"field"}
     after, before = (Image.open(io.BytesIO(files[f"{name}-0000.png"])) for name in ("frame", "before"))
     assert after.size == before.size == (32, 24)
     levels = np.asarray(Image.open(io.BytesIO(files["frame-0001-depth.png"])), dtype=np.float64)
@@ -90,33 +83,28 @@ def test_the_edited_scene_is_a_field_like_any_other(
     live_client: httpx.Client, demo_fields: dict[str, str], everything: dict[str, Any]
 ) -> None:
     sha = everything["field"]
-    artifact = next(one for one in everything["artifacts"] if one["name"] == "edited.safetensors")
+    (artifact,) = [one for one in everything["artifacts"] if one["name"] == "edited.safetensors"]
     assert artifact["sha256"] == sha
 
     def imported() -> dict[str, Any] | None:
         field: dict[str, Any] = live_client.get(f"/fields/{sha}", params={"wait": 5}).json()
         return None if field.get("state") == "validating" else field
 
-    field = eventually(imported, "the import of the edited scene")
-    assert field["state"] == "ready", field
+    assert eventually(imported, "the import of the edited scene")["state"] == "ready"
     again = {"scene": sha, "object": demo_fields["object"]}
     picture = result_of(live_client, rendered(live_client, again, edits=[substitution(demo_fields)]))
     assert picture["frames"] == 2
-    answer = live_client.post("/register", json=demo_request(again))
-    assert answer.status_code == 202, answer.text
-    assert finished(live_client, answer.json()["id"])["status"] == "successful"
+    answer = live_client.post("/register?dry_run=true", json=demo_request(again))
+    assert (answer.status_code, answer.json()["valid"]) == (200, True)
 
 
 def test_a_registration_and_then_its_rendering(live_client: httpx.Client, demo_fields: dict[str, str]) -> None:
-    asked = demo_request(demo_fields, options={}, seed=31)
+    asked = demo_request(demo_fields, options={})  # as in test_live_jobs: one request is one job
     job = finished(live_client, live_client.post("/register", json=asked).json()["id"])
     assert job["verdict"] == "registered", job
     edit = {"kind": "substitution", "job": job["id"]}
     result = result_of(live_client, rendered(live_client, demo_fields, edits=[edit], outputs=["strip"], before=True))
     assert "before-after.png" in {one["name"] for one in result["artifacts"]}
-    assert (
-        live_client.post("/render", json={"scene": demo_fields["scene"], **SMALL, "edits": [edit]}).status_code == 202
-    )
 
 
 def deepest_place() -> list[float]:
@@ -146,10 +134,8 @@ def test_a_rendering_that_is_cancelled_leaves_nothing(
     live_client: httpx.Client, live_stack: Live, demo_fields: dict[str, str]
 ) -> None:
     asked = {"scene": demo_fields["scene"], "size": [640, 480], "orbit": {"frames": 60}, "options": {"mode": "volume"}}
-    job = live_client.post("/render", json={**asked, "outputs": ["color"]}).json()
-    eventually(
-        lambda: live_client.get(f"/jobs/{job['id']}").json()["phase"] == "rendering" or None, "a rendering that goes on"
-    )
-    assert live_client.post(f"/jobs/{job['id']}/cancel").status_code == 202
-    assert finished(live_client, job["id"])["status"] == "dismissed"
-    assert not [name for name in live_stack.files() if name.startswith(f"jobs/{job['id']}/")]
+    address = live_client.post("/render", json={**asked, "outputs": ["color"]}).headers["location"]
+    eventually(lambda: live_client.get(address).json()["phase"] == "rendering" or None, "a rendering that goes on")
+    assert live_client.post(f"{address}/cancel").status_code == 202
+    assert finished(live_client, address.rpartition("/")[2])["status"] == "dismissed"
+    assert not [name for name in live_stack.files() if name.startswith(f"{address[1:]}/")]

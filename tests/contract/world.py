@@ -12,7 +12,6 @@ from typing import Any
 import httpx
 from fastapi import FastAPI
 from redis import Redis
-from starlette.routing import BaseRoute
 
 from regnf_service.server import create_app
 from regnf_state.queue import Work
@@ -21,7 +20,7 @@ from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 from tests.stores import HeldBlobs, ShiftedJournaledRecords, WatchedQueue, stores_over
 
-_ROUTES: list[BaseRoute] = []
+_APPS: list[FastAPI] = []
 BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
 BOUNDS = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 NOBODY = "0" * 32
@@ -38,6 +37,11 @@ def field_bytes(name: str, size: int = 600) -> bytes:
 
 def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
+
+
+def put(client: httpx.Client, data: bytes, **headers: str) -> httpx.Response:
+    """Upload a field's file under its digest."""
+    return client.put(f"/fields/{sha256(data)}", content=data, headers=headers)
 
 
 def transform(scale: float = 1.0) -> dict[str, Any]:
@@ -107,6 +111,8 @@ class World:
         """What a worker does first."""
         record = self.records.get_job(job_id)
         assert record is not None
+        if record.status == "running":
+            return record
         return self.records.update_job(job_id, record.attempt, status="running", phase="loading")
 
     def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None, pending: Sequence[str] = ()) -> None:
@@ -116,9 +122,8 @@ class World:
         listed = self._put(job_id, attempt, files)
         document = {"attempt": attempt, "artifacts": listed} | ({"pending": list(pending)} if pending else {})
         self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
-        self.records.update_job(
-            job_id, attempt, status="successful", verdict=json.loads(files["result.json"]).get("verdict")
-        )
+        verdict = json.loads(files["result.json"]).get("verdict")
+        self.records.update_job(job_id, attempt, status="successful", verdict=verdict)
 
     def finish(self, job_id: str, artifacts: dict[str, bytes]) -> None:
         """What it leaves behind of what was still to come."""
@@ -138,12 +143,18 @@ class World:
         self.records.update_job(job_id, attempt, status="failed", error=error)
 
 
+def pointers(problem: dict[str, Any]) -> list[str]:
+    """The places in a body that a problem names."""
+    return [one["pointer"] for one in problem["errors"]]
+
+
 def share_routes(app: FastAPI) -> None:
-    """Give every application the routes of the first one: no setting changes them, and the framework takes longer to
-    work them out, at an application's first request, than most tests take for theirs."""
-    if not _ROUTES:
-        _ROUTES.extend(app.router.routes)
-    app.router.routes[:] = _ROUTES
+    """Give every application the routes and the contract of the first one: no setting changes them, and the framework
+    takes longer to work them out, at an application's first request, than most tests take for theirs."""
+    _APPS.append(app)
+    del _APPS[1:]
+    app.router.routes[:] = _APPS[0].router.routes
+    app.openapi = _APPS[0].openapi  # type: ignore[method-assign]
 
 
 def make_world(folder: Path, redis: Redis, **settings: Any) -> World:

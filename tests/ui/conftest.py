@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import pytest
 import trimesh
-from playwright.sync_api import Browser, ConsoleMessage, Error, Page, Request, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 from regnf_state.settings import Settings
 from tests.ui import room
@@ -21,17 +21,11 @@ from tests.ui.home import home, register, upload
 
 # SwiftShader draws WebGL without a GPU, and nothing else, being slow. The others keep the browser from calling home.
 ARGUMENTS = [
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-gpu-compositing",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+Files = tuple[Path, Path, Path]
 
 DRIVER = "GL Driver Message"
 """Begins what the drawing library says of its own speed; the page has no part in it."""
@@ -53,15 +47,19 @@ class Visit:
         return self.page
 
 
+def chromium() -> str:
+    """The installed browser; without one the test is skipped, or fails where REGNF_REQUIRE_BROWSER=1 asks for it."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None and os.environ.get("REGNF_REQUIRE_BROWSER") == "1":
+        pytest.fail("no chromium on this machine, and REGNF_REQUIRE_BROWSER=1 asks for it")
+    return found or pytest.skip("no chromium on this machine: the page is not tested")
+
+
 @pytest.fixture(scope="package")  # its loop of events must not outlive these tests
 def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        if os.environ.get("REGNF_REQUIRE_BROWSER") == "1":
-            pytest.fail("no chromium on this machine, and REGNF_REQUIRE_BROWSER=1 asks for it")
-        pytest.skip("no chromium on this machine: the page is not tested")
+    program = chromium()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
         yield browser
         browser.close()
 
@@ -74,7 +72,7 @@ def running_server() -> Iterator[FixtureServer]:
 
 @pytest.fixture
 def server(running_server: FixtureServer) -> FixtureServer:
-    running_server.stage.reset()
+    running_server.stage.set(step=0, cancelled=False)
     return running_server
 
 
@@ -143,17 +141,15 @@ def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Vis
     page: Page = request.getfixturevalue(name)
     visit = Visit(page, server)
 
-    def asked(message: Request) -> None:
-        visit.requests.append(message.url)
-
-    def failed(error: Error) -> None:
-        visit.complaints.append(str(error))
-
     def said(message: ConsoleMessage) -> None:
         if message.type != "info" and DRIVER not in message.text:
             visit.complaints.append(message.text)
 
-    listeners = {"request": asked, "pageerror": failed, "console": said}
+    listeners: dict[Any, Callable[[Any], None]] = {
+        "request": lambda message: visit.requests.append(message.url),
+        "pageerror": lambda error: visit.complaints.append(str(error)),
+        "console": said,
+    }
     for event, listener in listeners.items():
         page.on(event, listener)
     yield visit
@@ -162,7 +158,7 @@ def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Vis
 
 
 @pytest.fixture(scope="session")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """A room, the chair that stands in it, and a stool that does not."""
     folder = tmp_path_factory.mktemp("own")
     stool = folder / "stool.glb"
@@ -190,7 +186,7 @@ def service(running_home: str, visit: Visit) -> Iterator[str]:
 
 
 @pytest.fixture
-def filled(service: str, files: tuple[Path, Path, Path]) -> str:
+def filled(service: str, files: Files) -> str:
     """The address of a service that has a room, a chair, and a job with both."""
     register(service, upload(service, files[:2]))
     return service

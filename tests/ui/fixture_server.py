@@ -2,11 +2,11 @@
 
     python -m tests.ui.fixture_server        then open the printed addresses
 
-The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
-(live without an event stream), asked (the scene's file may be two functions), locked (wants a token), numbers (made
-without pictures), labeled (the object's label is in its file), bare (a result with little in it), roomy (with the scene
-round the detection), broken (damaged clouds), searched (the best of a library), tipped (y is up), meshed (with display
-meshes) or rendered (a rendering).
+The job's id chooses the story: done, running, queued, failed, dismissed, live, polled (live without an event stream),
+ambiguous (with two more poses), judged (with a pose that was rejected), asked (the scene's file may be two functions),
+locked (wants a token), numbers (made without pictures), labeled (the object's label is in its file), bare (a result
+with little in it), roomy (with the scene round the detection), broken (damaged clouds), searched (the best of a
+library), tipped (y is up), meshed (with display meshes) or rendered (a rendering).
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from tests.ui.stories import MESHED, STORIES, STRIP, Stage, field_document, field_picture
-from tests.ui.synthetic import synthetic
-from tests.ui.synthetic_meshes import object_mesh, scene_mesh
+from tests.ui.synthetic import object_mesh, scene_mesh, synthetic
 
 WEB = Path(__file__).resolve().parents[2] / "service" / "regnf_service" / "web"
 CONTENT_SECURITY_POLICY = "default-src 'self'"
@@ -36,21 +35,12 @@ class Handler(BaseHTTPRequestHandler):
     stage: ClassVar[Stage]
 
     def do_GET(self) -> None:
-        path = self.path.split("?")[0]
+        path = self.path.split("?")[0].removeprefix("/v1")
         if path.startswith("/static/"):
             return self._file(WEB / path.removeprefix("/static/"))
-        field = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})", path)
-        if field:
-            return self._json(200, field_document(field[1]))
-        mesh = re.fullmatch(r"/fields/([0-9a-f]{64})/mesh\.glb", path)
-        if mesh:
-            return self._bytes(200, scene_mesh() if mesh[1] == MESHED["scene"] else object_mesh(), "model/gltf-binary")
-        picture = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})/(?:preview|candidates/1)\.png", path)
-        if picture:
-            if "/locked/" in self.headers.get("Referer", "") and self.headers.get("Authorization") != f"Bearer {TOKEN}":
-                return self._problem(401, "UNAUTHENTICATED")
-            return self._bytes(200, field_picture(picture[1]), "image/png")
-        match = re.fullmatch(r"(?:/v1)?/jobs/(\w+)(/.*)?", path)
+        if field := re.fullmatch(r"/fields/([0-9a-f]{64})(/mesh\.glb|/preview\.png|/candidates/1\.png)?", path):
+            return self._field(field[1], field[2] or "")
+        match = re.fullmatch(r"/jobs/(\w+)(/.*)?", path)
         if not match:
             return self._problem(404, "NOT_FOUND")
         story, rest = match[1], match[2] or ""
@@ -58,7 +48,7 @@ class Handler(BaseHTTPRequestHandler):
             return self._file(WEB / "view.html")
         if story not in STORIES:
             return self._problem(404, "JOB_NOT_FOUND")
-        if story == "locked" and self.headers.get("Authorization") != f"Bearer {TOKEN}":
+        if story == "locked" and self._stranger():
             return self._problem(401, "UNAUTHENTICATED")
         return self._job(story, rest)
 
@@ -68,10 +58,20 @@ class Handler(BaseHTTPRequestHandler):
             return self._json(202, self.stage.rendering())
         if not self.path.endswith("/cancel"):
             return self._problem(404, "NOT_FOUND")
-        with self.stage.changed:
-            self.stage.cancelled = True
-            self.stage.changed.notify_all()
+        self.stage.set(cancelled=True)
         return self._json(202, {})
+
+    def _stranger(self) -> bool:
+        return self.headers.get("Authorization") != f"Bearer {TOKEN}"
+
+    def _field(self, sha256: str, rest: str) -> None:
+        if rest == "":
+            return self._json(200, field_document(sha256))
+        if rest == "/mesh.glb":
+            return self._bytes(200, scene_mesh() if sha256 == MESHED["scene"] else object_mesh(), "model/gltf-binary")
+        if "/locked/" in self.headers.get("Referer", "") and self._stranger():
+            return self._problem(401, "UNAUTHENTICATED")
+        return self._bytes(200, field_picture(sha256), "image/png")
 
     def _job(self, story: str, rest: str) -> None:
         if rest == "":
@@ -94,33 +94,27 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", "text/event-stream")
         self.send_header("Connection", "close")
         self.end_headers()
+        self.close_connection = True
         # a stream begins with the past: here an earlier attempt, which failed
         past = {"status": "failed", "phase": "loading", "progress": 0.1, "attempt": 0, "updated": 1_779_999_000.0}
-        self.wfile.write(f"retry: 2000\n\nid: 0-1\nevent: status\ndata: {json.dumps(past)}\n\n".encode())
-        told: dict[str, Any] = {}
-        number = 0
+        line = f"retry: 2000\n\nid: 0-1\nevent: status\ndata: {json.dumps(past)}\n\n"
+        stage, told, number = self.stage, dict[str, Any](), 0
         while True:
-            before = told
-            told = self._next_document(story, before)
-            number += told != before
-            data = {name: told[name] for name in ("status", "phase", "progress", "error")} | {"attempt": 1}
-            event = f"id: {number}-0\nevent: progress\ndata: {json.dumps(data)}\n\n"
-            line = event if told != before else ": still here\n\n"
             try:
                 self.wfile.write(line.encode())
                 self.wfile.flush()
             except OSError:
-                break
-            if self.stage.closing or told["status"] not in ("accepted", "running"):
-                break
-        self.close_connection = True
-
-    def _next_document(self, story: str, known: dict[str, Any]) -> dict[str, Any]:
-        """The job's document once it differs from the known one, or after half a second."""
-        stage = self.stage
-        with stage.changed:
-            stage.changed.wait_for(lambda: stage.closing or stage.job(story) != known, timeout=0.5)
-            return stage.job(story)
+                return
+            if stage.closing or told.get("status", "accepted") not in ("accepted", "running"):
+                return
+            before = told
+            with stage.changed:
+                stage.changed.wait_for(lambda known=before: stage.closing or stage.job(story) != known, timeout=0.5)
+                told = stage.job(story)
+            number += told != before
+            data = {name: told[name] for name in ("status", "phase", "progress", "error")} | {"attempt": 1}
+            event = f"id: {number}-0\nevent: progress\ndata: {json.dumps(data)}\n\n"
+            line = event if told != before else ": still here\n\n"
 
     def _file(self, path: Path) -> None:
         if not path.is_file() or WEB not in path.resolve().parents:
@@ -161,7 +155,7 @@ class FixtureServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stage.close()
+        self.stage.set(closing=True)
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()

@@ -20,9 +20,11 @@ from playwright.sync_api import Page, expect
 from regnf_service.server import create_app
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.settings import Settings
+from regnf_state.stores import Stores
 from tests.contract.live import eventually
 from tests.stores import private_stores
 from tests.ui import room
+from tests.ui.pixels import box_of
 from tests.ui.pretend_worker import PretendWorker
 
 NETWORK = "Failed to load resource"
@@ -54,19 +56,28 @@ def true_pose() -> np.ndarray:
 
 
 @contextmanager
+def served(settings: Settings, stores: Stores) -> Iterator[str]:
+    """The address of the application over these stores."""
+    server = StoppingServer(create_app(settings, stores))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@contextmanager
 def home(settings: Settings, caller: str = ANONYMOUS) -> Iterator[str]:
     """The address of the application with a worker that ends everything at once."""
-    with private_stores() as stores:
-        server = StoppingServer(create_app(settings, stores))
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-            thread.start()
-            try:
-                with PretendWorker(stores.records, stores.blobs, caller, true_pose().tolist()):
-                    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
-            finally:
-                server.should_exit = True
-                thread.join()
+    with (
+        private_stores() as stores,
+        served(settings, stores) as address,
+        PretendWorker(stores.records, stores.blobs, caller, true_pose().tolist()),
+    ):
+        yield address
 
 
 def upload(address: str, files: Sequence[Path]) -> list[str]:
@@ -89,7 +100,7 @@ def register(address: str, fields: Sequence[str], **more: Any) -> dict[str, Any]
     assert answer.status_code == 202, answer.text
 
     def ended() -> dict[str, Any] | None:
-        job: dict[str, Any] = httpx.get(f"{address}/jobs/{answer.json()['id']}").json()
+        job: dict[str, Any] = httpx.get(f"{address}/jobs/{answer.json()['id']}", params={"wait": 5}, timeout=30).json()
         return job if job["status"] == "successful" else None
 
     return eventually(ended, "the end of a job")
@@ -109,8 +120,7 @@ def choose_scene(page: Page, label: str = "room.ply") -> None:
 
 
 def click_at(page: Page, place: tuple[float, float]) -> None:
-    box = page.locator("#canvas").bounding_box()
-    assert box is not None
+    box = box_of(page)
     page.mouse.click(box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"])
 
 
