@@ -183,8 +183,8 @@ def compose(
 
     Distances are in scene units. Deterministic for a seed. ``progress`` is called with the share done, 0..1, before
     each edit; it may raise CancelledError to stop the work.
-    Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID, EDIT_INVALID (two edits change the same place),
-    EDIT_INVALID, FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
+    Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID (also for two edits of one place, and beyond the scene),
+    FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
     surfaces: dict[int, OrientedBox] = {}
     scene, origin = near_origin(scene)
