@@ -46,7 +46,7 @@ def test_what_cameras_saw_is_told_by_where_they_stood_alone(world: Task) -> None
     T_scene_room = Sim3.from_matrix(json.loads((world.home / WORLD).read_text())["T_scene_room"])
     camera = T_scene_room.apply(read_cameras(world.home).positions)
     surfaces, before = 0, []
-    for one in islice(cases_of(world.home, "cameras"), 2):
+    for one in islice(cases_of(world.home, "cameras"), 1):
         seen = observation_of(one.case.scene)
         assert seen is not None
         assert one.case.truth is not None

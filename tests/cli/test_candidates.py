@@ -13,7 +13,7 @@ from PIL import Image
 from regnf_core.errors import Candidate, FieldFormatError
 from regnf_core.importing.gate import gate
 from tests.cli.conftest import DATA, Run, Serve, field
-from tests.core.importing.gate.test_candidates import octahedron
+from tests.core.importing.gate.test_candidates import two_scales
 
 ASKED = (Candidate("it's smooth", {"hash": {"interpolation": "smoothstep"}}, b"png"), Candidate("b", {"sign": -1}))
 
@@ -75,15 +75,15 @@ def test_pictures_are_written_where_they_were_made(run: Run, tmp_path: Path) -> 
 
 
 def test_a_line_and_a_picture_of_a_real_file(run: Run, tmp_path: Path) -> None:
-    upload = octahedron(tmp_path)
-    outcome = run("inspect", upload, "--candidates", tmp_path / "new", "--description", '{"output_tanh": 0}')
+    upload = two_scales(tmp_path)
+    outcome = run("inspect", upload, "--candidates", tmp_path / "new", "--description", '{"label": "pot"}')
     assert outcome.code == 2
     assert f"LAYOUT_AMBIGUOUS {upload}: " in outcome.stderr
     lines = lines_of(outcome.stderr, "--description")
-    (number,) = (number for number, line in enumerate(lines, 1) if line["activation"] == "relu")
-    with Image.open(tmp_path / "new" / f"{number}.png") as picture:
+    assert lines == [{"label": "pot", "input_scale": 1.0}, {"label": "pot", "input_scale": 3.0}]
+    with Image.open(tmp_path / "new" / "1.png") as picture:
         assert picture.size == (576, 192)
-    assert run("inspect", upload, "--description", json.dumps(lines[number - 1])).code == 0
+    assert run("inspect", upload, "--description", json.dumps(lines[0])).code == 0
 
 
 def test_a_service_asks_as_well(run: Run, serve: Serve, tmp_path: Path) -> None:

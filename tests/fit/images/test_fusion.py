@@ -105,9 +105,9 @@ def test_a_small_thing_before_a_coarse_sensor_is_fused(tmp_path: Path) -> None:
 
 
 def test_voxels_are_no_smaller_than_half_the_deviation(tmp_path: Path) -> None:
-    sharp = scenes.images(count=16, height=144, width=192)
+    sharp = scenes.images(count=12, height=288, width=384)
     exact = fuse_images(sharp, tmp_path / "exact.safetensors")
-    rough = fuse_images(misplaced(sharp, 0.06), tmp_path / "rough.safetensors")
+    rough = fuse_images(misplaced(sharp, 0.03), tmp_path / "rough.safetensors")
     assert exact.truncation == pytest.approx(4.0 * exact.voxel)
     assert rough.voxel > 1.3 * exact.voxel
     assert rough.truncation == pytest.approx(12.0 * rough.voxel)

@@ -124,14 +124,15 @@ def chosen(images: PosedImages, table_log2: int | None = None) -> tuple[int, int
 
 
 def occupied(images: PosedImages, edge: float) -> int:
-    """Cells of this edge with a measured point in them, one pixel after another."""
+    """Cells of this edge with a measured point in them."""
     assert images.depths is not None
-    cells = set()
+    rows, columns = np.indices(images.size) + 0.5
+    cells = []
     for depth, camera, pose in zip(images.depths, images.intrinsics, images.T_world_camera, strict=True):
-        for row, column in zip(*np.nonzero(depth), strict=True):
-            ray = np.linalg.inv(camera) @ (column + 0.5, row + 0.5, 1.0)
-            cells.add(tuple(np.floor((pose[:3, :3] @ (depth[row, column] * ray) + pose[:3, 3]) / edge)))
-    return len(cells)
+        rays = np.einsum("ij,jhw->hwi", np.linalg.inv(camera), np.stack([columns, rows, np.ones_like(rows)]))
+        points = np.einsum("ij,hwj->hwi", pose[:3, :3], depth[..., None] * rays) + pose[:3, 3]
+        cells.append(np.floor(points[depth > 0.0] / edge))
+    return len(np.unique(np.concatenate(cells), axis=0))
 
 
 def test_coarse_pixels_and_colors_alone_take_the_smallest_grid() -> None:

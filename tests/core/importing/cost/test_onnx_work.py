@@ -111,7 +111,7 @@ def test_costly_graphs_are_refused_before_anything_is_evaluated(
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda _: pytest.fail("it was opened"))
     path = saved(tmp_path, costly(name).SerializeToString())
     assert path.stat().st_size < 12_000
-    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(work_s=6)), "IMPORT_TOO_COSTLY")
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(wall_s=100, work_s=6)), "IMPORT_TOO_COSTLY")
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
