@@ -104,11 +104,6 @@ REASONS: dict[str, Reason] = {
     "QUOTA_IMPORTS": Reason(
         429, "Quota of imports used up", "You have the maximum number of imports that wait or run. Wait for one to end."
     ),
-    "QUOTA_WORKER_SECONDS": Reason(
-        429,
-        "Quota of worker time used up",
-        "Your imports and jobs of the last hour have used the time that you may use. See `Retry-After`.",
-    ),
     "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),

@@ -42,6 +42,8 @@ _RENAMED = {
     "REGNF_RETENTION_S": "REGNF_JOB_RETENTION_S",
     "REGNF_UNUSED_FIELD_RETENTION_S": "REGNF_FIELD_RETENTION_S",
     "REGNF_STORAGE_CAP_BYTES": "REGNF_MAX_STORED_BYTES",
+    "REGNF_CALLER_WEIGHTS": "REGNF_QUOTA_ACTIVE_JOBS",  # gone with the shares of worker time: callers take turns
+    "REGNF_QUOTA_WORKER_SECONDS_PER_HOUR": "REGNF_QUOTA_ACTIVE_JOBS",
 }
 
 
@@ -126,10 +128,6 @@ class Fixed(BaseModel):
     max_batch_pairs: int = Field(default=1000, ge=1)
     max_batch_bytes: int = Field(default=8 * MIB, ge=1024)
     """Largest body of a batch."""
-    worker_reserve_s: float = Field(default=300.0, ge=0, le=86400)
-    """How long after a caller's last request or result other callers leave one worker free for it; 0: they do not."""
-    job_niceness: int = Field(default=10, ge=0, le=19)
-    """The most by which jobs and imports of callers above their share give way at the processor; 0: they do not."""
     max_finished_jobs: int = Field(default=50_000, ge=1)
     """Of all callers; beyond this the oldest ones of the caller that has most go."""
     redis_reserve: float = Field(default=0.1, ge=0, le=0.5)
@@ -205,10 +203,6 @@ class Settings(Fixed, BaseSettings):
     """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""
     quota_active_jobs: int | None = Field(default=None, ge=1)
     """Jobs of each caller that wait or run. Unset: with tokens, as many as are left free for others."""
-    quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
-    """What each caller's imports and jobs may cost the workers in an hour."""
-    caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
-    """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""
     quota_finished_jobs: int = Field(default=10_000, ge=1)
     """Of each caller; beyond this its oldest finished jobs go before their time."""
     quota_fields: int | None = Field(default=10_000, ge=1)

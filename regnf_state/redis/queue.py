@@ -19,7 +19,7 @@ from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.queue import QUEUE_NAME, Work
 from regnf_state.records import JobRecord
 from regnf_state.redis.documents import shown
-from regnf_state.redis.fair_queue import FairQueue, Line, Waiting
+from regnf_state.redis.fair_queue import FairQueue, Waiting
 
 # What Redis holds of a piece of work in RQ's shape, a hash: written here, and believed only if written here.
 #
@@ -105,52 +105,44 @@ def _data(value: bytes) -> Any:
         return None
 
 
-class JobQueue:
+class JobQueue(FairQueue):
     """Hands ids to workers, each at most once per attempt: enqueueing what is known already changes nothing.
 
-    RQ's lists, and the fair queue before them, which has ``weights`` and ``reserve_s``. ``key`` signs
-    what is put into Redis.
+    ``key`` signs what is put into Redis.
     """
 
-    def __init__(
-        self,
-        redis: Redis,
-        key: str | None = None,
-        weights: Mapping[str, float] | None = None,
-        reserve_s: float = 0.0,
-    ) -> None:
-        self._redis = redis
+    def __init__(self, redis: Redis, key: str | None = None) -> None:
+        super().__init__(redis)
         self._key = key
-        self.fair = FairQueue(redis, weights, reserve_s)
 
     def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
         """of_batch: it waits behind all that its owner has posted by itself, so that a batch holds nothing up."""
-        self._enqueue([(Work("registration", job_id, attempt), owner, of_batch)])
+        self.enqueue(self._waiting(Work("registration", job_id, attempt), owner, of_batch))
 
     def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
         """The same for several accepted jobs, in one round trip, in their order."""
-        self._enqueue([(Work("registration", job.id, job.attempt), job.owner, job.is_of_batch) for job in jobs])
+        self.enqueue(
+            *(self._waiting(Work("registration", job.id, job.attempt), job.owner, job.is_of_batch) for job in jobs)
+        )
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
         """Its owner is named in the field's reference."""
-        self._enqueue([(Work("import", sha256, attempt), owner_of(sha256), False)])
+        self.enqueue(self._waiting(Work("import", sha256, attempt), owner_of(sha256)))
 
-    def _enqueue(self, waiting: Sequence[tuple[Work, str, bool]]) -> None:
-        self.fair.enqueue_each(
-            Waiting(work, owner, written(work, self._redis, self._key), of_batch) for work, owner, of_batch in waiting
-        )
+    def _waiting(self, work: Work, owner: str, of_batch: bool = False) -> Waiting:
+        return Waiting(work, owner, written(work, self._redis, self._key), of_batch)
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
         """Whether the transport still knows of this attempt, waiting or running."""
-        return self.fair.holds(Work("registration", job_id, attempt).name)
+        return self.holds(Work("registration", job_id, attempt).name)
 
     def holds_import(self, sha256: str, attempt: int) -> bool:
-        return self.fair.holds(Work("import", sha256, attempt).name)
+        return self.holds(Work("import", sha256, attempt).name)
 
     def stop(self, job_id: str, attempt: int) -> None:
         """Take a waiting job out of the queue, or tell the worker to end a running one."""
         name = Work("registration", job_id, attempt).name
-        if self.fair.remove(name):
+        if self.remove(name):
             return
         worker: Any = self._redis.hget(f"rq:job:{name}", "worker_name")
         if worker:
@@ -158,31 +150,7 @@ class JobQueue:
 
     def drop_import(self, sha256: str, attempt: int) -> None:
         """Take a waiting import out of the queue: its field is gone. One that runs goes on, and finds that itself."""
-        self.fair.remove(Work("import", sha256, attempt).name)
-
-    def turn(self) -> None:
-        """Hand the next in turn to the workers, if a process died before it did so."""
-        self.fair.turn()
-
-    def awaited(self) -> list[str]:
-        """The fields whose import registrations wait for, off the queue."""
-        return self.fair.awaited()
-
-    def release(self, reference: str) -> None:
-        """Queue what waited for this field: its import has ended."""
-        self.fair.release(reference)
-
-    def position(self, work: Work) -> int | None:
-        """1 for the work that is expected to be next; None for what does not wait in line."""
-        return self.fair.position(work)
-
-    def spent(self, owner: str) -> dict[int, float]:
-        """The worker seconds of an owner in the last hour, by minute (of the epoch)."""
-        return self.fair.spent(owner)
-
-    def lines(self) -> list[Line]:
-        """Every caller with work that waits."""
-        return self.fair.lines()
+        self.remove(Work("import", sha256, attempt).name)
 
     def live_workers(self) -> int:
         """How many workers have reported lately."""

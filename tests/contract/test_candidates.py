@@ -29,7 +29,7 @@ def asked_about(world: World, asked: Sequence[Candidate] = ASKED, reason: str = 
         raise FieldFormatError("which one is it?", reason=reason, candidates=asked)
 
     reference, attempt = world.queue.imports[-1]
-    world.queue.fair.remove(Work("import", reference, attempt).name)
+    world.queue.remove(Work("import", reference, attempt).name)
     context = Context(world.settings, world.records, world.blobs, world.queue)
     run_import_attempt(context, reference, attempt, "w", importer)
 

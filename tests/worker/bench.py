@@ -124,7 +124,7 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         stores = (
             RecordStore(redis),
             LocalBlobStore(values.blob_dir),
-            JobQueue(redis, reserve_s=values.worker_reserve_s),
+            JobQueue(redis),
         )
         made = Bench(Context(values, *stores), redis, folder, environment, given)
         try:

@@ -23,7 +23,7 @@ def taking(context: Context, any_redis: Redis) -> Taking:
     """A worker's, and a registration that waits."""
     accept(context)
     context.queue.enqueue_registration("j1", 1)
-    return Taking(any_redis, JobQueue(any_redis).fair, None)
+    return Taking(any_redis, JobQueue(any_redis), None)
 
 
 def import_again(context: Context) -> None:

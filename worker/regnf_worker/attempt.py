@@ -278,6 +278,8 @@ def render(
 
 
 logger = logging.getLogger(__name__)
+_NICENESS_OF_PICTURES = 10
+"""Beyond that of a job that has no result yet."""
 
 
 def run_attempt(context: Context, job_id: str, attempt: int, worker: str, make_engine: Callable[[], Engine]) -> None:
@@ -303,7 +305,7 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Engine])
             done = _published(context, record, make_engine, heartbeat, stack)
         if done is not None and done.manifest.pending:
             if let_worker_go():
-                give_way(context.settings.job_niceness)
+                give_way(_NICENESS_OF_PICTURES)
             finish_result(context, record, done)
 
 

@@ -153,7 +153,6 @@ class FieldDrawer:
         self._records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
         self._lock = settings.scratch_dir / _LOCK
         self._limits = JobLimits.of(settings)
-        self._niceness = min(_NICENESS, settings.job_niceness)
         self._draw = draw
         self._child = 0
         self._until = 0.0
@@ -216,7 +215,7 @@ class FieldDrawer:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         kernel.prefer_as_oom_victim()
-        kernel.give_way(self._niceness)
+        kernel.give_way(_NICENESS)
         self._limits.hold_here()
         resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_S, _PROCESSOR_S + 1))
         self._draw(reference)

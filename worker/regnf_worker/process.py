@@ -169,7 +169,7 @@ class RegnfWorker(ResilientWorker):
         self._context = context
         self._scratch = scratch
         self._functions = functions
-        self._fair = FairQueue(redis, context.settings.caller_weights, context.settings.worker_reserve_s)
+        self._fair = FairQueue(redis)
         self._taking = Taking(redis, self._fair, context.settings.queue_key)
         self._late_entries = LateEntries(redis, context.queue)
         self._settlers: dict[Kind, Callable[[Context, str, int, str, ChildExit], None]] = {
@@ -184,7 +184,6 @@ class RegnfWorker(ResilientWorker):
         self._finishing = Finishing()
         self._drawer = FieldDrawer(redis, context.settings, draw)
         self._because: str | None = None
-        self._niceness = 0
         self._started = 0.0
         self._limit_s = 0.0
         self._late = False
@@ -236,15 +235,11 @@ class RegnfWorker(ResilientWorker):
         self._late = self._given_back = False
         self._because = None
         oom_kills = kernel.oom_kills()
-        self._niceness = self._niceness_of(work)
         self.begin_job(job)
         if work.kind == "import":
             self._late_entries.before(work)
         folder = self._scratch.of_job()
-        try:
-            end = self._run_child(job, queue, folder)
-        finally:
-            self._charge(work)
+        end = self._run_child(job, queue, folder)
         if end is not None:
             self._scratch.drop(folder)
         try:
@@ -255,21 +250,6 @@ class RegnfWorker(ResilientWorker):
             if work.kind == "import":
                 self._if_possible("queueing what waited", lambda: self._fair.release(work.argument))
                 self._late_entries.after(work)
-
-    def _charge(self, work: Work) -> None:
-        """Have the caller pay for the time. When Redis refuses, the estimate stands."""
-        seconds = time.monotonic() - self._started
-        self._if_possible("charging for the time", lambda: self._fair.finish(work.name, seconds))
-
-    def _niceness_of(self, work: Work) -> int:
-        """By how much the work gives way to other work: the more, the further its caller is above its share."""
-        whole = self._context.settings.job_niceness
-        most = whole - whole // 2  # all work gives way to the front end by the other half
-        try:
-            return min(most, round(most * self._fair.excess(work.name))) if most else 0
-        except RedisError as error:
-            self.log.warning("job %s runs with the usual priority: %s", work.name, error)
-            return 0
 
     def main_work_horse(self, job: Any, queue: Any) -> None:
         """What the child does: it runs one of our functions, never what RQ would import."""
@@ -315,7 +295,6 @@ class RegnfWorker(ResilientWorker):
         def run() -> None:
             os.setpgrp()
             kernel.prefer_as_oom_victim()
-            kernel.give_way(self._niceness)
             os.close(ended)
             resilient_worker.hold(held_by_child)
             if limited:

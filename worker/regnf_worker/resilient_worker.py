@@ -281,7 +281,6 @@ class Taking:
             self._refuse(taken, "not a hash")
             return None
         if not held:
-            self._fair.finish(taken.name, 0.0)
             return None  # it was stopped meanwhile
         try:
             work = queue.read(taken.queue_name, taken.name, held, self._redis, self._key)

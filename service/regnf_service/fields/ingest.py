@@ -10,7 +10,6 @@ from regnf_core.field_source import Role, assumed_role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
-from regnf_service.library import check_budget
 from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
@@ -126,8 +125,7 @@ def _known(services: Services, reference: str) -> FieldRecord | None:
 
 
 def check_workers(services: Services, caller: str, headers: Mapping[str, str] | None = None) -> None:
-    """Refuse an import that the workers have no time for. Raises Problem QUOTA_IMPORTS, QUOTA_WORKER_SECONDS."""
-    check_budget(services, caller, headers)
+    """Refuse an import that the workers have no time for. Raises Problem QUOTA_IMPORTS."""
     most = services.quota.imports
     if most is not None and services.records.importing(caller) >= most:
         raise Problem("QUOTA_IMPORTS", headers={**(headers or {}), **RETRY_LATER})
@@ -147,7 +145,7 @@ async def store_upload(
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
     Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_IMPORTS,
-    QUOTA_WORKER_SECONDS, and QuotaError.
+    and QuotaError.
     """
     beside = beside or Beside()
     reference = reference_of(caller, received.sha256)

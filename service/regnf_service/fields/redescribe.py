@@ -16,7 +16,7 @@ from regnf_state.room import original_key, settings_key
 def redescribe(services: Services, caller: str, known: FieldRecord, said: UploadDescription, label: str | None) -> bool:
     """Have the field imported as another function, or change its label alone. Whether it is imported.
 
-    Raises Problem FIELD_VALIDATING, FIELD_IN_USE, FIELD_BYTES_GONE, QUOTA_IMPORTS, QUOTA_WORKER_SECONDS, CONFLICT, and
+    Raises Problem FIELD_VALIDATING, FIELD_IN_USE, FIELD_BYTES_GONE, QUOTA_IMPORTS, CONFLICT, and
     RecordsFullError.
     """
     function = function_of(said) | {

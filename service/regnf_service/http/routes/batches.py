@@ -65,7 +65,6 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "QUOTA_ACTIVE_JOBS",
             "QUOTA_BATCHES",
             "QUOTA_STORED_BYTES",
-            "QUOTA_WORKER_SECONDS",
             "QUEUE_FULL",
             "RECORDS_FULL",
             "STORAGE_FULL",

@@ -253,7 +253,6 @@ def list_fields(
             "FIELD_BYTES_GONE",
             "CONFLICT",
             "QUOTA_IMPORTS",
-            "QUOTA_WORKER_SECONDS",
         ),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: _CHANGE}}},

@@ -71,7 +71,6 @@ router = APIRouter(tags=["renderings"])
             "JOB_NOT_READY",
             "JOB_DISMISSED",
             "JOB_FAILED",
-            "QUOTA_WORKER_SECONDS",
         ),
     },
     openapi_extra={
