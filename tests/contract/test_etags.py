@@ -52,8 +52,8 @@ def preview_of(world: World) -> str:
 
 def candidate_of(world: World) -> str:
     now = world.records.now()
-    error = {"reason": "LAYOUT_AMBIGUOUS", "candidates": [{"picture": True}], "original_until": now + 60.0}
-    world.records.create_field(FieldRecord("a" * 64, "rejected", 1, now, now, error=error))
+    error = {"reason": "LAYOUT_AMBIGUOUS", "candidates": [{"picture": True}]}
+    world.records.create_field(FieldRecord("a" * 64, "rejected", 1, now, now, error=error, original_until=now + 60.0))
     world.blobs.put(f"fields/{'a' * 64}/candidates/1.png", b"a picture")
     return f"/fields/{'a' * 64}/candidates/1.png"
 

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from redis import Redis
 from redis.exceptions import RedisError
@@ -25,7 +26,7 @@ from regnf_core.errors import RegnfError
 from regnf_core.field_notes import FieldViews
 from regnf_state.ownership import owner_of
 from regnf_state.pieces import delete_views, view_key
-from regnf_state.records import FieldRecord, StaleAttemptError, ViewState
+from regnf_state.records import FieldRecord, StaleAttemptError
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from regnf_worker import kernel
@@ -120,11 +121,10 @@ def _keep(context: Context, field: FieldRecord, made: FieldViews) -> None:
         delete_views(context.blobs, field.sha256)
 
 
-def _note(context: Context, field: FieldRecord, views: ViewState = "pending", drawings: int | None = None) -> bool:
+def _note(context: Context, field: FieldRecord, **changes: Any) -> bool:
     """Write it down; False when the field was deleted, or is imported anew."""
     with suppress(StaleAttemptError):
-        changes = {} if drawings is None else {"drawings": drawings}
-        context.records.update_field(field.sha256, attempt=field.attempt, views=views, **changes)
+        context.records.update_field(field.sha256, attempt=field.attempt, **changes)
         return True
     return False
 

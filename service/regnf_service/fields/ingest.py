@@ -13,7 +13,7 @@ from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
 from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
-from regnf_state.records import CAMERAS, ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
+from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
 from regnf_state.room import delete_upload, original_key, settings_key
 
 
@@ -193,7 +193,8 @@ def _field(services: Services, reference: str, upload: Upload, received: Receive
     error = services.records.known_rejection(field)
     if error is None:
         return field
-    return replace(field, state="rejected", error=services.originals.keep_with(error, rejected=True))
+    until = services.originals.kept_until(error["reason"])
+    return replace(field, state="rejected", error=error, original_until=until)
 
 
 def _record(services: Services, field: FieldRecord, beside: Beside) -> StoredUpload:
@@ -225,5 +226,4 @@ def _create(services: Services, field: FieldRecord) -> tuple[FieldRecord, bool]:
             delete_upload(services.blobs, field)
             if field.state != "rejected":
                 raise
-            error_alone = {name: value for name, value in (field.error or {}).items() if name != ORIGINAL_UNTIL}
-            return services.records.create_field(replace(field, error=error_alone))
+            return services.records.create_field(replace(field, original_until=None))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
@@ -78,19 +77,13 @@ def _require_bytes_of(services: Services, field: FieldRecord) -> None:
 
 # The mesh and the picture of a field: a worker makes them when it has time, first those that somebody asks for.
 
-_AGAIN = {"Retry-After": "1"}
-
 
 def missing_view(services: Services, record: FieldRecord, reason: str) -> Problem:
     """What is to be said of a view that is not there: ``reason``. Blocking.
 
     With Retry-After while a worker is to make it, which it does sooner for this call.
     """
-    if record.state != "ready":
+    if record.views != "pending":
         return Problem(reason)
-    if record.views is None:  # imported by an earlier release
-        with suppress(StaleAttemptError):
-            services.records.update_field(record.sha256, attempt=record.attempt, views="pending")
-    elif record.views == "pending":
-        services.records.draw_next(record.sha256)
-    return Problem(reason, headers=_AGAIN if record.views in (None, "pending") else None)
+    services.records.draw_next(record.sha256)
+    return Problem(reason, headers={"Retry-After": "1"})
