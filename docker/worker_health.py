@@ -1,6 +1,6 @@
 """Whether the worker of this container is alive: Redis knows one of this host that has reported lately.
 
-A worker's registration in Redis expires unless the worker renews it, so a process that hangs, has lost Redis or was
+A worker's report counts for less than a minute, so a process that hangs, has lost Redis or was
 stopped is told from one that works or waits. Exit status 0 when alive, 1 with a word on stderr when not.
 """
 
@@ -8,28 +8,20 @@ from __future__ import annotations
 
 import socket
 import sys
-from typing import Any
 
 from redis import Redis, RedisError
-from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_core.errors import InvalidInputError
-from regnf_state.queue import QUEUE_NAME
 from regnf_state.redis.client import NoRedisError, redis_address
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import read_settings
 
 _TIMEOUT_S = 5.0
 
 
 def is_alive(redis: Redis, hostname: str) -> bool:
-    """True when a worker of this host is registered for the queue, has not expired and has not said goodbye."""
-    names: Any = redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)
-    for name in names:
-        answer: Any = redis.hmget(name, ["hostname", "death"])
-        known, dead = answer
-        if known is not None and known.decode() == hostname and dead is None:
-            return True
-    return False
+    """True when a worker of this host has reported lately and has not said goodbye."""
+    return any(name.rpartition(":")[0] == hostname for name in JobQueue(redis).workers())
 
 
 def main() -> int:

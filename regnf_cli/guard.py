@@ -32,7 +32,6 @@ MODULES = {
         "pydantic_settings",
         "python_multipart",
         "redis",
-        "rq",
         "uvicorn",
         "yaml",
     ),

@@ -1,18 +1,17 @@
-"""The worker's health check against a real Redis and the keys that RQ itself writes."""
+"""The worker's health check against a real Redis and what workers report."""
 
 from __future__ import annotations
 
 import importlib.util
+import socket
 import subprocess
 import sys
 from types import ModuleType
-from typing import Any
 
 import pytest
 from redis import Redis
-from rq import Queue, Worker
 
-from regnf_state.queue import QUEUE_NAME
+from regnf_state.redis.queue import JobQueue
 from tests.docker.files import ROOT
 
 SCRIPT = ROOT / "docker" / "worker_health.py"
@@ -28,33 +27,17 @@ def health() -> ModuleType:
     return module
 
 
-def worker_of(redis: Redis, hostname: str) -> Any:
-    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{hostname}-1")
-    worker.hostname = hostname
-    worker.register_birth()
-    return worker
-
-
-def test_a_registered_worker_is_alive(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "here")
+def test_only_a_worker_of_this_host_that_reported_lately_is_alive(health: ModuleType, redis: Redis) -> None:
+    queue = JobQueue(redis)
+    queue.report("elsewhere:1")
+    assert not health.is_alive(redis, "here")
+    queue.report("here:1")
     assert health.is_alive(redis, "here")
-
-
-def test_another_hosts_worker_does_not_count(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "elsewhere")
-    assert not health.is_alive(redis, "here")
-
-
-def test_a_worker_that_said_goodbye_is_not_alive(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "here").register_death()
-    assert not health.is_alive(redis, "here")
-
-
-def test_a_worker_that_stopped_reporting_is_not_alive(health: ModuleType, redis: Redis) -> None:
-    worker = worker_of(redis, "here")
-    assert redis.ttl(worker.key) > 0  # the registration runs out by itself ...
-    redis.delete(worker.key)  # ... as it has now
-    assert not health.is_alive(redis, "here")
+    redis.zincrby("regnf:workers", -46, "here:1")
+    assert not health.is_alive(redis, "here"), "it has stopped reporting"
+    queue.report("here:1")
+    queue.sign_off("here:1")
+    assert not health.is_alive(redis, "here"), "it said goodbye"
 
 
 @pytest.mark.parametrize(
@@ -71,7 +54,6 @@ def test_exit_status_follows_the_worker(redis_url: str, redis: Redis) -> None:
     environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": redis_url}
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (1, "no worker of this host has reported lately\n")
-    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis)
-    worker.register_birth()
+    JobQueue(redis).report(f"{socket.gethostname()}:1")
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (0, "")

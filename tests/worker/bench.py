@@ -79,7 +79,7 @@ class Bench:
             now = self.context.records.now()
             self.context.records.create_field(FieldRecord(sha256, "validating", 1, now, now))
             self.context.blobs.put(f"fields/{sha256}/field.safetensors", sha256[:1].encode())
-            self.context.records.update_field(sha256, state="ready")
+            self.context.records.update_field(sha256, state="ready", views="none")
 
     def submit(self, do: str, job_id: str = "j1", owner: str = ANONYMOUS, **changes: object) -> JobRecord:
         """Record and queue a job whose engine shall do this."""

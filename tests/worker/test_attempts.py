@@ -5,9 +5,9 @@ import pytest
 from regnf_core.errors import CancelledError
 from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.records import FieldRecord
+from regnf_worker.artifacts import publish
 from regnf_worker.attempt import Heartbeat, run_attempt
 from regnf_worker.models import Context
-from regnf_worker.settle import publish
 from tests.stores import ShiftedRecords, WatchedQueue
 from tests.worker.doubles import SHA, accept, job
 from tests.worker.tiny_engine import TinyEngine

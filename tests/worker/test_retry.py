@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from redis import Redis
 from redis.exceptions import RedisError
-from rq.exceptions import StopRequested
 
+from regnf_state.queue import Work
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
@@ -17,7 +17,7 @@ from regnf_worker.imports import run_import_attempt
 from regnf_worker.kernel import Scratch
 from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
-from regnf_worker.resilient_worker import MAX_WAIT_S, passes, retry_until_available
+from regnf_worker.taking import MAX_WAIT_S, StopRequestedError, passes, retry_until_available
 from tests.requests import request_record
 from tests.worker.doubles import context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
@@ -51,7 +51,7 @@ def test_what_passes_is_waited_for(waits: list[float], error: RedisError) -> Non
     assert retry_until_available("it", Refusals(2, error, answer=3)) == 3
 
 
-@pytest.mark.parametrize("error", [LASTING, StopRequested(), ValueError()], ids=repr)
+@pytest.mark.parametrize("error", [LASTING, StopRequestedError(), ValueError()], ids=repr)
 def test_what_does_not_pass_is_raised_at_once(waits: list[float], error: Exception) -> None:
     do = Refusals(1, error)
     with pytest.raises(type(error)):
@@ -61,7 +61,7 @@ def test_what_does_not_pass_is_raised_at_once(waits: list[float], error: Excepti
 
 def test_who_is_told_to_stop_waits_no_longer(waits: list[float]) -> None:
     do = Refusals(9)
-    with pytest.raises(StopRequested):
+    with pytest.raises(StopRequestedError):
         retry_until_available("it", do, stopped=lambda: len(do.calls) == 3)
     assert len(do.calls) == 3
     assert retry_until_available("it", Refusals(0, answer=1), stopped=lambda: True) == 1, (
@@ -88,23 +88,16 @@ def worker(tmp_path: Path, any_redis: Redis, redis: RefusingRedis, monkeypatch: 
     return RegnfWorker(context, Scratch(tmp_path / "scratch"))
 
 
-class TakenJob:
-    id = "j1-1"
-    args = ("j1",)
-    timeout = 1
-
-
-class JobsQueue:
-    name = "regnf"
+JOB = Work("registration", "j1", 1)
 
 
 def test_a_job_taken_but_not_begun_is_left_to_the_reaper(worker: RegnfWorker, monkeypatch: pytest.MonkeyPatch) -> None:
     accept(worker._context)
     before = worker._context.records.get_job("j1")
-    monkeypatch.setattr("rq.worker.base.BaseWorker.prepare_execution", lambda *_: Refusals(9)())
-    worker._stop_requested = True
-    with pytest.raises(StopRequested):
-        worker.execute_job(TakenJob, JobsQueue)
+    monkeypatch.setattr(worker._queue, "begin", Refusals(9))
+    worker._stop(0, None)
+    with pytest.raises(StopRequestedError):
+        worker.execute(JOB)
     assert worker._context.records.get_job("j1") == before
 
 
@@ -114,10 +107,8 @@ def test_a_job_is_settled_once_redis_takes_it(
     """The child died because Redis was full, and Redis is still full when its parent wants to say so."""
     accept(worker._context)
     refuse(monkeypatch, worker._context, "update_job", 3)
-    for name in ("begin_job", "finish_job"):
-        monkeypatch.setattr(worker, name, lambda *_: None)
     monkeypatch.setattr(worker, "_run_child", lambda *_: kernel.Exit(status=None))
-    worker.execute_job(TakenJob, JobsQueue)
+    worker.execute(JOB)
     again = worker._context.records.get_job("j1")
     assert again is not None
     assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)

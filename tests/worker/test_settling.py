@@ -3,8 +3,9 @@
 import pytest
 
 from regnf_state.manifest import Manifest
+from regnf_worker.artifacts import publish
 from regnf_worker.models import Context
-from regnf_worker.settle import ChildExit, publish, settle_import, settle_registration
+from regnf_worker.settle import ChildExit, settle_import, settle_registration
 from tests.worker.doubles import SHA, accept, begin_import, field, job
 
 

@@ -9,10 +9,10 @@ from redis import Redis
 
 from regnf_service.upkeep.reaper import Reaper
 from regnf_state.queue import Work
-from regnf_state.redis.queue import JobQueue
+from regnf_state.redis.queue import JobQueue, Taken
 from regnf_state.settings import Settings
 from regnf_worker.models import Context
-from regnf_worker.resilient_worker import Taken, Taking
+from regnf_worker.taking import Taking
 from tests.worker.doubles import SHA, accept
 
 JOB = Work("registration", "j1", 1)
@@ -23,7 +23,7 @@ def taking(context: Context, any_redis: Redis) -> Taking:
     """A worker's, and a registration that waits."""
     accept(context)
     context.queue.enqueue_registration("j1", 1)
-    return Taking(any_redis, JobQueue(any_redis), None)
+    return Taking(any_redis, JobQueue(any_redis))
 
 
 def import_again(context: Context) -> None:
@@ -35,25 +35,25 @@ def import_again(context: Context) -> None:
 
 
 def taken(taking: Taking) -> Taken:
-    found = taking.pop(None)
+    found = taking._queue.pop(0)
     assert found is not None
     return found
 
 
 def test_what_can_run_is_handed_out(taking: Taking) -> None:
     assert taking.accept(taken(taking)) == JOB
-    assert taking.pop(None) is None
+    assert taking._queue.pop(0) is None
 
 
 def test_what_waits_for_an_import_is_put_aside(context: Context, any_redis: Redis, taking: Taking) -> None:
     import_again(context)
     assert taking.accept(taken(taking)) is None
-    assert taking.pop(None) is None
+    assert taking._queue.pop(0) is None
     assert context.queue.holds_registration("j1", 1)
     assert context.queue.awaited() == [SHA]
     reaper = Reaper(context.records, context.queue, any_redis, Settings())
     reaper.run_once()
-    assert taking.pop(None) is None, "the import has not ended"
+    assert taking._queue.pop(0) is None, "the import has not ended"
     context.records.update_field(SHA, state="ready")
     reaper.run_once()
     assert taking.accept(taken(taking)) == JOB, "although the worker that had the import died"
@@ -63,13 +63,13 @@ def test_an_import_that_ends_meanwhile_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch, context: Context, taking: Taking
 ) -> None:
     import_again(context)
-    park = taking._fair.park
+    park = taking._queue.park
 
     def late(*arguments: object) -> None:
         context.records.update_field(SHA, state="ready")
         park(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(taking._fair, "park", late)
+    monkeypatch.setattr(taking._queue, "park", late)
     assert taking.accept(taken(taking)) is None
     assert taking.accept(taken(taking)) == JOB
 

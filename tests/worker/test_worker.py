@@ -47,7 +47,7 @@ def test_a_job_succeeds(table: Bench) -> None:
         assert json.load(file)["pid"] not in (worker.pid, os.getpid()), "jobs have a process of their own"
     phases = [event.data["phase"] for event in table.context.records.events("j1", None)]
     assert phases == [None, "loading", "sampling", "optimizing", "exporting", "exporting"]
-    eventually(lambda: not table.redis.keys("rq:job:*"), "the queue's forgetting the job")
+    eventually(lambda: not table.redis.keys("regnf:queue:entry:*"), "the queue's forgetting the job")
     assert_next_job_runs(table)
 
 
@@ -297,9 +297,6 @@ def test_a_search_makes_pictures_where_they_are_wanted(table: Bench, pictures: b
 
 BEGINNINGS = [
     ("os:setpgrp", "OSError"),
-    ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
-    ("regnf_worker.kernel:give_way", "MemoryError"),
-    ("regnf_worker.resilient_worker:hold", "OSError"),
     ("regnf_worker.job_limits:JobLimits.hold_here", "ValueError"),
     ("regnf_worker.kernel:Scratch.use", "OSError"),
     ("random:seed", "KeyboardInterrupt"),

@@ -17,7 +17,6 @@ from types import TracebackType
 from typing import Any
 
 from redis.exceptions import RedisError
-from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from regnf_core.field_notes import FieldNotes
@@ -30,6 +29,14 @@ from regnf_state.reasons import problem_document
 from regnf_state.records import WARNINGS, FieldRecord, JobRecord, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.registration_request import RegistrationRequest, RenderingRequest, request_of
+from regnf_worker.artifacts import (
+    discard,
+    discard_others,
+    keep_edited_field,
+    publish,
+    store_artifacts,
+    told_by_result,
+)
 from regnf_worker.engine import Candidate, Engine, Made
 from regnf_worker.job_limits import (
     JobLimits,
@@ -41,19 +48,10 @@ from regnf_worker.job_limits import (
     refusal,
     timeout,
 )
-from regnf_worker.kernel import give_way
+from regnf_worker.kernel import TimeUpError
 from regnf_worker.models import Context, ObjectModels
-from regnf_worker.resilient_worker import let_worker_go, retry_until_available
-from regnf_worker.settle import (
-    Published,
-    discard,
-    discard_others,
-    finish_result,
-    keep_edited_field,
-    publish,
-    store_artifacts,
-    told_by_result,
-)
+from regnf_worker.pictures import Published, finish_result, let_worker_go
+from regnf_worker.taking import retry_until_available
 
 # What a job repeats of its fields' imports: in its result all of it, in its record the words of the warnings.
 
@@ -278,8 +276,6 @@ def render(
 
 
 logger = logging.getLogger(__name__)
-_NICENESS_OF_PICTURES = 10
-"""Beyond that of a job that has no result yet."""
 
 
 def run_attempt(context: Context, job_id: str, attempt: int, worker: str, make_engine: Callable[[], Engine]) -> None:
@@ -304,8 +300,7 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Engine])
         with Heartbeat(context.records, record.id, record.attempt, context.settings.heartbeat_s) as heartbeat:
             done = _published(context, record, make_engine, heartbeat, stack)
         if done is not None and done.manifest.pending:
-            if let_worker_go():
-                give_way(_NICENESS_OF_PICTURES)
+            let_worker_go()
             finish_result(context, record, done)
 
 
@@ -332,7 +327,7 @@ def _published(
         _fail(context, job_id, attempt, problem_document(error.reason))
     except RegnfError as error:
         _fail(context, job_id, attempt, refusal(error))
-    except JobTimeoutException:
+    except TimeUpError:
         _fail(context, job_id, attempt, timeout("JOB_TIMEOUT", context.settings.job_timeout_s))
     except Exception as error:
         if are_files_away(error):

@@ -10,9 +10,10 @@ import logging
 import os
 import select
 import shutil
+import signal
 import time
-from collections.abc import Callable, MutableMapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 from uuid import uuid4
@@ -71,7 +72,7 @@ def forked(work: Callable[[], object]) -> int:
         die_with_parent(parent)
         work()
         status = 0
-    except BaseException:  # also a handler of signals that raises, as RQ's does, before ``work`` has set its own
+    except BaseException:  # also a handler of signals that raises, before ``work`` has set its own
         if os.getpid() == parent:
             raise
         logger.exception("a forked process ends")
@@ -89,6 +90,31 @@ def in_child(work: Callable[[], object]) -> bool:
         logger.error("no process could be made: %s", error)
         return False
     return os.waitpid(child, 0)[1] == 0
+
+
+class TimeUpError(Exception):
+    """The work has had its time."""
+
+
+@contextmanager
+def time_limit(seconds: int) -> Iterator[None]:
+    """Raises TimeUpError in what is done here once it has taken so many seconds of the wall clock."""
+
+    def end(signum: int, frame: object) -> None:  # noqa: ARG001 -- what handlers are given
+        raise TimeUpError
+
+    signal.signal(signal.SIGALRM, end)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+
+
+def kill_group(pid: int) -> None:
+    """End a child and what it has started."""
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
 
 
 def prefer_as_oom_victim() -> None:
