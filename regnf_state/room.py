@@ -116,7 +116,6 @@ class Originals:
         return sum(field.upload_bytes for field in self._kept(owner))
 
     def _kept(self, owner: str) -> list[FieldRecord]:
-        """Those whose time is over first, first."""
         return self._records.fields_with_original(owner)
 
     def drop(self, field: FieldRecord) -> bool:
@@ -192,7 +191,6 @@ class Room:
 
         How many jobs went.
         """
-        self._owners.find()
         evicted = 0
         for owner in self._owners.all():
             self._originals.trim(owner)
@@ -216,7 +214,6 @@ class Room:
         return 0 if owner is None else self._evict(owner, most, confirm)
 
     def _evict(self, owner: str, most: int, confirm: Callable[[], None] = lambda: None) -> int:
-        """Forget a caller's oldest finished jobs, ``most`` at most, results included."""
         gone = 0
         for job_id in self._owners.oldest_finished(owner, most):
             confirm()
@@ -233,7 +230,6 @@ class Room:
         return gone
 
     def _drop_rejected(self, owner: str) -> None:
-        """Forget a caller's oldest rejected fields beyond those that are kept."""
         for reference in self._records.rejected_beyond(owner, _REJECTED_KEPT, _AT_ONCE):
             field = self._records.get_field(reference)
             if field is None or field.state == "rejected":

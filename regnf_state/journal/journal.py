@@ -204,7 +204,6 @@ def _text(record: JobRecord | FieldRecord, **beside: str) -> bytes:
 
 
 def _as_record(kind: type[_Record], name: str, text: bytes) -> _Record:
-    """The record of a document. Raises UnreadableRecordError."""
     try:
         document = json.loads(text)
     except ValueError as error:
@@ -256,6 +255,5 @@ def claim_storage(redis: Redis, storage_id: str, adopt: str | None = None) -> No
 
 
 def _known(redis: Redis) -> str | None:
-    """Whose Redis it is."""
     noted: Any = redis.get(STORAGE_KEY)
     return None if noted is None else text(noted)

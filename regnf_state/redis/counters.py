@@ -125,8 +125,6 @@ OWNERS = f"{PREFIX}owners"
 _JOBS = f"{PREFIX}jobs:created"
 _FIELDS = f"{PREFIX}fields:created"
 _ACTIVE = f"{PREFIX}jobs:active"
-_FOUND = f"{PREFIX}owners:found"
-_FIND_EVERY_S = 3600
 _EVICTED_KEPT = 1000
 _EVICTED_KEPT_S = 7 * 24 * 3600
 _PAGE = 200
@@ -142,15 +140,6 @@ class Owners:
 
     def all(self) -> list[str]:
         return sorted(map(text, self._redis.smembers(OWNERS)))
-
-    def find(self) -> None:
-        """Look for those that another release has not noted, once an hour."""
-        if not self._redis.set(_FOUND, "1", nx=True, ex=_FIND_EVERY_S):
-            return
-        for index in (_JOBS, _FIELDS):
-            names = [text(key).removeprefix(f"{index}:") for key in self._redis.scan_iter(f"{index}:*", count=1000)]
-            if names:
-                self._redis.sadd(OWNERS, *names)
 
     def finished(self, owner: str | None = None) -> int:
         """How many jobs that have ended an owner has; None: all together."""

@@ -111,21 +111,17 @@ class RedisDocuments:
     # reading
 
     def _read(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
-        """The record, if there is one, and the time of reading. Raises UnreadableRecordError."""
         ((_, stored),), now = self._fetch_now(kind, [name])
         return self._record(kind, name, stored), now
 
     def _read_each(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record | None]:
-        """The record of each name, or None. One round trip. Raises UnreadableRecordError."""
         return [self._record(kind, name, stored) for name, stored in self._fetch(kind, names)]
 
     def _read_many(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record]:
-        """The records that exist and can be read, in the order of their names."""
         found = (self._readable(kind, name, stored) for name, stored in self._fetch(kind, names))
         return [record for record in found if record is not None]
 
     def _read_to_create(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
-        """The same before a record is made. Raises as ``_before``."""
         ((_, stored),), now = self._fetch_now(kind, [name])
         return self._before(kind, name, stored), now
 
@@ -145,7 +141,6 @@ class RedisDocuments:
         return self._fetch_now(kind, names)[0]
 
     def _fetch_now(self, kind: Kind[Any], names: Sequence[str]) -> tuple[list[tuple[str, Stored | None]], float]:
-        """What is held under each name, and the time of reading. One round trip."""
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:
                 ask(pipeline, kind.key(name))
@@ -247,7 +242,6 @@ class RedisDocuments:
             return None
 
     def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
-        """Set a record aside."""
         self.unreadable.set_aside(kind.name, kind.key(name), stored, error)
 
     def _require_known(self, kind: Kind[Any], name: str) -> None:
@@ -284,7 +278,6 @@ class RedisDocuments:
 
 
 def _arguments(change: Change) -> list[str | int]:
-    """What ``_WRITE`` is given."""
     token = uuid4().hex
     writes = list(change.commands)
     if (record := change.record) is not None:

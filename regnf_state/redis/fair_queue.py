@@ -272,7 +272,6 @@ class FairQueue:
         return [Line(owner, count, max(0.0, since)) for owner, count, since in waits]
 
     def _look(self) -> tuple[list[str], list[bytes], float]:
-        """The owners in the order of their turns, what lies ready, the server's time."""
         with self._redis.pipeline() as pipeline:
             pipeline.zrange(f"{_PREFIX}owners", 0, -1)
             for key in LISTS.values():

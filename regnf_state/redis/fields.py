@@ -120,7 +120,6 @@ FIELD = Kind("field", FieldRecord)
 
 
 def _created_keys(reference: str) -> tuple[str, str]:
-    """Where a field is listed: among all, and among its owner's."""
     return _CREATED, f"{_CREATED}:{owner_of(reference)}"
 
 
@@ -130,17 +129,14 @@ def _stored_key(owner: str) -> str:
 
 
 def _rejected_key(owner: str) -> str:
-    """An owner's rejected fields, by time."""
     return f"{PREFIX}owner:{owner}:rejected"
 
 
 def _originals_key(owner: str) -> str:
-    """An owner's fields whose uploads are kept after their import, by the time until then."""
     return f"{PREFIX}owner:{owner}:originals"
 
 
 def _importing_key(owner: str) -> str:
-    """An owner's fields whose import has not ended."""
     return f"{_VALIDATING}:{owner}"
 
 
@@ -197,15 +193,20 @@ class RedisFieldRecords(RedisRejections):
             indexes.append(("ZADD", originals, repr(until), record.sha256))
         return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
-    def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
+    def _change_field(
+        self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord], must_last: bool = False
+    ) -> FieldRecord:
         while True:
             known, now = self._current_field(sha256)
             changed = change(known, now)
             if self._save_field(known.version, changed, counters.of_field(known, changed)) == "OK":
+                self._note_field(changed, must_last)
                 return changed
 
+    def _note_field(self, field: FieldRecord, must_last: bool) -> None:
+        """A field has changed; ``must_last``: what is said of it must outlast Redis."""
+
     def _current_field(self, sha256: str) -> tuple[FieldRecord, float]:
-        """The field that is to be changed, and the time. Raises StaleAttemptError."""
         try:
             known, now = self._read(FIELD, sha256)
         except UnreadableRecordError as error:
@@ -309,13 +310,15 @@ class RedisFieldRecords(RedisRejections):
         Raises StaleAttemptError when it has changed since it was ``known``.
         """
         return self._change_field(
-            known.sha256, lambda now_held, now: transitions.reimported_field(now_held, known, description, label, now)
+            known.sha256,
+            lambda now_held, now: transitions.reimported_field(now_held, known, description, label, now),
+            must_last=True,
         )
 
     def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
         """The field as it was ``before`` that attempt, which has not begun. Raises StaleAttemptError."""
         return self._change_field(
-            before.sha256, lambda known, now: transitions.restored_field(known, before, attempt, now)
+            before.sha256, lambda known, now: transitions.restored_field(known, before, attempt, now), must_last=True
         )
 
     def fields_with_original(self, owner: str) -> list[FieldRecord]:
@@ -369,6 +372,7 @@ class RedisLibrary(RedisFieldRecords):
             changed = replace(field, version=field.version + 1, updated=now, library=said)
             answer = self._save_field(field.version, changed, *_renaming(field, notes))
             if answer == "OK":
+                self._note_field(changed, must_last=True)
                 return changed
             taken = notes is not None and answer == NameTakenError.reason
             if notes is not None and taken and self.entries_named(known.owner, [notes.name])[0] is not None:
@@ -385,7 +389,7 @@ class RedisLibrary(RedisFieldRecords):
             field = fields.get(key)
             entry = None if field is None else LibraryEntry.of(field)
             if key in held and (entry is None or entry.notes.name != name):
-                self._redis.delete(key)  # an earlier release, or damage, has taken the entry away
+                self._redis.delete(key)  # damage has taken the entry away
                 entry = None
             found.append(entry)
         return found

@@ -21,6 +21,7 @@ from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.record_store import Page, Position
 from regnf_state.records import (
     ACTIVE,
+    FINISHED,
     NO_QUOTA,
     JobEvent,
     JobNews,
@@ -91,7 +92,6 @@ JOB = Kind("job", JobRecord)
 
 
 def _created_keys(record: JobRecord) -> tuple[str, str]:
-    """Where a job is listed: among all, and among its owner's."""
     return _CREATED, f"{_CREATED}:{record.owner}"
 
 
@@ -100,7 +100,6 @@ def _active_key(owner: str) -> str:
 
 
 def _caps(owner: str, max_active: int, quota: Quota) -> list[Cap]:
-    """The bounds of a new job."""
     caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
     if quota.active_jobs is not None:
         caps.append(("SCARD", _active_key(owner), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
@@ -141,7 +140,6 @@ class RecordStore(RedisLibrary):
         return value if known is None else text(known)  # type: ignore[arg-type]
 
     def _commands(self, before: JobRecord | None, after: JobRecord) -> list[Command]:
-        """What has to change around a record when ``before`` becomes ``after``."""
         key, events = JOB.key(after.id), _events_key(after.id)
         commands: list[Command] = [
             *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
@@ -184,10 +182,14 @@ class RecordStore(RedisLibrary):
                 return known
             commands = self._commands(known, changed)
             if self._compare_and_set(JOB.key(job_id), known.version, commands, changed) == "OK":
+                if changed.status in FINISHED:
+                    self._note_end(changed)
                 return changed
 
+    def _note_end(self, job: JobRecord) -> None:
+        """A job has ended."""
+
     def _current_job(self, job_id: str) -> tuple[JobRecord, float]:
-        """The job that is to be changed, and the time. Raises StaleAttemptError."""
         try:
             known, now = self._read(JOB, job_id)
         except UnreadableRecordError as error:

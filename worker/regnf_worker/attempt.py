@@ -345,7 +345,6 @@ def _published(
 
 
 def _limits_held(context: Context) -> JobLimits | None:
-    """The job's limits, where they hold for this process."""
     return JobLimits.of(context.settings) if held_memory_limit() is not None else None
 
 
@@ -381,7 +380,6 @@ def _give_back(context: Context, job_id: str, attempt: int) -> None:
 def _work(
     context: Context, record: JobRecord, make_engine: Callable[[], Engine], heartbeat: Heartbeat, stack: ExitStack
 ) -> Published:
-    """Do the job and publish its result: the one that counts, of this attempt or an earlier one."""
     request = request_of(record)
     fields = Fields(context, heartbeat, stack)
     scene, *objects = fields.ready([request.scene, *request.objects])

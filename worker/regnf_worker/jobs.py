@@ -37,11 +37,11 @@ from regnf_worker.models import Context
 def run_registration(job_id: str, attempt: int, worker: str) -> None:
     """Run the attempt at a job that the queue handed out: its record says what it is, a registration or a rendering."""
     from regnf_worker.attempt import run_attempt
-    from regnf_worker.engine import CoreEngine
+    from regnf_worker.engine import Engine
 
     settings = Settings()
     context = Context.from_settings(settings, existing=True)
-    run_attempt(context, job_id, attempt, worker, lambda: CoreEngine.on(settings.device, settings.workers))
+    run_attempt(context, job_id, attempt, worker, lambda: Engine.on(settings.device, settings.workers))
 
 
 def run_import(sha256: str, attempt: int, worker: str) -> None:
@@ -50,7 +50,7 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
     For a field that became a library's entry after its import, only the model is left to be made.
     """
     from regnf_core.importing.gate.gate import ImportLimits
-    from regnf_worker.engine import CoreEngine, core_importer
+    from regnf_worker.engine import Engine, core_importer
     from regnf_worker.imports import run_import_attempt
     from regnf_worker.job_limits import JobLimits
     from regnf_worker.models import is_unmodeled_entry, model_entry
@@ -65,7 +65,7 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
     run_import_attempt(context, sha256, attempt, worker, core_importer(limits))
     if is_unmodeled_entry(context.records, sha256, attempt):
         JobLimits.of(settings).hold_here()
-        model_entry(context, sha256, CoreEngine.on(settings.device, settings.workers))
+        model_entry(context, sha256, Engine.on(settings.device, settings.workers))
 
 
 def run_drawing(reference: str) -> None:
@@ -211,7 +211,6 @@ class FieldDrawer:
         return random.choice(lines) if lines else None  # noqa: S311 -- for fairness, not for secrecy
 
     def _run(self, reference: str) -> None:
-        """What the child does."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         kernel.prefer_as_oom_victim()

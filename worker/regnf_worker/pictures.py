@@ -72,7 +72,6 @@ def finish_result(context: Context, record: JobRecord, done: Published) -> None:
 
 
 def _made(context: Context, manifest: Manifest, made: Made, folder: Path) -> tuple[Artifact, ...]:
-    """The files, stored; none of them when one cannot be made."""
     try:
         return store_artifacts(context.blobs, manifest.job_id, manifest.attempt, folder, made.finish())
     except Exception as error:

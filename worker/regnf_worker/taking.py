@@ -93,7 +93,6 @@ class Taking:
             return work  # whose process says so
 
     def _is_parked(self, work: Work) -> bool:
-        """Whether the registration waits for an import, and has been put aside for that."""
         job = self.records.get_job(work.argument)
         if job is None or job.attempt != work.attempt or job.status != "accepted":
             return False
