@@ -19,15 +19,7 @@ from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journal import GENERATION_KEY, Journal, claim_storage
-from regnf_state.records import (
-    NO_QUOTA,
-    FieldRecord,
-    JobNews,
-    JobRecord,
-    Quota,
-    RecordError,
-    UnreadableRecordError,
-)
+from regnf_state.records import NO_QUOTA, FieldRecord, JobNews, JobRecord, Quota, RecordError, UnreadableRecordError
 from regnf_state.redis.documents import Kind, text
 from regnf_state.redis.jobs import JOB, RecordStore
 from regnf_state.redis.queue import JobQueue

@@ -54,10 +54,7 @@ def unlisted(record: FieldRecord) -> list[Command]:
     """What takes the entry of a field out of the lists."""
     if record.library is None:
         return []
-    return [
-        ("DEL", name_key(record.owner, record.library["name"])),
-        ("ZREM", listed_key(record.owner), record.sha256),
-    ]
+    return [("DEL", name_key(record.owner, record.library["name"])), ("ZREM", listed_key(record.owner), record.sha256)]
 
 
 # Why an owner's uploads were rejected, kept after their fields are gone: the same bytes are not imported again for

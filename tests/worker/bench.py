@@ -121,11 +121,7 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
         values = Settings(**given)  # type: ignore[arg-type]
-        stores = (
-            RecordStore(redis),
-            LocalBlobStore(values.blob_dir),
-            JobQueue(redis),
-        )
+        stores = (RecordStore(redis), LocalBlobStore(values.blob_dir), JobQueue(redis))
         made = Bench(Context(values, *stores), redis, folder, environment, given)
         try:
             yield made

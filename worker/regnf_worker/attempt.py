@@ -29,14 +29,7 @@ from regnf_state.reasons import problem_document
 from regnf_state.records import WARNINGS, FieldRecord, JobRecord, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.registration_request import RegistrationRequest, RenderingRequest, request_of
-from regnf_worker.artifacts import (
-    discard,
-    discard_others,
-    keep_edited_field,
-    publish,
-    store_artifacts,
-    told_by_result,
-)
+from regnf_worker.artifacts import discard, discard_others, keep_edited_field, publish, store_artifacts, told_by_result
 from regnf_worker.engine import Candidate, Engine, Made
 from regnf_worker.job_limits import (
     JobLimits,

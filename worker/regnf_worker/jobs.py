@@ -57,9 +57,7 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
 
     settings = Settings()
     limits = ImportLimits(
-        wall_s=settings.import_timeout_s,
-        work_s=settings.import_work_s,
-        memory_bytes=settings.import_memory_bytes,
+        wall_s=settings.import_timeout_s, work_s=settings.import_work_s, memory_bytes=settings.import_memory_bytes
     )
     context = Context.from_settings(settings, existing=True)
     run_import_attempt(context, sha256, attempt, worker, core_importer(limits))
