@@ -51,11 +51,10 @@ def test_a_deleted_field_is_told(context: Context) -> None:
     assert error["reason"] == "FIELD_NOT_FOUND"
 
 
-def test_fields_that_are_still_imported_send_the_job_back(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fields_that_are_still_imported_send_the_job_back(context: Context) -> None:
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
     accept(context)
-    monkeypatch.setattr("regnf_worker.attempt._WAIT_BEFORE_GIVING_BACK_S", 0.0)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
     assert isinstance(context.queue, WatchedQueue)

@@ -19,7 +19,7 @@ from regnf_state.ownership import owner_of
 from regnf_state.records import CANDIDATES, FieldRecord, SettingsFile, StaleAttemptError
 from regnf_state.room import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_worker.engine import Importer
-from regnf_worker.job_limits import are_files_away, fault, new_incident, refusal, timeout
+from regnf_worker.job_limits import are_files_away, fault, refusal, timeout
 from regnf_worker.kernel import TimeUpError
 from regnf_worker.models import Context
 from regnf_worker.taking import retry_until_available
@@ -65,9 +65,7 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except Exception as error:
         if are_files_away(error):
             raise
-        incident = new_incident()
-        logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
-        _refuse(context, sha256, attempt, fault(error, incident))
+        _refuse(context, sha256, attempt, fault(error, f"import {sha256} attempt {attempt}"))
     else:
         until = context.originals.kept_until(None)
         if until is None:
