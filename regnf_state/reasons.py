@@ -1,6 +1,6 @@
-"""Every reason the HTTP interface can give, with its status, title and meaning: the table that clients program against (reasons.toml).
+"""Every reason the HTTP interface can give, with its status, title and meaning: reasons.toml.
 
-Stable: a reason is never renamed, and never changes its meaning.
+It is the table that clients program against. Stable: a reason is never renamed, and never changes its meaning.
 """
 
 from __future__ import annotations

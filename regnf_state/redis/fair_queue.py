@@ -294,7 +294,8 @@ class FairQueue:
             pipeline.lpos(f"{_PREFIX}line:{mine}", work.name)
             for owner in owners:
                 pipeline.llen(f"{_PREFIX}line:{owner}")
-            place, *lengths = pipeline.execute()
+            answers: list[int | None] = pipeline.execute()
+        place, lengths = answers[0], [length or 0 for length in answers[1:]]
         if place is None or mine not in owners:
             return None
         own = owners.index(mine)

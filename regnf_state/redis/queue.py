@@ -125,7 +125,7 @@ class JobQueue(FairQueue):
         held: Any = self._redis.getex(f"{RUNNING}{name}", ex=_HELD_FOR_S)
         if held is None:
             self.begin(name, worker)
-        return held != _STOP
+        return bool(held != _STOP)
 
     def end(self, name: str) -> None:
         """It has ended. What became of it is in its record."""
@@ -143,7 +143,8 @@ class JobQueue(FairQueue):
     def workers(self) -> list[str]:
         """The names of those that have reported lately: `host:id`."""
         seconds, _ = self._redis.time()
-        return [shown(name) for name in self._redis.zrangebyscore(_WORKERS, seconds - _LIVE_FOR_S, "+inf")]
+        names: Any = self._redis.zrangebyscore(_WORKERS, seconds - _LIVE_FOR_S, "+inf")
+        return [shown(name) for name in names]
 
     def live_workers(self) -> int:
         """How many workers have reported lately."""

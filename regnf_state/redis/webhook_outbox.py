@@ -17,7 +17,7 @@ from redis import Redis
 
 from regnf_state.records import LAST_TIME, JobRecord
 from regnf_state.redis.counters import count
-from regnf_state.redis.documents import Command, is_wrong_type, text
+from regnf_state.redis.documents import Command, text, unless_wrong_type
 from regnf_state.redis.unreadable import PREFIX
 
 logger = logging.getLogger(__name__)
@@ -189,11 +189,7 @@ class RedisOutbox:
 
 
 def _delivery(answer: Any) -> Delivery:
-    if is_wrong_type(answer):
-        return _UNREADABLE
-    if isinstance(answer, Exception):
-        raise answer
-    message, told = answer
+    message, told = unless_wrong_type(answer, (None, "damaged"))
     if told is None:
         return Delivery("waiting" if message is None else "pending")
     try:
