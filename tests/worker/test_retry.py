@@ -9,7 +9,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from regnf_state.queue import Work
-from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.records import FieldRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.attempt import run_attempt
@@ -18,21 +18,9 @@ from regnf_worker.kernel import Scratch
 from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
 from regnf_worker.taking import MAX_WAIT_S, StopRequestedError, passes, retry_until_available
-from tests.requests import request_record
-from tests.worker.doubles import context_over
+from tests.worker.doubles import SHA, accept, context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
-
-SHA = "a" * 64
-
-
-def accept(context: Context, do: str = "succeed") -> None:
-    now = context.records.now()
-    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
-    context.blobs.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = request_record(SHA, SHA, do)
-    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
-
 
 # waiting
 
@@ -159,12 +147,10 @@ def test_an_import_waits_for_redis_and_rejects_nothing_for_it(
     context.blobs.put(f"fields/{SHA}/original", data)
     refuse(monkeypatch, context, name, 2)
 
-    def importer(
-        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
-    ) -> dict[str, Any]:
-        if upload.read_bytes() == b"raise":
+    def importer(*given: Any) -> dict[str, Any]:
+        if given[0].read_bytes() == b"raise":
             raise ValueError("no field")
-        return tiny_importer(upload, folder, description, settings)
+        return tiny_importer(*given)
 
     run_import_attempt(context, SHA, 1, "w", importer)
     field = context.records.get_field(SHA)
