@@ -269,7 +269,7 @@ class RecordStore(RedisLibrary):
 
     def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
         """Several jobs in one round trip, in the order asked for; one that cannot be read keeps no other back."""
-        found = {name: self._held(name, stored) for name, stored in self._fetch(JOB, job_ids)}
+        found = {name: self._held(name, stored) for name, stored in self._fetch_now(JOB, job_ids)[0]}
         damaged = self.unreadable.among([JOB.key(name) for name, held in found.items() if held is None])
         for name in found:
             if JOB.key(name) in damaged:
