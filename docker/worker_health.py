@@ -1,6 +1,6 @@
 """Whether the worker of this container is alive: Redis knows one of this host that has reported lately.
 
-A worker's report counts for less than a minute, so a process that hangs, has lost Redis or was
+A worker's registration in Redis expires unless the worker renews it, so a process that hangs, has lost Redis or was
 stopped is told from one that works or waits. Exit status 0 when alive, 1 with a word on stderr when not.
 """
 
@@ -20,8 +20,8 @@ _TIMEOUT_S = 5.0
 
 
 def is_alive(redis: Redis, hostname: str) -> bool:
-    """True when a worker of this host has reported lately and has not said goodbye."""
-    return any(name.rpartition(":")[0] == hostname for name in JobQueue(redis).workers())
+    """True when a worker of this host is registered for the queue, has not expired and has not said goodbye."""
+    return hostname in JobQueue(redis).live_hosts()
 
 
 def main() -> int:

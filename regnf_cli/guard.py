@@ -32,6 +32,7 @@ MODULES = {
         "pydantic_settings",
         "python_multipart",
         "redis",
+        "rq",
         "uvicorn",
         "yaml",
     ),

@@ -104,7 +104,7 @@ def configure_logging(log_format: Literal["text", "json"], level: int = logging.
     root.setLevel(level)
     # a line for every request is for collectors; people look at what goes wrong
     logging.getLogger(ACCESS_LOGGER).setLevel(logging.NOTSET if log_format == "json" else logging.WARNING)
-    for name in ("uvicorn", "uvicorn.error", "uvicorn.access"):
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "rq.worker", "rq.job"):
         logger = logging.getLogger(name)
         logger.handlers = []
         logger.propagate = True

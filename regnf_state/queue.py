@@ -1,4 +1,4 @@
-"""What the queue hands to the workers: a name, whose record says what is to be done."""
+"""The transport to the workers. A job's only argument is an id; what it must do is in its record."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+QUEUE_NAME = "regnf"
+IMPORT_QUEUE_NAME = "regnf-import"
+REGISTER_FUNCTION = "regnf_worker.jobs.run_registration"
+IMPORT_FUNCTION = "regnf_worker.jobs.run_import"
+
 Kind = Literal["import", "registration"]
-"""What the queue tells apart. A "registration" is a job of any kind: its record says which."""
+"""What the transport tells apart. A "registration" is a job of any kind: its record says which."""
 _ATTEMPT = r"(?P<attempt>[1-9][0-9]{0,8})"
 _NAMES: dict[Kind, re.Pattern[str]] = {
     "import": re.compile(rf"import-(?P<argument>[0-9a-f]{{64}}(?:_[a-z0-9][a-z0-9-]{{0,31}})?)-{_ATTEMPT}"),
@@ -25,13 +30,22 @@ class Work:
 
     @property
     def name(self) -> str:
-        """What the queue calls it."""
+        """What the transport calls it."""
         prefix = "import-" if self.kind == "import" else ""
         return f"{prefix}{self.argument}-{self.attempt}"
 
+    @property
+    def function(self) -> str:
+        return IMPORT_FUNCTION if self.kind == "import" else REGISTER_FUNCTION
+
+    @property
+    def queue_name(self) -> str:
+        return IMPORT_QUEUE_NAME if self.kind == "import" else QUEUE_NAME
+
     @classmethod
-    def named(cls, kind: Kind, name: str) -> Work:
-        """The work of this kind and name. Raises ValueError when no such work has such a name."""
+    def named(cls, queue_name: str, name: str) -> Work:
+        """The work of this name in the queue. Raises ValueError when no work of that queue has such a name."""
+        kind: Kind = "import" if queue_name == IMPORT_QUEUE_NAME else "registration"
         match = _NAMES[kind].fullmatch(name)
         if match is None:
             raise ValueError("not a name of this queue")

@@ -1,7 +1,7 @@
 """The records that are the truth about fields and jobs, and the refusals of the store that keeps them.
 
 A job's state machine is monotonic: accepted -> running -> successful | failed | dismissed. Every change names the
-attempt it belongs to; a writer of an older attempt loses (StaleAttemptError). the queue is transport, never truth.
+attempt it belongs to; a writer of an older attempt loses (StaleAttemptError). RQ is transport, never truth.
 Times are the store's own: one clock for every machine that shares it.
 """
 

@@ -16,10 +16,9 @@ from regnf_service.services import Services
 from regnf_service.webhooks.service import webhooks_of
 from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore, Rebuilder
-from regnf_state.queue import Work
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.client import connect
 from regnf_state.redis.documents import RedisDocuments, text
-from regnf_state.redis.fair_queue import LISTS
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
@@ -68,10 +67,12 @@ class WatchedQueue(JobQueue):
 
     @property
     def waiting(self) -> list[Work]:
-        """What waits, whether ready or in a line: each owner's in order, what is next first."""
+        """What waits, whether in RQ's list or in a line: each owner's in order, what is next first."""
+        lists = [f"rq:queue:{IMPORT_QUEUE_NAME}", f"rq:queue:{QUEUE_NAME}"]
         lines = [f"regnf:queue:line:{line.owner}" for line in self.lines()]
-        names = [text(name) for key in [*LISTS.values(), *lines] for name in self._redis.lrange(key, 0, -1)]
-        return [Work.named("import" if name.startswith("import-") else "registration", name) for name in names]
+        names = [text(name) for key in lists + lines for name in self._redis.lrange(key, 0, -1)]
+        kinds = [IMPORT_QUEUE_NAME if name.startswith("import-") else QUEUE_NAME for name in names]
+        return [Work.named(kind, name) for kind, name in zip(kinds, names, strict=True)]
 
     def lose(self) -> None:
         """Forget everything, as a queue that was never told."""

@@ -21,11 +21,11 @@ OURS = {
 HEAVY = {"torch", "open3d", "igl", "trimesh"}
 FOLDERS = {"regnf_service": "service/regnf_service", "regnf_worker": "worker/regnf_worker"}
 FORBIDDEN = {
-    "regnf": HTTP | {"redis", "regnf_cli", "regnf_service", "regnf_state", "regnf_worker"},
-    "regnf_client": HTTP | HEAVY | {"redis"} | OURS - {"regnf_client", "regnf_core"},
-    "regnf_core": HTTP | {"redis"} | OURS - {"regnf_core"},
-    "regnf_data": HTTP | {"redis"} | OURS - {"regnf_core", "regnf_data"},
-    "regnf_fit": HTTP | {"redis"} | OURS - {"regnf_core", "regnf_data", "regnf_fit"},
+    "regnf": HTTP | {"rq", "redis", "regnf_cli", "regnf_service", "regnf_state", "regnf_worker"},
+    "regnf_client": HTTP | HEAVY | {"rq", "redis"} | OURS - {"regnf_client", "regnf_core"},
+    "regnf_core": HTTP | {"rq", "redis"} | OURS - {"regnf_core"},
+    "regnf_data": HTTP | {"rq", "redis"} | OURS - {"regnf_core", "regnf_data"},
+    "regnf_fit": HTTP | {"rq", "redis"} | OURS - {"regnf_core", "regnf_data", "regnf_fit"},
     "regnf_state": HTTP | HEAVY | OURS - {"regnf_core", "regnf_state"},
     "regnf_service": HEAVY | {"regnf_worker", "regnf_cli", "regnf_client", "regnf_fit", "regnf_data"},
     "regnf_worker": HTTP | {"regnf_service", "regnf_cli", "regnf_client", "regnf_fit", "regnf_data"},

@@ -21,7 +21,7 @@ from regnf_state.redis.client import connect
 
 _BATCH = 5
 _LOOKS = ("/jobs?limit=100", "/fields?limit=100", "/readyz")
-_KEPT = ("regnf:workers", "regnf:running", "regnf:storage")
+_KEPT = ("rq:worker", "rq:wip", "rq:clean", "regnf:storage")
 _ALLOWED = (200, 304, 404, 409, 410, 503)
 
 
@@ -134,8 +134,8 @@ def _change_member(random: Random, redis: Redis) -> str:
 
 
 def _change_value(random: Random, redis: Redis) -> str:
-    """A value or name within what the fair queue, the counters and workers keep, of the same type as before."""
-    key = _keys(random, redis, random.choice(["regnf:queue:*", "regnf:queue:*", "regnf:[crw]*"]))
+    """A value or name within what the fair queue, the counters and RQ keep, of the same type as before."""
+    key = _keys(random, redis, random.choice(["regnf:queue:*", "regnf:queue:*", "regnf:[cr]*", "rq:*"]))
     if key is None:
         return "no such key"
     value = random.choice([b"x", b"", b"nan", b"inf", b"-inf", b"-1", b"0", b"\xff\xfe", b"9" * 400, b"x" * 100_000])
@@ -164,14 +164,46 @@ def _drop(random: Random, redis: Redis) -> str:
 
 def _queue_entry(random: Random, redis: Redis, trap: Path) -> str:
     """A queue entry that asks a worker to run something else, or something odd."""
-    name = random.choice(["a-1", "b", "", "x" * 300, f"{random.randrange(99)}-1", "é-1", "../a-1", f"os.mkdir {trap}"])
-    members = ("owner", "kind", "signature", "since", "batch", "parked", "x")
-    values = ["os.mkdir", "x", "{", "\xff", "", json.dumps({"a": 1}), str(trap)]
-    redis.delete(f"regnf:queue:entry:{name}")
-    redis.hset(
-        f"regnf:queue:entry:{name}", mapping={member: random.choice(values) for member in random.sample(members, 3)}
+    functions = (
+        "os.mkdir",
+        "os.system",
+        "builtins.exec",
+        "regnf_worker.jobs.run_registration",
+        "subprocess.run",
+        "x",
+        "",
     )
-    random.choice([redis.rpush, redis.lpush])(f"regnf:queue:ready:{random.choice(['registration', 'import'])}", name)
+    function, rq_id = (
+        random.choice(functions),
+        random.choice(["a-1", "b", "", "x" * 300, f"{random.randrange(99)}-1", "é-1"]),
+    )
+    arguments = random.choice([[str(trap)], [f"touch {trap}"], [], [None], [{"a": 1}], ["0" * 32], ["\x00"]])
+    data = random.choice(
+        [
+            json.dumps([function, None, arguments, {}]),
+            json.dumps([function, "os", arguments, {"mode": 1}]),
+            "{",
+            "[]",
+            "\x80\x04.",
+            json.dumps({"a": 1}),
+        ]
+    )
+    held: dict[str, Any] = {"data": data, "status": "queued", "origin": random.choice(["regnf", "x"]), "timeout": "60"}
+    hooks = (
+        "success_callback_name",
+        "failure_callback_name",
+        "stopped_callback_name",
+        "meta",
+        "dependency_ids",
+        "created_at",
+    )
+    for name in random.sample(hooks, random.randrange(3)):
+        held[name] = random.choice(["os.mkdir", "x", "{", "\xff", json.dumps({"a": 1})])
+    redis.delete(f"rq:job:{rq_id}")
+    redis.hset(f"rq:job:{rq_id}", mapping=held)
+    queue = random.choice(["regnf", "regnf-import"])
+    random.choice([redis.rpush, redis.lpush])(f"rq:queue:{queue}", rq_id)
+    redis.sadd("rq:queues", f"rq:queue:{queue}")
     return "queue entry"
 
 

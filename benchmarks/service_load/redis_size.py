@@ -45,7 +45,7 @@ def finish(redis: Redis, ids: list[str]) -> None:
         for place, phase in enumerate(_PHASES[1:]):
             records.update_job(job_id, 1, phase=phase, progress=place / len(_PHASES))
         records.update_job(job_id, 1, status="successful", verdict="registered")
-    for key in redis.scan_iter("regnf:queue:*", count=1000):
+    for key in redis.scan_iter("rq:*", count=1000):
         redis.delete(key)
 
 

@@ -1,16 +1,14 @@
-"""The fair queue: callers take turns at the workers (docs/adr/0009-fair-queue.md).
+"""The fair queue: callers take turns at the workers, over RQ's lists (docs/adr/0009-fair-queue.md).
 
 A caller's waiting work is a line, first come first served; but jobs of batches stand behind all that was posted by
 itself, and its imports. Callers with a line take turns, one piece of work each: who has had a turn goes behind all
-others. One name lies ready, in a list where the workers block; when a worker has taken it, the next call of any process
+others. One name lies in RQ's list, where the workers block; when a worker has taken it, the next call of any process
 puts the next one there. So no call relies on the one before it: the death of a process costs nothing.
 
 Keys, below the prefix:  line:{owner}   list of names        owners        sorted set: callers with a line, by turn
                          entry:{name}   hash, see below      turn          how many turns there have been
                          parked:{ref}   list of names        parkings      set: fields that something waits for
-                         ready:{kind}   list of one name
-An entry: owner, kind, signature, since, batch (of one); while it waits for a field: parked. What a worker runs is told
-by regnf:running:{name}, which it renews, and which Redis lets expire once the worker is dead.
+An entry: owner, kind, since, batch (of one); while it waits for a field: parked.
 """
 
 from __future__ import annotations
@@ -18,28 +16,27 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 from redis import Redis
 from redis.exceptions import ResponseError
 
-from regnf_state.queue import Kind, Work
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.documents import number, shown
 from regnf_state.redis.unreadable import PREFIX
 
 _PREFIX = f"{PREFIX}queue:"
-LISTS: dict[Kind, str] = {"import": f"{_PREFIX}ready:import", "registration": f"{_PREFIX}ready:registration"}
-"""Where workers take from."""
-RUNNING = f"{PREFIX}running:"
+LISTS = {f"rq:queue:{name}": name for name in (IMPORT_QUEUE_NAME, QUEUE_NAME)}
+"""Where workers take from, and the queues of these lists."""
 _NOT_DAMAGE = re.compile("OOM|MISCONF|READONLY|NOSCRIPT|BUSY|LOADING|NOPERM|MASTERDOWN|NOREPLICAS|denied")
 """What Redis says of a script that it does not run now, or not for us."""
 # One call is one step, which Redis runs whole or not at all.
 _SCRIPT = """
 local P, op, name = KEYS[1], ARGV[1], ARGV[2]
 local DAY = 86400
-local LISTS = {import = P .. 'ready:import', registration = P .. 'ready:registration'}
+local LISTS = {import = 'rq:queue:regnf-import', registration = 'rq:queue:regnf'}
 local time = redis.call('TIME')
 local now = string.format('%.6f', time[1] + time[2] / 1e6)
 
@@ -71,7 +68,14 @@ local function first_of_batch(owner)
   end
 end
 
-local function runs(id) return redis.call('EXISTS', KEYS[2] .. id) == 1 end
+-- that a worker reports is told by what Redis lets expire: times in RQ's own lists are of the workers' clocks
+local function runs(id)
+  if redis.call('TYPE', 'rq:executions:' .. id).ok ~= 'zset' then return false end
+  for _, one in ipairs(redis.call('ZRANGE', 'rq:executions:' .. id, 0, -1)) do
+    if redis.call('EXISTS', 'rq:execution:' .. id .. ':' .. one) == 1 then return true end
+  end
+  return false
+end
 
 local function advance()
   while redis.call('LLEN', LISTS.import) + redis.call('LLEN', LISTS.registration) == 0 do
@@ -114,10 +118,12 @@ end
 local steps = {}
 
 -- what has been waiting already stays where it is; a leftover of a worker's death is replaced
-function steps.enqueue(owner, kind, batch, signature)
+function steps.enqueue(owner, kind, batch, ...)
   if waits(name) or runs(name) then return 0 end
   remove(name)
-  redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'signature', signature, 'since', now)
+  redis.call('DEL', 'rq:job:' .. name)
+  redis.call('HSET', 'rq:job:' .. name, ...)
+  redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'since', now)
   if batch == '1' then redis.call('HSET', entry_of(name), 'batch', 1) end
   join(owner, name, 'RPUSH', batch ~= '1' and first_of_batch(owner))
   return 1
@@ -127,7 +133,11 @@ function steps.turn() return 0 end
 
 function steps.holds() return (waits(name) or runs(name)) and 1 or 0 end
 
-function steps.remove() return remove(name) end
+function steps.remove()
+  if remove(name) == 0 then return 0 end
+  redis.call('DEL', 'rq:job:' .. name)
+  return 1
+end
 
 -- taken, but it cannot run before the import of this field has ended
 function steps.park(owner, kind, reference)
@@ -172,17 +182,12 @@ class Line:
 
 
 class Waiting(NamedTuple):
-    """Work that is to wait. of_batch: whether it is of a batch."""
+    """Work that is to wait, with what RQ holds of it. of_batch: whether it is of a batch."""
 
     work: Work
     owner: str
+    payload: Mapping[str, Any]
     of_batch: bool = False
-    signature: str = ""
-
-
-def entry_key(name: str) -> str:
-    """Where Redis holds what is known of work."""
-    return f"{_PREFIX}entry:{name}"
 
 
 class FairQueue:
@@ -197,7 +202,7 @@ class FairQueue:
         return self._mended(lambda: int(self._run(self._redis, step, name, *arguments)))
 
     def _run(self, client: Redis, step: str, name: str, *arguments: Any) -> Any:
-        return self._script(keys=[_PREFIX, RUNNING], args=[step, name, *arguments], client=client)
+        return self._script(keys=[_PREFIX], args=[step, name, *arguments], client=client)
 
     def _mended(self, do: Callable[[], _Value]) -> _Value:
         """What ``do`` returns, on an empty queue if the keys of this one are damaged."""
@@ -207,7 +212,9 @@ class FairQueue:
             if not _tells_of_damage(error):
                 raise
             logger.error("the fair queue is damaged and begins anew: %s", error)
-        if held := list(self._redis.scan_iter(f"{_PREFIX}*", count=1000)):
+        damaged = [key for key in LISTS if self._redis.type(key) != b"list"]
+        held: list[Any] = [*self._redis.scan_iter(f"{_PREFIX}*", count=1000), *damaged]
+        if held:
             self._redis.delete(*held)
         return do()
 
@@ -218,8 +225,9 @@ class FairQueue:
 
     def _enqueue(self, waiting: tuple[Waiting, ...]) -> list[bool]:
         with self._redis.pipeline(transaction=False) as pipeline:
-            for work, owner, of_batch, signature in waiting:
-                self._run(pipeline, "enqueue", work.name, owner, work.kind, int(of_batch), signature)
+            for work, owner, payload, of_batch in waiting:
+                told = (part for pair in payload.items() for part in pair)
+                self._run(pipeline, "enqueue", work.name, owner, work.kind, int(of_batch), *told)
             answers = pipeline.execute(raise_on_error=False)
         for answer in answers:
             if isinstance(answer, Exception):
@@ -263,7 +271,7 @@ class FairQueue:
             answers = pipeline.execute()
             firsts = [shown(name) for name in (*ready, *(name for found in answers[::2] for name in found))]
             for name in firsts:
-                pipeline.hmget(entry_key(name), "owner", "since")
+                pipeline.hmget(f"{_PREFIX}entry:{name}", "owner", "since")
             entries = [(shown(owner), number(since, seconds)) for owner, since in pipeline.execute() if owner]
         waiting = Counter(dict(zip(owners, answers[1::2], strict=True)))
         waiting.update(owner for owner, _ in entries[: len(ready)])
@@ -274,7 +282,7 @@ class FairQueue:
     def _look(self) -> tuple[list[str], list[bytes], float]:
         with self._redis.pipeline() as pipeline:
             pipeline.zrange(f"{_PREFIX}owners", 0, -1)
-            for key in LISTS.values():
+            for key in LISTS:
                 pipeline.lrange(key, 0, 0)
             pipeline.time()
             owners, imports, registrations, (seconds, _) = pipeline.execute()
@@ -288,7 +296,7 @@ class FairQueue:
         owners, ready, _ = self._look()
         if work.name.encode() in ready:
             return 1
-        held: Any = self._redis.hget(entry_key(work.name), "owner")
+        held: Any = self._redis.hget(f"{_PREFIX}entry:{work.name}", "owner")
         mine = shown(held or "")
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.lpos(f"{_PREFIX}line:{mine}", work.name)

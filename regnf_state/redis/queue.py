@@ -1,46 +1,79 @@
-"""The queue to the workers: ids only, results and failures kept nowhere but in the records."""
+"""The transport to the workers over RQ: ids only, results and failures kept nowhere but in the records."""
 
 from __future__ import annotations
 
 import hashlib
 import hmac
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from redis import Redis
-from redis.exceptions import ResponseError
+from rq.command import send_command
+from rq.job import Job, JobStatus
+from rq.serializers import JSONSerializer
+from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_state.ownership import ANONYMOUS, owner_of
-from regnf_state.queue import Kind, Work
+from regnf_state.queue import QUEUE_NAME, Work
 from regnf_state.records import JobRecord
 from regnf_state.redis.documents import shown
-from regnf_state.redis.fair_queue import LISTS, RUNNING, FairQueue, Waiting, entry_key
-from regnf_state.redis.unreadable import PREFIX
+from regnf_state.redis.fair_queue import FairQueue, Waiting
 
-_WORKERS = f"{PREFIX}workers"
-"""Sorted set: every worker's name by the time of its last report."""
-_LIVE_FOR_S = 45
-_HELD_FOR_S = 60
-"""What a worker has taken, and has said nothing of for so long, is not being run any more."""
-_STOP = b"stop"
+# What Redis holds of a piece of work in RQ's shape, a hash: written here, and believed only if written here.
+#
+# RQ itself would import whatever function a hash names, and the callbacks in it, and hand it on to jobs that depend
+# on it. A worker therefore never lets RQ read one. It takes a name from RQ's list, checks here that the hash says
+# exactly what ``written`` writes for this name, and makes the job anew from the name. With a key, the hash must be
+# signed too.
+
+SIGNATURE = "regnf_signature"
+_MAX_S = 24 * 3600
+"""What RQ itself would allow a job; workers set the limit that counts from their own settings."""
+_FAILURE_KEPT_S = 60
+_WRITTEN_BY_RQ = frozenset(
+    ("created_at", "enqueued_at", "started_at", "ended_at", "last_heartbeat", "worker_name", "status", "exc_info")
+)
+"""What RQ notes down of a job on its way. Nothing of it is used."""
 
 
-class ForeignWorkError(ValueError):
-    """What lies in the queue is not of this service. Says what is wrong with it, and repeats nothing of it."""
+def made(work: Work, redis: Redis) -> Job:
+    """RQ's job for a piece of work."""
+    return Job.create(
+        work.function,
+        args=[work.argument],
+        connection=redis,
+        id=work.name,
+        origin=work.queue_name,
+        timeout=_MAX_S,
+        result_ttl=0,
+        failure_ttl=_FAILURE_KEPT_S,
+        status=JobStatus.QUEUED,
+        serializer=JSONSerializer,
+        description=f"{work.function} {work.name}",
+    )
 
 
-class Taken(NamedTuple):
-    """A name that has left the list of its kind."""
+def signature(work: Work, key: str) -> str:
+    """HMAC-SHA256 over the function and the name, which holds the argument and the attempt."""
+    return hmac.new(key.encode(), f"regnf-queue-1\n{work.function}\n{work.name}".encode(), hashlib.sha256).hexdigest()
 
-    kind: Kind
-    name: str
+
+def written(work: Work, redis: Redis) -> dict[str, Any]:
+    """The hash of a piece of work that waits, not signed. RQ reads data that is not compressed as well: the bytes of
+    what is compressed depend on the release of zlib."""
+    job = made(work, redis)
+    return job.to_dict() | {"data": job.data}
+
+
+def _believed(held: Mapping[bytes, bytes]) -> dict[str, bytes]:
+    fields = {shown(field): value for field, value in held.items() if value}
+    return {field: value for field, value in fields.items() if field not in _WRITTEN_BY_RQ}
 
 
 class JobQueue(FairQueue):
     """Hands ids to workers, each at most once per attempt: enqueueing what is known already changes nothing.
 
-    ``key`` signs what is put into Redis. A worker believes nothing of it but a name, and with a key only one that the
-    service has signed.
+    ``key`` signs what is put into Redis.
     """
 
     def __init__(self, redis: Redis, key: str | None = None) -> None:
@@ -62,15 +95,24 @@ class JobQueue(FairQueue):
         self.enqueue(self._waiting(Work("import", sha256, attempt), owner_of(sha256)))
 
     def _waiting(self, work: Work, owner: str, of_batch: bool = False) -> Waiting:
-        return Waiting(work, owner, of_batch, self._signature(work))
+        signed = {SIGNATURE: signature(work, self._key)} if self._key is not None else {}
+        return Waiting(work, owner, written(work, self._redis) | signed, of_batch)
 
-    def _signature(self, work: Work) -> str:
-        """HMAC-SHA256 over the kind and the name, which holds the argument and the attempt; without a key, nothing."""
-        said = f"regnf-queue-2\n{work.kind}\n{work.name}".encode()
-        return hmac.new(self._key.encode(), said, hashlib.sha256).hexdigest() if self._key is not None else ""
+    def read(self, queue_name: str, name: str, held: Mapping[bytes, bytes]) -> Work:
+        """The work that a name and its hash mean. Raises ValueError unless the hash is one that this queue writes;
+        its message repeats nothing of the hash."""
+        work = Work.named(queue_name, name)
+        believed = _believed(held)
+        signed = believed.pop(SIGNATURE, b"")
+        encode: Any = self._redis.get_encoder().encode
+        if believed != _believed({encode(field): encode(value) for field, value in written(work, self._redis).items()}):
+            raise ValueError("not what this service writes")
+        if self._key is not None and not hmac.compare_digest(signed, signature(work, self._key).encode()):
+            raise ValueError("not signed with the key of this service")
+        return work
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
-        """Whether the queue still knows of this attempt, waiting or running."""
+        """Whether the transport still knows of this attempt, waiting or running."""
         return self.holds(Work("registration", job_id, attempt).name)
 
     def holds_import(self, sha256: str, attempt: int) -> bool:
@@ -79,73 +121,23 @@ class JobQueue(FairQueue):
     def stop(self, job_id: str, attempt: int) -> None:
         """Take a waiting job out of the queue, or tell the worker to end a running one."""
         name = Work("registration", job_id, attempt).name
-        if not self.remove(name):
-            self._redis.set(f"{RUNNING}{name}", _STOP, xx=True, ex=_HELD_FOR_S)
+        if self.remove(name):
+            return
+        worker: Any = self._redis.hget(f"rq:job:{name}", "worker_name")
+        if worker:
+            send_command(self._redis, shown(worker), "stop-job", job_id=name)
 
     def drop_import(self, sha256: str, attempt: int) -> None:
         """Take a waiting import out of the queue: its field is gone. One that runs goes on, and finds that itself."""
         self.remove(Work("import", sha256, attempt).name)
 
-    # for workers
-
-    def pop(self, seconds: int) -> Taken | None:
-        """The next name, waited for so many seconds (0: not at all); None when there is none."""
-        self.turn()
-        found: Any
-        if seconds:
-            found = self._redis.blpop(list(LISTS.values()), seconds)
-        else:
-            found = next(((key, name) for key in LISTS.values() if (name := self._redis.lpop(key)) is not None), None)
-        if found is None:
-            return None
-        kinds: dict[str, Kind] = {key: kind for kind, key in LISTS.items()}
-        return Taken(kinds[shown(found[0])], shown(found[1]))
-
-    def work_of(self, taken: Taken) -> Work | None:
-        """The work that a name means; None for what was stopped meanwhile. Raises ForeignWorkError."""
-        try:
-            work = Work.named(taken.kind, taken.name)
-            held: Any = self._redis.hget(entry_key(work.name), "signature")
-        except ValueError as error:
-            raise ForeignWorkError(str(error)) from error
-        except ResponseError as error:
-            if "WRONGTYPE" not in str(error):
-                raise
-            raise ForeignWorkError("not a hash") from error
-        if held is not None and not hmac.compare_digest(held, self._signature(work).encode()):
-            raise ForeignWorkError("not signed with the key of this service")
-        return None if held is None else work
-
-    def begin(self, name: str, worker: str) -> None:
-        """The worker runs it from now on."""
-        self._redis.set(f"{RUNNING}{name}", worker, ex=_HELD_FOR_S)
-
-    def goes_on(self, name: str, worker: str) -> bool:
-        """Say so again, every few seconds; False once the work shall stop."""
-        held: Any = self._redis.getex(f"{RUNNING}{name}", ex=_HELD_FOR_S)
-        if held is None:
-            self.begin(name, worker)
-        return bool(held != _STOP)
-
-    def end(self, name: str) -> None:
-        """It has ended. What became of it is in its record."""
-        self._redis.delete(f"{RUNNING}{name}", entry_key(name))
-
-    def report(self, worker: str) -> None:
-        """The worker lives."""
-        seconds, _ = self._redis.time()
-        self._redis.zadd(_WORKERS, {worker: seconds})
-        self._redis.zremrangebyscore(_WORKERS, "-inf", seconds - _LIVE_FOR_S)
-
-    def sign_off(self, worker: str) -> None:
-        self._redis.zrem(_WORKERS, worker)
-
-    def workers(self) -> list[str]:
-        """The names of those that have reported lately: `host:id`."""
-        seconds, _ = self._redis.time()
-        names: Any = self._redis.zrangebyscore(_WORKERS, seconds - _LIVE_FOR_S, "+inf")
-        return [shown(name) for name in names]
+    def live_hosts(self) -> list[str]:
+        """The hosts of the workers that have reported lately and have not signed off, one each."""
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for name in self._redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME):
+                pipeline.hmget(shown(name), "hostname", "death")
+            return [shown(host) for host, death in pipeline.execute() if host is not None and death is None]
 
     def live_workers(self) -> int:
         """How many workers have reported lately."""
-        return len(self.workers())
+        return len(self.live_hosts())

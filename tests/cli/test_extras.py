@@ -40,7 +40,7 @@ def test_the_table_names_a_module_of_every_requirement() -> None:
         ("igl", REGISTER),
         ("torch", ["inspect", FIELD]),
         ("trimesh", ["fit", FIELD, "out.safetensors"]),
-        ("redis", ["worker"]),
+        ("rq", ["worker"]),
         ("torch", ["worker"]),
         ("uvicorn", ["serve"]),
         ("torch", ["serve"]),

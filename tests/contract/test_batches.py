@@ -14,9 +14,8 @@ from regnf_service.upkeep.reaper import Reaper
 from regnf_state.blobs.local import LocalBlobWriter
 from regnf_state.journal.journaled_records import Rebuilder
 from regnf_state.ownership import reference_of
-from regnf_state.queue import Work
+from regnf_state.queue import QUEUE_NAME, Work
 from regnf_state.reasons import problem_document
-from regnf_state.redis.fair_queue import LISTS
 from tests.contract.asgi import client_of
 from tests.contract.batch_posts import NDJSON, body_of, document, pairs, post, posted, results, work
 from tests.contract.world import BOX, RESULT, TOKENS, World, assert_refused, field_bytes, sha256
@@ -518,6 +517,6 @@ def test_a_large_batch_does_not_keep_another_callers_waiting(worlds: Callable[..
             assert client.post("/batches", content=body_of(lines), headers=NDJSON).status_code == 202
     while len(taken) < 7:
         world.queue.turn()
-        name = world.redis.lpop(LISTS["registration"])
-        taken.append(world.records.get_job(Work.named("registration", name.decode()).argument).owner)
+        name = world.redis.lpop(f"rq:queue:{QUEUE_NAME}")
+        taken.append(world.records.get_job(Work.named(QUEUE_NAME, name.decode()).argument).owner)
     assert taken.count("bob") == 3

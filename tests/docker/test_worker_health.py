@@ -1,17 +1,18 @@
-"""The worker's health check against a real Redis and what workers report."""
+"""The worker's health check against a real Redis and the keys that RQ itself writes."""
 
 from __future__ import annotations
 
 import importlib.util
-import socket
 import subprocess
 import sys
 from types import ModuleType
+from typing import Any
 
 import pytest
 from redis import Redis
+from rq import Queue, Worker
 
-from regnf_state.redis.queue import JobQueue
+from regnf_state.queue import QUEUE_NAME
 from tests.docker.files import ROOT
 
 SCRIPT = ROOT / "docker" / "worker_health.py"
@@ -28,15 +29,19 @@ def health() -> ModuleType:
 
 
 def test_only_a_worker_of_this_host_that_reported_lately_is_alive(health: ModuleType, redis: Redis) -> None:
-    queue = JobQueue(redis)
-    queue.report("elsewhere:1")
-    assert not health.is_alive(redis, "here")
-    queue.report("here:1")
+    for name in ("elsewhere", "here"):
+        assert not health.is_alive(redis, "here")
+        worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{name}-1")
+        worker.hostname = name
+        worker.register_birth()
     assert health.is_alive(redis, "here")
-    redis.zincrby("regnf:workers", -46, "here:1")
+    assert redis.ttl(worker.key) > 0, "the registration runs out by itself"
+    held = redis.hgetall(worker.key)
+    redis.delete(worker.key)
     assert not health.is_alive(redis, "here"), "it has stopped reporting"
-    queue.report("here:1")
-    queue.sign_off("here:1")
+    redis.hset(worker.key, mapping=held)
+    assert health.is_alive(redis, "here")
+    worker.register_death()
     assert not health.is_alive(redis, "here"), "it said goodbye"
 
 
@@ -54,6 +59,7 @@ def test_exit_status_follows_the_worker(redis_url: str, redis: Redis) -> None:
     environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": redis_url}
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (1, "no worker of this host has reported lately\n")
-    JobQueue(redis).report(f"{socket.gethostname()}:1")
+    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis)
+    worker.register_birth()
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (0, "")

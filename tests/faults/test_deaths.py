@@ -12,7 +12,6 @@ import httpx
 import pytest
 
 from regnf_state.queue import Work
-from regnf_state.redis.fair_queue import LISTS
 from tests.contract.batch_posts import NDJSON
 from tests.contract.world import field_bytes, sha256
 from tests.faults.house import House
@@ -217,7 +216,7 @@ def test_two_workers_with_one_job(house: House) -> None:
     workers = [house.start_both()[1], house.start_worker()]
     job_id = house.running()
     with fault():
-        house.redis.rpush(LISTS["registration"], Work("registration", job_id, 1).name)
+        house.redis.rpush("rq:queue:regnf", Work("registration", job_id, 1).name)
         eventually(lambda: "is not run" in house.log(), house.log)
         house.let_go()
         done = check_promise(house, [job_id])
@@ -229,7 +228,7 @@ def test_kill_of_the_worker_during_an_import(house: House) -> None:
     """The import is held for a minute after its worker's last word; then another worker does it."""
     if not house.pace.whole:
         pytest.skip(
-            "Redis holds what a dead worker had for a minute, which no setting shortens: python -m benchmarks.faults"
+            "RQ holds what a dead worker had for a minute, which no setting shortens: python -m benchmarks.faults"
         )
     _, first = house.start_both()
     house.hold("hold-import")

@@ -44,7 +44,7 @@ def test_a_process_with_another_storage_does_not_start(another_s: str, tmp_path:
     assert storage_id in said
     with connect(another_s) as redis:
         assert redis.get(STORAGE_KEY) == b"0" * 32
-        assert redis.keys("regnf:workers") == []
+        assert redis.keys("rq:*") == []
 
 
 def test_the_storage_that_the_operator_names_is_adopted(another_s: str, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from regnf_state.redis.counters import COUNTERS_KEY, Counters, count
 from regnf_state.redis.fair_queue import FairQueue, Waiting
 
 PREFIX = "regnf:queue:"
-READY = f"{PREFIX}ready:registration"
 WAITING, OTHER, PARKED = (Work("registration", f"{letter * 32}", 1) for letter in "abc")
 ODD = [b"x", b"", b"nan", b"inf", b"-inf", b"1e308", b"0", b"-1", b"\xff\xfe", b"9" * 400]
 
@@ -22,9 +21,9 @@ def used(redis: Redis) -> FairQueue:
     """A queue with something in every key: work that waits, lies ready, has been run and is parked."""
     fair = FairQueue(redis)
     for number in range(3):
-        fair.enqueue(Waiting(Work("registration", f"{number:032x}", 1), "one"))
-    fair.enqueue(Waiting(WAITING, "two"))
-    redis.lpop(READY)
+        fair.enqueue(Waiting(Work("registration", f"{number:032x}", 1), "one", {"owner": "one"}))
+    fair.enqueue(Waiting(WAITING, "two", {"owner": "two"}))
+    redis.lpop("rq:queue:regnf")
     fair.turn()
     fair.park(PARKED, "one", "e" * 64)
     return fair
@@ -39,16 +38,16 @@ def go_through(fair: FairQueue, redis: Redis) -> None:
     fair.release("e" * 64)
     fair.awaited()
     Counters(redis)
-    redis.lpop(READY)
+    redis.lpop("rq:queue:regnf")
     fair.turn()
 
 
 def comes_out(fair: FairQueue, redis: Redis, work: Work) -> bool:
     """Whether work that is queued now is handed out in the end."""
-    fair.enqueue(Waiting(work, "three"))
+    fair.enqueue(Waiting(work, "three", {"owner": "three"}))
     for _ in range(20):
         fair.turn()
-        if redis.lpop(READY) == work.name.encode():
+        if redis.lpop("rq:queue:regnf") == work.name.encode():
             return True
     return False
 
@@ -56,7 +55,7 @@ def comes_out(fair: FairQueue, redis: Redis, work: Work) -> bool:
 @pytest.mark.parametrize("kind", ["string", "list", "hash", "set", "zset"])
 def test_keys_of_another_type(redis: Redis, kind: str) -> None:
     used(redis)
-    keys = [key for key in redis.keys(f"{PREFIX}*") if redis.type(key) != kind.encode()]
+    keys = [key for key in redis.keys(f"{PREFIX}*") + redis.keys("rq:queue:regnf*") if redis.type(key) != kind.encode()]
     assert keys
     for key in keys:
         redis.flushall()

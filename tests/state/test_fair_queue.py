@@ -11,7 +11,9 @@ import pytest
 from redis import Redis
 
 from regnf_state.queue import Work
-from regnf_state.redis.fair_queue import LISTS, FairQueue, Waiting, entry_key
+from regnf_state.redis.fair_queue import FairQueue, Waiting
+
+LISTS = ("rq:queue:regnf-import", "rq:queue:regnf")
 
 
 def import_of(owner: str, number: int) -> Work:
@@ -32,11 +34,11 @@ class Shop:
         self.fair = FairQueue(self.redis)
 
     def enqueue(self, work: Work, owner: str, of_batch: bool = False) -> bool:
-        return self.fair.enqueue(Waiting(work, owner, of_batch))[0]
+        return self.fair.enqueue(Waiting(work, owner, {"owner": owner}, of_batch))[0]
 
     def pop(self) -> str | None:
         self.fair.turn()
-        found = next((name for key in LISTS.values() if (name := self.redis.lpop(key))), None)
+        found = next((name for key in LISTS if (name := self.redis.lpop(key))), None)
         return found.decode() if found else None
 
     def take(self) -> str | None:
@@ -45,7 +47,7 @@ class Shop:
         return name
 
     def owner(self, name: str) -> str:
-        return self.redis.hget(entry_key(name), "owner").decode()
+        return self.redis.hget(f"rq:job:{name}", "owner").decode()
 
     def owners(self, count: int) -> str:
         """Of what the workers take next."""
@@ -53,7 +55,7 @@ class Shop:
 
     def waiting(self) -> Counter[str]:
         """How often each name lies in a list, a line or among those that wait for a field."""
-        keys = [*LISTS.values(), *self.redis.keys("regnf:queue:line:*"), *self.redis.keys("regnf:queue:parked:*")]
+        keys = [*LISTS, *self.redis.keys("regnf:queue:line:*"), *self.redis.keys("regnf:queue:parked:*")]
         return Counter(name.decode() for key in keys for name in self.redis.lrange(key, 0, -1))
 
 
@@ -129,7 +131,7 @@ def test_what_waits_for_an_import_comes_first_afterwards(shop: Shop) -> None:
 
 STEPS: list[Callable[[Shop], object]] = [
     lambda shop: shop.fair.turn(),
-    lambda shop: shop.redis.lpop(LISTS["registration"]),
+    lambda shop: shop.redis.lpop("rq:queue:regnf"),
     lambda shop: shop.fair.turn(),
     lambda shop: shop.fair.park(job_of("a", 0), "a", "f" * 64),
     lambda shop: shop.fair.release("f" * 64),
@@ -190,7 +192,7 @@ def test_nothing_is_lost_or_doubled_whatever_happens_in_whatever_order(any_redis
                 shop.fair.turn()
         assert shop.waiting() == dict.fromkeys(waiting, 1)
         assert all(shop.fair.holds(name) for name in waiting)
-        assert sum(any_redis.llen(key) for key in LISTS.values()) <= 1
+        assert sum(any_redis.llen(key) for key in LISTS) <= 1
     for number in range(3):
         shop.fair.release(f"field {number}")
     left = [shop.take() for _ in range(len(waiting) + 1)]

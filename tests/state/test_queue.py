@@ -1,11 +1,15 @@
-"""The queue: ids only, each attempt once, nothing left behind."""
+"""The queue over RQ: ids only, each attempt once, nothing left behind."""
+
+import json
 
 import pytest
 from redis import Redis
+from rq.executions import Execution
+from rq.job import Job
+from rq.serializers import JSONSerializer
 
-from regnf_state.queue import Kind, Work
-from regnf_state.redis.fair_queue import LISTS
-from regnf_state.redis.queue import ForeignWorkError, JobQueue, Taken
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
+from regnf_state.redis.queue import JobQueue
 from tests.worker.bench import eventually
 
 SHA = "a" * 64
@@ -17,8 +21,8 @@ def queue(redis: Redis) -> JobQueue:
 
 
 def listed(redis: Redis) -> list[bytes]:
-    """What workers may take."""
-    return [name for key in LISTS.values() for name in redis.lrange(key, 0, -1)]
+    """What workers may take: RQ's lists."""
+    return [name for queue in ("regnf-import", "regnf") for name in redis.lrange(f"rq:queue:{queue}", 0, -1)]
 
 
 def lined(redis: Redis, owner: str = "anonymous") -> list[bytes]:
@@ -27,44 +31,51 @@ def lined(redis: Redis, owner: str = "anonymous") -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "work", "name"),
+    ("queue_name", "work", "name"),
     [
-        ("registration", Work("registration", "j-1", 3), "j-1-3"),
-        ("import", Work("import", SHA, 12), f"import-{SHA}-12"),
-        ("import", Work("import", f"{SHA}_alice-2", 1), f"import-{SHA}_alice-2-1"),
+        (QUEUE_NAME, Work("registration", "j-1", 3), "j-1-3"),
+        (IMPORT_QUEUE_NAME, Work("import", SHA, 12), f"import-{SHA}-12"),
+        (IMPORT_QUEUE_NAME, Work("import", f"{SHA}_alice-2", 1), f"import-{SHA}_alice-2-1"),
     ],
 )
-def test_names_tell_job_and_attempt(kind: Kind, work: Work, name: str) -> None:
+def test_names_tell_job_and_attempt(queue_name: str, work: Work, name: str) -> None:
     assert work.name == name
-    assert Work.named(kind, name) == work
+    assert Work.named(queue_name, name) == work
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"),
+    ("queue_name", "name"),
     [
-        ("registration", "j1"),
-        ("registration", "j1-0"),
-        ("registration", "j1-1\n"),
-        ("registration", "../j1-1"),
-        ("registration", "j1:1-1"),
-        ("registration", ""),
-        ("registration", "a" * 101 + "-1"),
-        ("import", "j1-1"),
-        ("import", f"import-{SHA[1:]}-1"),
-        ("import", f"import-{SHA}_Alice-1"),
-        ("import", f"import-{SHA}-01"),
+        (QUEUE_NAME, "j1"),
+        (QUEUE_NAME, "j1-0"),
+        (QUEUE_NAME, "j1-1\n"),
+        (QUEUE_NAME, "../j1-1"),
+        (QUEUE_NAME, "j1:1-1"),
+        (QUEUE_NAME, ""),
+        (QUEUE_NAME, "a" * 101 + "-1"),
+        (IMPORT_QUEUE_NAME, "j1-1"),
+        (IMPORT_QUEUE_NAME, f"import-{SHA[1:]}-1"),
+        (IMPORT_QUEUE_NAME, f"import-{SHA}_Alice-1"),
+        (IMPORT_QUEUE_NAME, f"import-{SHA}-01"),
     ],
 )
-def test_other_names_mean_nothing(kind: Kind, name: str) -> None:
+def test_other_names_mean_nothing(queue_name: str, name: str) -> None:
     with pytest.raises(ValueError, match="not a name"):
-        Work.named(kind, name)
+        Work.named(queue_name, name)
 
 
-def test_one_name_lies_ready(redis: Redis, queue: JobQueue) -> None:
+def test_a_job_is_one_id_as_json(redis: Redis, queue: JobQueue) -> None:
     queue.enqueue_registration("j1", 2)
     queue.enqueue_import(SHA)
     assert listed(redis) == [b"j1-2"], "the next in turn, and nothing else"
     assert lined(redis) == [f"import-{SHA}-1".encode()]
+    for key, function, argument in (
+        ("rq:job:j1-2", "regnf_worker.jobs.run_registration", "j1"),
+        (f"rq:job:import-{SHA}-1", "regnf_worker.jobs.run_import", SHA),
+    ):
+        data = redis.hget(key, "data")
+        assert data is not None
+        assert json.loads(bytes(data)) == [function, None, [argument], {}]
 
 
 def test_every_attempt_is_queued_once(redis: Redis, queue: JobQueue) -> None:
@@ -86,25 +97,40 @@ def test_what_the_transport_holds(queue: JobQueue) -> None:
 
 
 def test_work_in_progress_is_held_while_its_worker_reports(redis: Redis, queue: JobQueue) -> None:
-    for job_id in ("j1", "j2"):
-        queue.enqueue_registration(job_id, 1)
-        assert queue.pop(0) == Taken("registration", f"{job_id}-1")
-        assert not queue.holds_registration(job_id, 1), "a worker that dies right after taking it"
-        queue.begin(f"{job_id}-1", "w")
-    assert 0 < redis.ttl("regnf:running:j1-1") <= 60
-    redis.pexpire("regnf:running:j2-1", 1)
-    eventually(lambda: not queue.holds_registration("j2", 1), "its worker fell silent")
+    for job_id in ("j1-1", "j2-1"):
+        queue.enqueue_registration(job_id[:2], 1)
+        assert redis.lpop("rq:queue:regnf") == job_id.encode()
+        with redis.pipeline() as pipeline:
+            job = Job.fetch(job_id, connection=redis, serializer=JSONSerializer)
+            Execution.create(job, 60, pipeline, worker_name="w")
+            pipeline.execute()
+    redis.zadd("rq:wip:regnf", dict.fromkeys(redis.zrange("rq:wip:regnf", 0, -1), 1.0))
+    assert queue.holds_registration("j1", 1), "whatever its worker's clock says"
+    (key,) = redis.keys("rq:execution:j2-1:*")
+    redis.pexpire(key, 1)
+    eventually(lambda: not redis.exists(key))
+    assert not queue.holds_registration("j2", 1), "its worker fell silent"
     assert queue.holds_registration("j1", 1)
+
+
+def test_an_id_that_fell_between_two_lists_is_queued_anew(redis: Redis, queue: JobQueue) -> None:
+    """A worker that dies right after taking an id leaves the job's hash, and the id in no list."""
     queue.enqueue_registration("j1", 1)
-    assert listed(redis) + lined(redis) == [], "it is not queued beside its run"
-    assert queue.goes_on("j2-1", "w")
-    assert queue.holds_registration("j2", 1), "whose worker was slow, and reports again"
-    queue.stop("j1", 1)
-    assert not queue.goes_on("j1-1", "w")
-    for job_id in ("j1", "j2"):
-        queue.end(f"{job_id}-1")
-        assert not queue.holds_registration(job_id, 1)
-    assert redis.keys("*j1*") == redis.keys("*j2*") == []
+    redis.delete("rq:queue:regnf")
+    assert not queue.holds_registration("j1", 1)
+    queue.enqueue_registration("j1", 1)
+    assert listed(redis) == [b"j1-1"]
+
+
+def test_what_the_previous_release_has_queued_is_worked_off_first(redis: Redis, queue: JobQueue) -> None:
+    redis.rpush("rq:queue:regnf", "old-1", "old-2")
+    queue.enqueue_registration("j1", 1)
+    assert queue.holds_registration("old", 1)
+    queue.enqueue_registration("old", 1)
+    assert (listed(redis), lined(redis)) == ([b"old-1", b"old-2"], [b"j1-1"])
+    redis.lpop("rq:queue:regnf", 2)
+    queue.turn()
+    assert listed(redis) == [b"j1-1"]
 
 
 def test_stopping_a_waiting_job_leaves_nothing_of_it(redis: Redis, queue: JobQueue) -> None:
@@ -113,48 +139,12 @@ def test_stopping_a_waiting_job_leaves_nothing_of_it(redis: Redis, queue: JobQue
     for name in ("j1", "j3", "j9"):
         queue.stop(name, 1)
     assert (listed(redis), lined(redis)) == ([b"j2-1"], [])
-    assert [*redis.keys("*j1-1*"), *redis.keys("*j3-1*"), *redis.keys("*j9*")] == []
+    assert [*redis.keys("*j1-1*"), *redis.keys("*j3-1*")] == []
 
 
 def test_live_workers_are_those_that_reported_lately(redis: Redis, queue: JobQueue) -> None:
     assert queue.live_workers() == 0
-    for worker in ("host:a", "host:b", "host:c"):
-        queue.report(worker)
-    redis.zincrby("regnf:workers", -46, "host:b")
-    queue.sign_off("host:c")
-    assert (queue.workers(), queue.live_workers()) == (["host:a"], 1)
-    queue.report("host:a")
-    assert redis.zcard("regnf:workers") == 1, "the silent one is forgotten"
-
-
-def test_of_what_is_taken_only_a_name_of_ours_is_believed(any_redis: Redis) -> None:
-    """With a key only what was signed with it, for this very name and kind."""
-    key = "correct horse battery staple"
-    any_redis.flushall()
-    plain, signed, forged = (
-        JobQueue(any_redis),
-        JobQueue(any_redis, key),
-        JobQueue(any_redis, "another key, long enough"),
-    )
-    for number, (queue, reader, why) in enumerate(
-        [(plain, plain, None), (signed, signed, None), (plain, signed, "not signed"), (forged, signed, "not signed")]
-    ):
-        queue.enqueue_registration(f"j{number}", 1)
-        taken = reader.pop(0)
-        assert taken is not None
-        if why is None:
-            assert reader.work_of(taken) == Work("registration", f"j{number}", 1)
-        else:
-            with pytest.raises(ForeignWorkError, match=why):
-                reader.work_of(taken)
-    signed.enqueue_registration("a", 1)
-    stolen = any_redis.hget("regnf:queue:entry:a-1", "signature")
-    for name in ("b-1", "a-2"):
-        any_redis.hset(f"regnf:queue:entry:{name}", "signature", stolen)
-        with pytest.raises(ForeignWorkError, match="not signed"):
-            signed.work_of(Taken("registration", name))
-    any_redis.set("regnf:queue:entry:c-1", "no hash")
-    for name, why in (("c-1", "not a hash"), ("../c-1", "not a name"), ("\\xff", "not a name"), ("c", "not a name")):
-        with pytest.raises(ForeignWorkError, match=why):
-            plain.work_of(Taken("registration", name))
-    assert plain.work_of(Taken("registration", "unknown-1")) is None, "it was stopped meanwhile"
+    redis.sadd("rq:workers:regnf", "rq:worker:a", "rq:worker:b", "rq:worker:c")
+    redis.hset("rq:worker:a", "hostname", "h1")
+    redis.hset("rq:worker:b", mapping={"hostname": "h2", "death": "2026-01-01"})
+    assert queue.live_workers() == 1

@@ -51,4 +51,4 @@ def test_valkey_opens_what_redis_has_kept() -> None:
             kept = RecordStore(redis).get_job("j1")
             assert kept is not None
             assert kept.status == "accepted"
-            assert redis.lrange("regnf:queue:ready:registration", 0, -1) == [b"j1-1"]
+            assert redis.lrange("rq:queue:regnf", 0, -1) == [b"j1-1"]

@@ -7,9 +7,12 @@ from typing import Any
 import pytest
 from redis import Redis
 from redis.exceptions import RedisError
+from rq import Queue
+from rq.exceptions import StopRequested
 
 from regnf_state.queue import Work
 from regnf_state.records import FieldRecord
+from regnf_state.redis.queue import made
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.attempt import run_attempt
@@ -17,7 +20,7 @@ from regnf_worker.imports import run_import_attempt
 from regnf_worker.kernel import Scratch
 from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
-from regnf_worker.taking import MAX_WAIT_S, StopRequestedError, passes, retry_until_available
+from regnf_worker.resilient_worker import MAX_WAIT_S, passes, retry_until_available
 from tests.worker.doubles import SHA, accept, context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
@@ -39,7 +42,7 @@ def test_what_passes_is_waited_for(waits: list[float], error: RedisError) -> Non
     assert retry_until_available("it", Refusals(2, error, answer=3)) == 3
 
 
-@pytest.mark.parametrize("error", [LASTING, StopRequestedError(), ValueError()], ids=repr)
+@pytest.mark.parametrize("error", [LASTING, StopRequested(), ValueError()], ids=repr)
 def test_what_does_not_pass_is_raised_at_once(waits: list[float], error: Exception) -> None:
     do = Refusals(1, error)
     with pytest.raises(type(error)):
@@ -49,7 +52,7 @@ def test_what_does_not_pass_is_raised_at_once(waits: list[float], error: Excepti
 
 def test_who_is_told_to_stop_waits_no_longer(waits: list[float]) -> None:
     do = Refusals(9)
-    with pytest.raises(StopRequestedError):
+    with pytest.raises(StopRequested):
         retry_until_available("it", do, stopped=lambda: len(do.calls) == 3)
     assert len(do.calls) == 3
     assert retry_until_available("it", Refusals(0, answer=1), stopped=lambda: True) == 1, (
@@ -76,16 +79,18 @@ def worker(tmp_path: Path, any_redis: Redis, redis: RefusingRedis, monkeypatch: 
     return RegnfWorker(context, Scratch(tmp_path / "scratch"))
 
 
-JOB = Work("registration", "j1", 1)
+def execute(worker: RegnfWorker) -> None:
+    work = Work("registration", "j1", 1)
+    worker.execute_job(made(work, worker.connection), Queue(work.queue_name, connection=worker.connection))
 
 
 def test_a_job_taken_but_not_begun_is_left_to_the_reaper(worker: RegnfWorker, monkeypatch: pytest.MonkeyPatch) -> None:
     accept(worker._context)
     before = worker._context.records.get_job("j1")
-    monkeypatch.setattr(worker._queue, "begin", Refusals(9))
-    worker._stop(0, None)
-    with pytest.raises(StopRequestedError):
-        worker.execute(JOB)
+    monkeypatch.setattr("rq.worker.base.BaseWorker.prepare_execution", lambda *_: Refusals(9)())
+    worker._stop_requested = True
+    with pytest.raises(StopRequested):
+        execute(worker)
     assert worker._context.records.get_job("j1") == before
 
 
@@ -95,8 +100,9 @@ def test_a_job_is_settled_once_redis_takes_it(
     """The child died because Redis was full, and Redis is still full when its parent wants to say so."""
     accept(worker._context)
     refuse(monkeypatch, worker._context, "update_job", 3)
+    worker.register_birth()
     monkeypatch.setattr(worker, "_run_child", lambda *_: kernel.Exit(status=None))
-    worker.execute(JOB)
+    execute(worker)
     again = worker._context.records.get_job("j1")
     assert again is not None
     assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)

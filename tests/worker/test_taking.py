@@ -9,10 +9,10 @@ from redis import Redis
 
 from regnf_service.upkeep.reaper import Reaper
 from regnf_state.queue import Work
-from regnf_state.redis.queue import JobQueue, Taken
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import Settings
 from regnf_worker.models import Context
-from regnf_worker.taking import Taking
+from regnf_worker.resilient_worker import Taken, Taking
 from tests.worker.doubles import SHA, accept
 
 JOB = Work("registration", "j1", 1)
@@ -35,25 +35,25 @@ def import_again(context: Context) -> None:
 
 
 def taken(taking: Taking) -> Taken:
-    found = taking._queue.pop(0)
+    found = taking.pop(None)
     assert found is not None
     return found
 
 
 def test_what_can_run_is_handed_out(taking: Taking) -> None:
     assert taking.accept(taken(taking)) == JOB
-    assert taking._queue.pop(0) is None
+    assert taking.pop(None) is None
 
 
 def test_what_waits_for_an_import_is_put_aside(context: Context, any_redis: Redis, taking: Taking) -> None:
     import_again(context)
     assert taking.accept(taken(taking)) is None
-    assert taking._queue.pop(0) is None
+    assert taking.pop(None) is None
     assert context.queue.holds_registration("j1", 1)
     assert context.queue.awaited() == [SHA]
     reaper = Reaper(context.records, context.queue, any_redis, Settings())
     reaper.run_once()
-    assert taking._queue.pop(0) is None, "the import has not ended"
+    assert taking.pop(None) is None, "the import has not ended"
     context.records.update_field(SHA, state="ready")
     reaper.run_once()
     assert taking.accept(taken(taking)) == JOB, "although the worker that had the import died"

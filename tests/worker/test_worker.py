@@ -47,7 +47,7 @@ def test_a_job_succeeds(table: Bench) -> None:
         assert json.load(file)["pid"] not in (worker.pid, os.getpid()), "jobs have a process of their own"
     phases = [event.data["phase"] for event in table.context.records.events("j1", None)]
     assert phases == [None, "loading", "sampling", "optimizing", "exporting", "exporting"]
-    eventually(lambda: not table.redis.keys("regnf:queue:entry:*"), "the queue's forgetting the job")
+    eventually(lambda: not table.redis.keys("rq:job:*"), "the queue's forgetting the job")
     assert_next_job_runs(table)
 
 

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from redis.exceptions import RedisError
+from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from regnf_core.field_notes import FieldNotes
@@ -39,10 +40,9 @@ from regnf_worker.job_limits import (
     refusal,
     timeout,
 )
-from regnf_worker.kernel import TimeUpError
 from regnf_worker.models import Context, ObjectModels
 from regnf_worker.pictures import Published, finish_result, let_worker_go
-from regnf_worker.taking import retry_until_available
+from regnf_worker.resilient_worker import retry_until_available
 
 # What a job repeats of its fields' imports: in its result all of it, in its record the words of the warnings.
 
@@ -287,7 +287,7 @@ def _published(
         _fail(context, job_id, attempt, problem_document(error.reason))
     except RegnfError as error:
         _fail(context, job_id, attempt, refusal(error))
-    except TimeUpError:
+    except JobTimeoutException:
         _fail(context, job_id, attempt, timeout("JOB_TIMEOUT", context.settings.job_timeout_s))
     except Exception as error:
         if are_files_away(error):

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from redis.exceptions import RedisError
+from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import Candidate, FieldFormatError, RegnfError
 from regnf_state.blobs.base import StorageUnavailableError
@@ -20,9 +21,8 @@ from regnf_state.records import CANDIDATES, FieldRecord, SettingsFile, StaleAtte
 from regnf_state.room import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_worker.engine import Importer
 from regnf_worker.job_limits import are_files_away, fault, refusal, timeout
-from regnf_worker.kernel import TimeUpError
 from regnf_worker.models import Context
-from regnf_worker.taking import retry_until_available
+from regnf_worker.resilient_worker import retry_until_available
 
 _CLAIM_KEPT_S = 24 * 3600
 logger = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         _refuse(context, sha256, attempt, refusal(error), asked)
     except StaleAttemptError as error:
         _retire(context, sha256, attempt, error)
-    except TimeUpError:
+    except JobTimeoutException:
         _refuse(context, sha256, attempt, timeout("IMPORT_TIMEOUT", context.settings.import_timeout_s))
     except Exception as error:
         if are_files_away(error):

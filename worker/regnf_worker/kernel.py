@@ -12,8 +12,8 @@ import select
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, MutableMapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 from uuid import uuid4
@@ -90,25 +90,6 @@ def in_child(work: Callable[[], object]) -> bool:
         logger.error("no process could be made: %s", error)
         return False
     return os.waitpid(child, 0)[1] == 0
-
-
-class TimeUpError(Exception):
-    """The work has had its time."""
-
-
-@contextmanager
-def time_limit(seconds: int) -> Iterator[None]:
-    """Raises TimeUpError in what is done here once it has taken so many seconds of the wall clock."""
-
-    def end(signum: int, frame: object) -> None:  # noqa: ARG001 -- what handlers are given
-        raise TimeUpError
-
-    signal.signal(signal.SIGALRM, end)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
 
 
 def kill_group(pid: int) -> None:

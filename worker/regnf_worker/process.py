@@ -1,12 +1,8 @@
 """The worker process: takes ids from the queue, forks a child for each, limits it, and settles the job's record.
 
-Only two functions ever run, children end with the worker, time limits also stop native code, a Redis that is full or
-away does not end the worker, and after a child's death no record says that the job still runs. The worker never runs a
-torch operation itself: the forked children of a process that has hang.
-
-There are three kinds of calls of Redis. What must succeed before the worker continues, such as its sign of life, is
-repeated until Redis accepts it: a worker that cannot write takes nothing. What only tidies up is skipped. What is
-written while a child runs is never repeated: the child has time limits, which the worker must keep.
+It is RQ's forking worker, with these additions: only two functions ever run, children end with the worker, time limits
+also stop native code, and after a child's death no record says that the job still runs. The worker never runs a torch
+operation itself: the forked children of a process that has hang.
 """
 
 from __future__ import annotations
@@ -15,30 +11,34 @@ import logging
 import os
 import random
 import signal
-import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
-from uuid import uuid4
+from types import FrameType
+from typing import Any
 
 from redis.exceptions import RedisError
+from rq import Queue
+from rq.exceptions import StopRequested
+from rq.serializers import JSONSerializer
+from rq.timeouts import JobTimeoutException
+from rq.worker import WorkerStatus
 
 from regnf_core.importing.gate.child import LONGEST
-from regnf_state.queue import Kind, Work
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis.client import WORKER_RETRIES, connect, redis_address
-from regnf_state.redis.queue import JobQueue
+from regnf_state.redis.queue import JobQueue, made
 from regnf_worker import jobs, kernel, pictures
 from regnf_worker.job_limits import JobLimits, start_refused
 from regnf_worker.jobs import Draw, FieldDrawer
 from regnf_worker.kernel import Scratch
 from regnf_worker.models import Context, is_unmodeled_entry
 from regnf_worker.pictures import ChildAtPictures, Finishing, give_up_rest
+from regnf_worker.resilient_worker import ResilientWorker, Taking
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
-from regnf_worker.taking import StopRequestedError, Taking, retry_until_available
 
 Function = Callable[[str, int, str], None]
 """(job's id or field's reference, attempt, worker)."""
@@ -47,13 +47,13 @@ FUNCTIONS: Mapping[Kind, Function] = {"import": jobs.run_import, "registration":
 _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
 _IMPORT_MARGIN_S = 30
-_MONITOR_S = 1.0
+_FIRST_REPORT_S = 30
+_MONITOR_S = 1
 """How often the worker checks the child that it runs, and whether it shall stop."""
-_Value = TypeVar("_Value")
 logger = logging.getLogger(__name__)
 
 
-class RegnfWorker:
+class RegnfWorker(ResilientWorker):
     """One worker of the service."""
 
     def __init__(
@@ -64,7 +64,14 @@ class RegnfWorker:
         draw: Draw = jobs.run_drawing,
     ) -> None:
         redis = connect(redis_address(context.settings), retries=WORKER_RETRIES)
-        self.name = f"{socket.gethostname()}:{uuid4().hex}"
+        super().__init__(
+            [IMPORT_QUEUE_NAME, QUEUE_NAME],
+            connection=redis,
+            serializer=JSONSerializer,
+            worker_ttl=_FIRST_REPORT_S,
+            job_monitoring_interval=_MONITOR_S,
+            log_job_description=False,
+        )
         self._context = context
         self._scratch = scratch
         self._functions = functions
@@ -83,72 +90,65 @@ class RegnfWorker:
         self._give_back_at: float | None = None
         self._given_back = False
 
-    @property
-    def stopping(self) -> bool:
-        """Whether it was told to stop."""
-        return self._give_back_at is not None
-
     def serve(self) -> None:
         """Work until told to stop, be it while starting."""
-        signal.signal(signal.SIGINT, self._stop)
-        signal.signal(signal.SIGTERM, self._stop)
+        signal.signal(signal.SIGINT, self.request_stop)
+        signal.signal(signal.SIGTERM, self.request_stop)
         try:
-            while not self.stopping:
-                work = self.next_work()
-                if work is not None:
-                    self.execute(work)
-        except StopRequestedError:
-            pass
+            self.work(logging_level=None)
+        except StopRequested:
+            self.teardown()
         finally:
-            self._if_possible("signing off", lambda: self._queue.sign_off(self.name))
             self._drawer.end()
             self._finishing.end(self._context.settings.shutdown_grace_s)
 
-    def _stop(self, signum: int, frame: object) -> None:  # noqa: ARG002 -- what handlers are given
+    def request_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002 -- what handlers are given
         """A running job has ``shutdown_grace_s`` to end, then goes back to the queue. Told again: at once."""
-        grace_s = 0.0 if self.stopping else self._context.settings.shutdown_grace_s
+        grace_s = 0.0 if self._stop_requested else self._context.settings.shutdown_grace_s
         self._give_back_at = time.monotonic() + grace_s
+        self._stop_requested = True
 
-    def _until_available(self, what: str, do: Callable[[], _Value]) -> _Value:
-        return retry_until_available(what, do, stopped=lambda: self.stopping)
-
-    def _if_possible(self, what: str, do: Callable[[], object]) -> None:
-        try:
-            do()
-        except RedisError as error:
-            logger.warning("%s is skipped: %s", what, error)
-
-    def next_work(self) -> Work | None:
-        """What is to be done now, waited for for a second."""
-        self._until_available("a sign of life", lambda: self._queue.report(self.name))
-        taken = self._until_available("taking a job", partial(self._queue.pop, 0))
-        if taken is None:
-            self._drawer.go_on()
-            self._finishing.is_free()
-            self._scratch.drop_left()
-            taken = self._until_available("waiting for a job", partial(self._queue.pop, 1))
-        if taken is None:
-            return None
-        return self._until_available("looking at what was taken", partial(self._taking.accept, taken))
+    def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:  # noqa: ARG002
+        """The next job and its queue, waited for; None once told to stop, and without a ``timeout`` if none waits."""
+        self.set_state(WorkerStatus.IDLE)
+        while not self._stop_requested:
+            self.heartbeat()
+            if self.should_run_maintenance_tasks:
+                self.run_maintenance_tasks()
+            taken = self._until_available("taking a job", partial(self._taking.pop, None))
+            if taken is None and timeout is None:
+                return None
+            if taken is None:
+                self._drawer.go_on()
+                self._finishing.is_free()
+                self._scratch.drop_left()
+                taken = self._until_available("waiting for a job", partial(self._taking.pop, _MONITOR_S))
+            if taken is not None:
+                work = self._until_available("looking at what was taken", partial(self._taking.accept, taken))
+                if work is not None:
+                    return made(work, self.connection), Queue(work.queue_name, connection=self.connection)
+        return None
 
     # one job
 
-    def execute(self, work: Work) -> None:
+    def execute_job(self, job: Any, queue: Any) -> None:
         """Run one job in a child, limit it, and settle its record. A job that is taken and not begun is in no queue
         any more: the reaper puts it back.
         """
-        logger.info("%s: %s", work.kind, work.name)
+        work = Work.named(queue.name, job.id)
+        self.log.info("%s: %s", work.queue_name, work.name)
         self._started = time.monotonic()
         self._late = self._given_back = False
         self._because = None
         oom_kills = kernel.oom_kills()
-        self._until_available(f"taking up job {work.name}", lambda: self._queue.begin(work.name, self.name))
+        self._until_available(f"taking up job {work.name}", lambda: self.prepare_execution(job))
+        self._until_available(f"beginning job {work.name}", lambda: self.prepare_job_execution(job))
         was_entry = self._is_unmodeled(work, otherwise=True)
         folder = self._scratch.of_job()
-        end = self._run_child(work, folder)
+        end = self._run_child(job, work, folder)
         if end is not None:
             self._scratch.drop(folder)
-        self._if_possible(f"the queue's forgetting {work.name}", lambda: self._queue.end(work.name))
+        self._if_possible(f"closing RQ's entries on job {work.name}", lambda: self._drop_entries(job))
         if end is not None:
             self._settle(work, end, kernel.oom_kills() > oom_kills)
         if work.kind == "import":
@@ -165,7 +165,14 @@ class RegnfWorker:
             logger.warning("whether %s is an entry without a model is not known: %s", work.argument, error)
             return otherwise
 
-    def _run_child(self, work: Work, folder: Path) -> kernel.Exit | None:
+    def _drop_entries(self, job: Any) -> None:
+        """The outcome is written to the job's own record."""
+        with self.connection.pipeline() as pipeline:
+            self.cleanup_execution(job, pipeline)
+            pipeline.delete(job.key, f"rq:executions:{job.id}")
+            pipeline.execute()
+
+    def _run_child(self, job: Any, work: Work, folder: Path) -> kernel.Exit | None:
         """Fork a child for the job and wait for its end; None when it has said that the worker may go on."""
         limited = work.kind != "import"  # an import's process has limits of its own
         try:
@@ -176,11 +183,13 @@ class RegnfWorker:
             return kernel.Exit(None)
         with suppress(OSError):
             os.setpgid(child, child)  # the child does so too: whoever is first, before anybody kills its group
+        self._horse_pid = child
         while (exit_ := kernel.wait_for_exit(child, ended, _MONITOR_S)) is None:
             if self._must_end(work, child, folder, limited):
                 kernel.kill_group(child)
-            self._if_possible("a sign of life", lambda: self._queue.report(self.name))
+            self._if_possible(f"a sign of life of job {work.name}", lambda: self.maintain_heartbeats(job))
             self._finishing.is_free()
+        self._horse_pid = 0
         if exit_ == "spoken":
             self._let_finish(work, child, ended, folder)
             return None
@@ -194,8 +203,7 @@ class RegnfWorker:
         ended, held_by_child = os.pipe()
 
         def run() -> None:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            self.setup_work_horse_signals()  # type: ignore[no-untyped-call]
             os.setpgrp()
             kernel.prefer_as_oom_victim()
             os.close(ended)
@@ -204,7 +212,7 @@ class RegnfWorker:
                 self._job_limits.hold_here()
             self._scratch.use(folder)
             random.seed()
-            with kernel.time_limit(self._limits[work.kind]):
+            with self.death_penalty_class(self._limits[work.kind], JobTimeoutException):
                 self._functions[work.kind](work.argument, work.attempt, self.name)
 
         try:
@@ -225,11 +233,11 @@ class RegnfWorker:
 
         until = time.monotonic() + self._context.settings.lost_after_s
         while not self._finishing.is_free(_MONITOR_S):
-            self._if_possible("a sign of life", lambda: self._queue.report(self.name))
+            self._if_possible("a sign of life", self._report)
         self._finishing.take(ChildAtPictures(child, ended, until, settle))
 
     def _must_end(self, work: Work, child: int, folder: Path, limited: bool) -> bool:
-        """Whether the child was cancelled, is past its time limit or the time that a worker which stops grants it, or,
+        """Whether the child is past its time limit or the time that a worker which stops grants it, or,
         ``limited``, over a limit of its memory or disk space."""
         now_s = time.monotonic()
         self._late = now_s - self._started > self._limits[work.kind] + _LATE_GRACE_S
@@ -238,13 +246,7 @@ class RegnfWorker:
             return True
         if limited and self._because is None:
             self._because = self._job_limits.exceeded_by(child, folder)
-        if self._because is not None:
-            return True
-        try:
-            return not self._queue.goes_on(work.name, self.name)
-        except RedisError as error:
-            logger.warning("a sign of life of job %s is skipped: %s", work.name, error)
-            return False
+        return self._because is not None
 
     def _settle(self, work: Work, ended: kernel.Exit, out_of_memory: bool) -> None:
         status = ended.status
