@@ -17,7 +17,6 @@ from regnf_service.concurrency import portions
 from regnf_service.fields.ingest import room_for_bytes
 from regnf_service.jobs.edits import manifest_of, result_of
 from regnf_service.jobs.submit import FieldLookup, check_fields, future_job_id, start
-from regnf_service.library import check_budget
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch, Pair
@@ -100,7 +99,7 @@ class Posting:
             line.is_done = is_told and status in ("running", "successful")
 
     def require_room(self) -> None:
-        """Raises Problem QUOTA_ACTIVE_JOBS, QUOTA_STORED, QUOTA_ACTIVE_JOBS, QUEUE_FULL, QUOTA_WORKER_SECONDS.
+        """Raises Problem QUOTA_ACTIVE_JOBS, QUOTA_STORED, QUEUE_FULL.
 
         Then nothing is started.
         """
@@ -109,7 +108,6 @@ class Posting:
         new = {line.job for line in self.lines if line.is_new}
         if not new:
             return
-        check_budget(services, caller)
         free, reason = services.records.room_for_jobs(caller, services.settings.max_queued_jobs, services.quota)
         if len(new) > free:
             detail = f"The lines need {len(new)} new jobs; there is room for {free}. Nothing was started."

@@ -46,7 +46,7 @@ def test_patience_ends(slept: list[float]) -> None:
 @pytest.mark.parametrize(
     "answer",
     [
-        refusal(reason="QUOTA_WORKER_SECONDS"), refusal(after="121"), refusal(after=None), refusal(after="soon"),
+        refusal(reason="QUOTA_ACTIVE_JOBS"), refusal(after="121"), refusal(after=None), refusal(after="soon"),
         refusal(after="9" * 400), refusal(404, "JOB_NOT_FOUND"), refusal(507, "STORAGE_FULL"),
         refusal(409, "JOB_NOT_READY"),
         httpx.Response(429, text="<html>", headers={"Retry-After": "1"}),

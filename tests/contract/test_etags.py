@@ -34,8 +34,8 @@ def addresses(world: World) -> list[str]:
     job, known, asked = world.submit(), world.ready_field("a"), "a" * 64
     world.succeed(job, {"trace.json": b"[]"})
     now = world.records.now()
-    error = {"reason": "LAYOUT_AMBIGUOUS", "candidates": [{"picture": True}], "original_until": now + 60.0}
-    world.records.create_field(FieldRecord(asked, "rejected", 1, now, now, error=error))
+    error = {"reason": "LAYOUT_AMBIGUOUS", "candidates": [{"picture": True}]}
+    world.records.create_field(FieldRecord(asked, "rejected", 1, now, now, error=error, original_until=now + 60.0))
     places = [f"/fields/{known}/preview.png", f"/fields/{asked}/candidates/1.png"]
     for place in places:
         world.blobs.put(place[1:], b"a picture")

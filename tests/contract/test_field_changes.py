@@ -49,7 +49,7 @@ def imported(world: World, reason: str | None = None, asked: Sequence[Candidate]
         return tiny_importer(*given)
 
     reference, attempt = world.queue.imports[-1]
-    world.queue.fair.remove(Work("import", reference, attempt).name)
+    world.queue.remove(Work("import", reference, attempt).name)
     context = Context(world.settings, world.records, world.blobs, world.queue)
     run_import_attempt(context, reference, attempt, "w", importer)
 

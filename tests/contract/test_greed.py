@@ -96,39 +96,6 @@ def test_a_service_without_tokens_has_one_caller_who_may_have_all(world: World) 
     assert {answer.status_code for answer in answers} == {202}
 
 
-def spend(world: World, seconds: float) -> None:
-    """An import of the greedy one's takes so long, and fails."""
-    assert put(world.client, "costly").status_code == 201
-    reference = reference_of("greedy", sha256(field_bytes("costly")))
-    name = world.redis.lpop("rq:queue:regnf-import").decode()
-    assert name.startswith(f"import-{reference}-")
-    world.queue.fair.finish(name, seconds)
-    world.records.update_field(reference, state="rejected", error={"reason": "IMPORT_TIMEOUT"})
-
-
-def test_a_caller_whose_time_is_used_up_waits(shared: Callable[..., World]) -> None:
-    world = shared(quota_worker_seconds_per_hour=100)
-    request = imported(world, world.client, "greedy")
-    world.queue.lose()
-    earlier = world.client.post("/register", json=request).json()["id"]
-    world.queue.lose()
-    spend(world, 99.0)
-    assert world.client.post("/register", json=request | {"seed": 1}).status_code == 202
-    world.queue.lose()
-    spend(world, 1.0)
-    for answer in (
-        put(world.client, "another"),
-        world.client.post("/fields", content=field_bytes("another")),
-        put(world.client, "costly"),
-        world.client.post("/register", json=request | {"seed": 2}),
-    ):
-        assert_refused(answer, 429, "QUOTA_WORKER_SECONDS")
-        assert 3500 <= int(answer.headers["Retry-After"]) <= 3600
-    assert world.client.post("/register", json=request).json()["id"] == earlier, "what exists costs nothing"
-    with client_of(world.app, headers=HONEST) as honest:
-        assert put(honest, "another").status_code == 201
-
-
 def reject(world: World, caller: str, name: str, reason: str) -> None:
     """What a worker does with an upload that the gate refuses."""
     assert put(world.client, name).json()["state"] == "validating"

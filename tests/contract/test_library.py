@@ -79,7 +79,7 @@ def test_a_worker_is_asked_for_the_model_once(world: World) -> None:
     world.queue.imports.clear()
     add(world, chair)
     assert world.queue.imports == [(chair, 1)]
-    assert world.queue.fair.holds(Work("import", chair, 1).name)
+    assert world.queue.holds(Work("import", chair, 1).name)
     world.records.update_field(waiting, symmetry=FOUND)
     add(world, waiting, "table")
     assert world.queue.imports == [(chair, 1)], "its model was made by a job"

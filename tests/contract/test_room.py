@@ -125,14 +125,12 @@ def test_a_caller_s_oldest_finished_jobs_go_beyond_its_quota(tmp_path: Path, red
 
 
 def test_rounds_bring_all_callers_within_their_bounds(tmp_path: Path, redis: Redis) -> None:
-    """Those whom the release before has not noted, too."""
     world = served(tmp_path, redis, max_upload_bytes=4096)
     with world.client:
         requests = {caller: ready(world, caller) for caller in TOKENS}
         for caller, count in (("greedy", 6), ("honest", 2)):
             for seed in range(count):
                 register_and_cancel(world, caller, requests[caller], seed)
-        redis.delete("regnf:owners")
         room = Room(world.records, world.blobs, redis, world.settings.model_copy(update={"max_finished_jobs": 5}))
         assert room.tidy(lambda: None) == 3
         held = [len(world.client.get("/jobs", headers=TOKENS[caller]).json()["jobs"]) for caller in TOKENS]

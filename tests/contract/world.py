@@ -81,7 +81,7 @@ class World:
         answer = self.client.put(f"/fields/{sha256(data)}", content=data)
         assert answer.status_code == 201, answer.text
         self.blobs.delete(f"fields/{sha256(data)}/original")
-        self.queue.fair.remove(Work("import", sha256(data), 1).name)
+        self.queue.remove(Work("import", sha256(data), 1).name)
         self.records.update_field(sha256(data), attempt=1, state="ready", report={"bounds": bounds or BOUNDS})
         return sha256(data)
 

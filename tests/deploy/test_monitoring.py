@@ -44,7 +44,6 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         store.update_field("a" * 64, state="ready")
         for number in range(2):
             services.queue.enqueue_registration(f"j{number}", 1)
-        count(redis, "worker_seconds", "anonymous", "import")
         count(redis, "queue_payloads_refused", "regnf")
         count(redis, "jobs_evicted")
         count(redis, "records_unreadable", "job")

@@ -37,6 +37,8 @@ def queued(function: str = OURS, *arguments: Any, queue: str = "regnf", **option
     def attack(redis: Redis) -> None:
         chosen = {"job_id": "evil-1", "result_ttl": 0, "failure_ttl": 60} | options
         Queue(queue, connection=redis, serializer=JSONSerializer).enqueue(function, *(arguments or ["evil"]), **chosen)
+        key = f"rq:job:{chosen['job_id']}"
+        redis.hset(key, "data", zlib.decompress(redis.hget(key, "data")))  # as the service writes it
 
     return attack
 

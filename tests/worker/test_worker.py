@@ -297,9 +297,6 @@ def test_a_search_makes_pictures_where_they_are_wanted(table: Bench, pictures: b
 
 BEGINNINGS = [
     ("os:setpgrp", "OSError"),
-    ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
-    ("regnf_worker.kernel:give_way", "MemoryError"),
-    ("regnf_worker.resilient_worker:hold", "OSError"),
     ("regnf_worker.job_limits:JobLimits.hold_here", "ValueError"),
     ("regnf_worker.kernel:Scratch.use", "OSError"),
     ("random:seed", "KeyboardInterrupt"),

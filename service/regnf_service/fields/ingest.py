@@ -10,11 +10,10 @@ from regnf_core.field_source import Role, assumed_role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
-from regnf_service.library import check_budget
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
-from regnf_state.records import CAMERAS, ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
+from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
 from regnf_state.room import delete_upload, original_key, settings_key
 
 
@@ -123,8 +122,7 @@ def _known(services: Services, reference: str) -> FieldRecord | None:
 
 
 def check_workers(services: Services, caller: str) -> None:
-    """Refuse an import that the workers have no time for. Raises Problem QUOTA_ACTIVE_JOBS, QUOTA_WORKER_SECONDS."""
-    check_budget(services, caller)
+    """Refuse an import that the workers have no time for. Raises Problem QUOTA_ACTIVE_JOBS."""
     most = services.quota.imports
     if most is not None and services.records.importing(caller) >= most:
         detail = f"{most} of your imports wait or run. Wait for one to end."
@@ -145,7 +143,7 @@ async def store_upload(
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
     Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_ACTIVE_JOBS,
-    QUOTA_WORKER_SECONDS, and QuotaError.
+    and QuotaError.
     """
     beside = beside or Beside()
     reference = reference_of(caller, received.sha256)
@@ -193,7 +191,8 @@ def _field(services: Services, reference: str, upload: Upload, received: Receive
     error = services.records.known_rejection(field)
     if error is None:
         return field
-    return replace(field, state="rejected", error=services.originals.keep_with(error, rejected=True))
+    until = services.originals.kept_until(error["reason"])
+    return replace(field, state="rejected", error=error, original_until=until)
 
 
 def _record(services: Services, field: FieldRecord, beside: Beside) -> StoredUpload:
@@ -225,5 +224,4 @@ def _create(services: Services, field: FieldRecord) -> tuple[FieldRecord, bool]:
             delete_upload(services.blobs, field)
             if field.state != "rejected":
                 raise
-            error_alone = {name: value for name, value in (field.error or {}).items() if name != ORIGINAL_UNTIL}
-            return services.records.create_field(replace(field, error=error_alone))
+            return services.records.create_field(replace(field, original_until=None))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 from regnf_core.cost import Cost, Term, estimate
@@ -15,11 +14,10 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.rendering import request as rendering_cost
 from regnf_core.rendering.request import RENDERER_REVISION, RenderRequest
 from regnf_core.version import ENGINE_REVISION
-from regnf_service.library import check_budget
 from regnf_service.problem import Problem, json_pointer
 from regnf_service.services import Services
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
-from regnf_state.records import FieldRecord, JobRecord, RecordError, UnreadableRecordError
+from regnf_state.records import FieldRecord, JobRecord, RecordError
 from regnf_state.registration_request import JobRequest, RenderingRequest, estimated_cost, kind_of
 from regnf_state.settings import Settings
 
@@ -229,7 +227,7 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
     A job that exists tells the request's webhook of its end too; one that has finished, at once.
-    Raises Problem IDEMPOTENCY_KEY_REUSED, QUOTA_WORKER_SECONDS, QueueFullError, QuotaError, RecordsFullError.
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
     job_id = future_job_id(services, caller, asked)
@@ -239,7 +237,6 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
         existing = _earlier_answer(services, digest(key), job_id, request)
         if existing is not None:
             return existing
-    _require_budget(services, caller, job_id)
     (started,) = start(services, caller, [(job_id, asked)])
     if isinstance(started, RecordError):
         raise started
@@ -271,15 +268,6 @@ def start(
     # also jobs known before: mends one that was recorded but never queued
     services.queue.enqueue_jobs([job for job in started if isinstance(job, JobRecord) and job.status == "accepted"])
     return started
-
-
-def _require_budget(services: Services, caller: str, job_id: str) -> None:
-    """What exists already costs nothing more. Raises Problem QUOTA_WORKER_SECONDS."""
-    with suppress(UnreadableRecordError):
-        known = services.records.get_job(job_id)
-        if known is not None and known.status not in ("failed", "dismissed"):
-            return
-    check_budget(services, caller)
 
 
 def _earlier_answer(services: Services, key: str, job_id: str, request: JobRequest) -> JobRecord | None:

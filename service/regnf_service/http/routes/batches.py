@@ -55,7 +55,7 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
         },
         **refusals(
             "INVALID_QUERY INVALID_HEADER UNSUPPORTED_MEDIA_TYPE MALFORMED_JSON REQUEST_TOO_LARGE UPLOAD_INCOMPLETE "
-            "TOO_MANY_REQUESTS_AT_ONCE QUOTA_ACTIVE_JOBS QUOTA_STORED QUOTA_WORKER_SECONDS QUEUE_FULL STORAGE_FULL"
+            "TOO_MANY_REQUESTS_AT_ONCE QUOTA_ACTIVE_JOBS QUOTA_STORED QUEUE_FULL STORAGE_FULL"
         ),
     },
     openapi_extra={"requestBody": {"required": True, "content": {MEDIA_TYPE: _BODY}}},

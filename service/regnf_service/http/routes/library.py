@@ -77,7 +77,7 @@ def list_library(
     responses={
         200: {"description": "It was one, and says the same.", "model": EntryDocument},
         201: {"headers": {"Location": header("The entry.")}},
-        **refusals(_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY", "QUOTA_WORKER_SECONDS"),
+        **refusals(_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY"),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(NewEntry)}}}},
 )

@@ -14,7 +14,7 @@ from regnf_service.http.query import NEXT_PAGE
 from regnf_service.http.schemas.results import Incoming, Label, Links, Moment, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
-from regnf_state.records import CANDIDATES, DRAWINGS, ORIGINAL_UNTIL, VIEWS, FieldRecord
+from regnf_state.records import CANDIDATES, FieldRecord
 
 
 class SettingsDocument(Outgoing):
@@ -115,7 +115,7 @@ def field_document(record: FieldRecord, prefix: str, queue_position: int | None 
         "description": record.said,
         "settings": None if record.settings is None else record.settings._asdict(),
         "cameras": None if record.cameras is None else record.cameras._asdict(),
-        "report": _plain(record.report),
+        "report": record.report,
         "library": None if record.library is None else {name: record.library[name] for name in ("name", "tags")},
         "queue_position": queue_position,
         "error": None if record.error is None else outgoing_problem(_error(record, address)),
@@ -126,13 +126,8 @@ def field_document(record: FieldRecord, prefix: str, queue_position: int | None 
     }
 
 
-def _plain(said: dict[str, Any]) -> dict[str, Any]:
-    """A report or an error without what the document shows elsewhere."""
-    return {name: value for name, value in said.items() if name not in (ORIGINAL_UNTIL, VIEWS, DRAWINGS)}
-
-
 def _error(record: FieldRecord, address: str) -> dict[str, Any]:
-    error = _plain(record.error or {})
+    error = record.error or {}
     if CANDIDATES not in error:
         return error
     pictures = [
