@@ -48,6 +48,7 @@ _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
 _IMPORT_MARGIN_S = 30
 _FIRST_REPORT_S = 30
+"""A minute more than this, RQ counts a worker as live that has not reported yet."""
 _MONITOR_S = 1
 """How often the worker checks the child that it runs, and whether it shall stop."""
 logger = logging.getLogger(__name__)
