@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from redis.exceptions import ConnectionError as RedisConnectionError
 
 from regnf_core import __version__
-from regnf_state.settings import Settings
 from tests.cli.conftest import DATA, Run
 
 
@@ -18,7 +16,6 @@ def test_version_and_help(run: Run) -> None:
     assert run("--version").stdout.strip() == __version__
     assert run("--help").code == 0
     assert run("register", "--help").code == 0
-    assert run("unheard-of").code == 2
 
 
 def test_inspect_shows_a_field(run: Run) -> None:
@@ -39,17 +36,6 @@ def test_faulty_settings_are_named(
     assert outcome.stderr.startswith("INVALID_SETTINGS ")
     assert name.removeprefix("REGNF_").lower() in outcome.stderr.lower()
     assert value not in outcome.stderr
-
-
-def test_a_worker_without_its_redis_is_unavailable(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unreachable(settings: Settings) -> None:
-        raise RedisConnectionError(f"nobody at {settings.redis_url}")
-
-    monkeypatch.setattr("regnf_worker.main.run_worker", unreachable)
-    monkeypatch.setenv("REGNF_REDIS_URL", "")  # restored afterwards: the command sets it
-    outcome = run("worker", "--redis-url", "redis://127.0.0.1:9/0")
-    assert outcome.code == 3
-    assert outcome.stderr.startswith("REDIS_UNAVAILABLE ")
 
 
 def test_a_fit_says_which_faces_it_turned(run: Run, tmp_path: Path) -> None:

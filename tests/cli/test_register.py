@@ -117,27 +117,19 @@ def test_a_given_start(run: Run, exact: list[object], tmp_path: Path) -> None:
     assert outcome.stderr.startswith("INITIAL_TRANSFORM_UNSUPPORTED ")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{}",
-        '{"T_object_scene": {"scale": 2}}',
-        '{"T_object_scene": null}',
-        "[[1, 2], [3]]",
-        "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
-        "[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
-        '"abcd"',
-        "7",
-    ],
-)
+NO_TRANSFORMS = (
+    "{}", '{"T_object_scene": {"scale": 2}}', '{"T_object_scene": null}', "[[1, 2], [3]]", '"abcd"', "7",
+    "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
+    "[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("option", ["--initial-transform", "--ground-truth"])
-def test_a_file_without_a_transform_is_refused(
-    option: str, text: str, run: Run, exact: list[object], tmp_path: Path
-) -> None:
-    (tmp_path / "T.json").write_text(text)
-    outcome = run(*exact, option, tmp_path / "T.json")
-    assert outcome.code == 2
-    assert outcome.stderr.startswith("INVALID_TRANSFORM ")
+def test_a_file_without_a_transform_is_refused(option: str, run: Run, exact: list[object], tmp_path: Path) -> None:
+    for text in NO_TRANSFORMS:
+        (tmp_path / "T.json").write_text(text)
+        outcome = run(*exact, option, tmp_path / "T.json")
+        assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "INVALID_TRANSFORM"), text
 
 
 def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
@@ -150,18 +142,7 @@ def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
         read_options(file, "robust")
 
 
-@pytest.mark.parametrize(
-    ("detection", "said"),
-    [
-        ("[" * 100_000, "MALFORMED_JSON"),
-        ('{"min": [0, 0, 0]}', "box.json: detection.max is missing"),
-        ('{"center": [5, 5, 5], "size": [1, 1, 1]}', "DETECTION_OUTSIDE_SCENE"),
-        ('{"center": [0, 0, 0.9], "size": [1e-9, 1e-9, 1e-9]}', "NO_SURFACE_IN_DETECTION"),
-    ],
-)
-def test_detections_that_are_refused(detection: str, said: str, run: Run, exact: list[object], tmp_path: Path) -> None:
-    (tmp_path / "box.json").write_text(detection)
+def test_a_box_of_air_is_refused(run: Run, exact: list[object], tmp_path: Path) -> None:
+    (tmp_path / "box.json").write_text('{"center": [0, 0, 0.9], "size": [1e-9, 1e-9, 1e-9]}')
     outcome = run(*exact)
-    assert outcome.code == 2
-    assert said in outcome.stderr
-    assert outcome.stdout == ""
+    assert (outcome.code, outcome.stdout, "NO_SURFACE_IN_DETECTION" in outcome.stderr) == (2, "", True)

@@ -32,14 +32,6 @@ def test_fields_that_the_service_has_without_a_name_get_one(run: Run, demo: list
     assert asked.count("PATCH") == 2
 
 
-@pytest.mark.parametrize("stuck", ["fields", "jobs"])
-def test_nobody_waits_for_ever_for_a_worker(stuck: str, run: Run, demo: list[object], serve: Serve) -> None:
-    outcome = run(*demo, "--server", serve(without_worker(stuck)), "--worker-timeout", 0)
-    assert outcome.code == 3
-    assert "NO_WORKER " in outcome.stderr
-    assert "Traceback" not in outcome.stderr
-
-
 @pytest.mark.parametrize("checks", [{"worker": True, "storage": False}, {}, [], "?"])
 def test_a_worker_is_missing_only_where_the_service_says_so(
     checks: object, run: Run, demo: list[object], serve: Serve

@@ -29,6 +29,10 @@ CASES = [
     Case("detection a folder", "FILE_IS_FOLDER", 2, "nothing", "expected a file", "Give a file", [*REGISTER[:4], "nothing"]),
     Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON is expected", [*REGISTER[:4], "chair.safetensors"]),
     Case("output a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json"]),
+    Case("recording of another format", "INVALID_OPTIONS", 2, "chair.bin", ".rrd", "", [*REGISTER, "--recording", "chair.bin"]),
+    Case("recording a folder", "FILE_IS_FOLDER", 2, "folder.rrd", "", "", [*REGISTER, "--recording", "folder.rrd"], lambda folder: (folder / "folder.rrd").mkdir()),
+    Case("recording below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "", "", [*REGISTER, "--recording", "box.json/chair.rrd"]),
+    Case("recording of a service's job", "INVALID_OPTIONS", 2, "--recording", "", "", [*REGISTER, "--recording", "chair.rrd", "--server", "http://127.0.0.1:1"]),
     Case("output below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json/out"]),
     Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--ground-truth", "box.json"]),
     Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected safe fields", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
@@ -55,6 +59,7 @@ def test_a_wrong_command(case: Case, run: Run, folder: Path, monkeypatch: pytest
     if case.reason in ("ADDRESS_UNAVAILABLE", "PROXY_MISSING"):
         monkeypatch.setenv("REGNF_API_TOKENS", '["robot:0123456789abcdef0123456789abcdef"]')
         monkeypatch.setenv("REGNF_BEHIND_PROXY", str(case.reason == "ADDRESS_UNAVAILABLE"))
+    case.prepare(folder)
     outcome = run(*case.how)
     assert outcome.code == case.code, outcome.stderr
     assert case.reason in outcome.stderr
@@ -130,6 +135,7 @@ SERVERS = [
     Case("another JSON service", "SERVICE_ERROR", 2, "HTTP status 200|HTTP status 404", "no regnf service", "Check address", lambda method, path: (404, '{"message": "no"}')),
     Case("no token", "UNAUTHENTICATED", 2, "UNAUTHENTICATED", "token", "REGNF_API_TOKEN", refusing(401, {"reason": "UNAUTHENTICATED", "detail": "Send a token."})),
     Case("no worker", "NO_WORKER", 3, "no live worker", "for 0 s", "regnf worker", without_worker("jobs")),
+    Case("no worker for the fields", "NO_WORKER", 3, "no live worker", "for 0 s", "regnf worker", without_worker("fields")),
     Case("queue full", "QUEUE_FULL", 3, "QUEUE_FULL", "as many", "again later", refusing(503, {"reason": "QUEUE_FULL", "detail": "as many jobs as it takes"})),
     Case("a field that was rejected", "FIELD_SHAPES", 2, "chair.safetensors: wrong shapes", "wrong shapes", "another", lambda method, path: (200, field(path, state="rejected", error={"reason": "FIELD_SHAPES", "detail": "wrong shapes", "hint": "Try another."}))),
 ]  # fmt: skip
