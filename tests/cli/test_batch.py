@@ -58,8 +58,7 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
         pair(key="search", object=None, candidates=["dining-chair.safetensors", "armchair.safetensors"]),
     ]
     path = write(folder, lines)
-    outcome = run("batch", path, "--processes", 1)
-    assert outcome.code == 1, outcome.stderr
+    outcome = run("batch", path, "--processes", 1, code=1)
     found = {one["line"]: one for one in results(path)}
     reasons = {line: one["error"]["reason"] for line, one in found.items() if one["status"] == "failed"}
     assert reasons == {2: "DETECTION_OUTSIDE_SCENE", 3: "MALFORMED_JSON", 4: "FILE_NOT_FOUND"}

@@ -53,8 +53,7 @@ def test_a_command_says_which_extra_it_lacks(
 ) -> None:
     (extra,) = [name for name, modules in MODULES.items() if module in modules]
     monkeypatch.setitem(sys.modules, module, None)
-    outcome = run(*command)
-    assert outcome.code == 3
+    outcome = run(*command, code=3)
     assert outcome.stderr.strip() == f"EXTRA_MISSING not installed: {module}; pip install 'regnf[{extra}]'"
 
 

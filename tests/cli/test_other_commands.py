@@ -19,8 +19,7 @@ def test_version_and_help(run: Run) -> None:
 
 
 def test_inspect_shows_a_field(run: Run) -> None:
-    outcome = run("inspect", DATA / "armchair.safetensors")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run("inspect", DATA / "armchair.safetensors", code=0)
     assert "plausibility:" in outcome.stdout
     assert re.search(r"^parameters +\d{5,}$", outcome.stdout, re.MULTILINE)
 
@@ -31,8 +30,7 @@ def test_faulty_settings_are_named(
     command: str, name: str, value: str, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(name, value)
-    outcome = run(command)
-    assert outcome.code == 2
+    outcome = run(command, code=2)
     assert outcome.stderr.startswith("INVALID_SETTINGS ")
     assert name.removeprefix("REGNF_").lower() in outcome.stderr.lower()
     assert value not in outcome.stderr
@@ -44,8 +42,7 @@ def test_a_fit_says_which_faces_it_turned(run: Run, tmp_path: Path) -> None:
     top = trimesh.creation.box(bounds=[[-1.0, -1.0, 0.8], [1.0, 1.0, 1.0]])
     trimesh.util.concatenate([top, leg]).export(tmp_path / "table.ply")
     outcome = run(
-        "fit", tmp_path / "table.ply", tmp_path / "field.safetensors", "--iterations", "1", "--table-log2", "10"
+        "fit", tmp_path / "table.ply", tmp_path / "field.safetensors", "--iterations", "1", "--table-log2", "10", code=0
     )
-    assert outcome.code == 0, outcome.stderr
     assert "table.ply: " in outcome.stderr
     assert "turned round" in outcome.stderr

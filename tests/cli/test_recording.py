@@ -13,8 +13,7 @@ from tests.core.viewing.test_recording import matrix_of, rows_of
 
 def test_the_recording_is_the_only_file(run: Run, demo: list[object], tmp_path: Path) -> None:
     path = tmp_path / "new" / "chair.rrd"
-    outcome = run(*demo, "--json", "--recording", path)
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(*demo, "--json", "--recording", path, code=0)
     assert [one.name for one in path.parent.iterdir()] == ["chair.rrd"]
     document = json.loads(outcome.stdout)
     rows = rows_of(path)

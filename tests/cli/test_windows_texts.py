@@ -182,8 +182,7 @@ def test_failed_rows_are_shown(run: Run, tmp_path: Path) -> None:
     rows = ["room.ply,chair.ply,box.json"] * 9 + ["room.ply,chair.ply,nothing.json", "room.ply,chair.ply,box.json,5"]
     path = tmp_path / "pairs.csv"
     path.write_text("\n".join(["scene,object,detection", *rows]))
-    outcome = run("batch", path, "--processes", 1)
-    assert outcome.code == 1
+    outcome = run("batch", path, "--processes", 1, code=1)
     assert "11 failed" in outcome.stdout
     told = " ".join(outcome.stderr.split())
     assert "FILE_NOT_FOUND 10 pairs, lines 2, 3, 4, 5, 6 and 5 more; the first:" in told

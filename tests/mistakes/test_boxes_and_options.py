@@ -59,8 +59,7 @@ def test_a_wrong_box(case: Case, run: Run, folder: Path, monkeypatch: pytest.Mon
     """It is refused before any field is opened: there is nothing left that could open one."""
     monkeypatch.delattr("regnf_core.loading.load_field")
     (folder / "b.json").write_text(case.how)
-    outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "b.json")
-    assert outcome.code == case.code, outcome.stderr
+    outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "b.json", code=case.code)
     assert outcome.stderr.startswith(case.reason)
     assert outcome.stdout == ""
     case.check(outcome.stderr)
@@ -69,8 +68,16 @@ def test_a_wrong_box(case: Case, run: Run, folder: Path, monkeypatch: pytest.Mon
 @parametrized(OPTIONS)
 def test_wrong_options(case: Case, run: Run, folder: Path) -> None:
     (folder / "o.json").write_text(case.how)
-    outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "box.json", "--options", "o.json")
-    assert outcome.code == case.code, outcome.stderr
+    outcome = run(
+        "register",
+        "room.safetensors",
+        "chair.safetensors",
+        "--detection",
+        "box.json",
+        "--options",
+        "o.json",
+        code=case.code,
+    )
     assert outcome.stderr.startswith(case.reason)
     assert outcome.stderr.count("\n") == 2  # the message and the hint, however narrow the terminal
     case.check(outcome.stderr)
@@ -78,8 +85,7 @@ def test_wrong_options(case: Case, run: Run, folder: Path) -> None:
 
 def test_swapped_scene_and_object(run: Run, folder: Path) -> None:
     (folder / "far.json").write_text(json.dumps({"center": [1.1, 1.1, 0.0], "size": [0.3, 0.3, 0.3]}))
-    outcome = run("register", "chair.safetensors", "room.safetensors", "--detection", "far.json")
-    assert outcome.code == 2
+    outcome = run("register", "chair.safetensors", "room.safetensors", "--detection", "far.json", code=2)
     assert outcome.stderr.startswith("DETECTION_OUTSIDE_SCENE chair.safetensors: the box is")
     assert "are scene and object swapped?" in outcome.stderr
 
@@ -87,8 +93,7 @@ def test_swapped_scene_and_object(run: Run, folder: Path) -> None:
 def test_the_same_file_twice(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("regnf_cli.registration.register_here", lambda *_: {"verdict": "rejected"})
     monkeypatch.setattr("regnf_cli.report.show_result", lambda _: None)
-    outcome = run("register", "room.safetensors", "room.safetensors", "--detection", "box.json")
-    assert outcome.code == 1
+    outcome = run("register", "room.safetensors", "room.safetensors", "--detection", "box.json", code=1)
     assert "warning: scene and object are the same file, room.safetensors" in outcome.stderr
 
 

@@ -72,8 +72,9 @@ def ends_in_order(service: Service, number: signal.Signals = signal.SIGTERM) -> 
     assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in service.log()] == []
 
 
-def test_a_service_that_has_just_begun_ends_in_order(tmp_path: Path) -> None:
+def test_a_signal_ends_everything_in_order(tmp_path: Path) -> None:
     with started(tmp_path / "state") as service:
+        service.await_ready()
         ends_in_order(service)
 
 
@@ -146,7 +147,6 @@ def test_whoever_waits_is_answered_before_the_end_and_the_next_service_has_their
         assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
     with started(tmp_path / "state", *NO_WORKER) as following:
         assert httpx.get(f"{following.address}/fields/{scene}").json()["state"] == "validating"
-        following.await_ready()
         ends_in_order(following, signal.SIGINT)
 
 
