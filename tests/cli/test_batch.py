@@ -73,6 +73,10 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
 def test_a_file_that_holds_no_results_is_left_as_it_is(run: Run, folder: Path) -> None:
     path = write(folder, [pair()])
     other = folder / "notes.txt"
+    for torn in ("", "{", '{"id": "b'):
+        other.write_text(torn)
+        ResultsFile(other)
+        assert other.read_text() == "", "a first line that is torn is cut off"
     for held in (b"not mine\n", b"not mine", b"\xa0\0\n\xff", b'{"id": "a", "status": "successful"}\nmine'):
         other.write_bytes(held)
         outcome = run("batch", path, "--output", other)
@@ -145,14 +149,6 @@ def test_a_second_run_does_what_is_left(run: Run, folder: Path, monkeypatch: pyt
     write(folder, [pair(seed=3), pair(seed=1)])
     assert run("batch", path, "--processes", 1).code == 0
     assert done == [1, 2, 2, 3], "both were done, wherever they stand now"
-
-
-@pytest.mark.parametrize("torn", ["", "{", '{"id": "b'])
-def test_a_first_line_that_is_torn_is_cut_off(torn: str, tmp_path: Path) -> None:
-    path = tmp_path / "results.jsonl"
-    path.write_text(torn)
-    ResultsFile(path)
-    assert path.read_text() == ""
 
 
 def test_several_processes_find_the_same(folder: Path) -> None:

@@ -31,9 +31,7 @@ def test_a_page_is_printed_as_it_is_written(run: Run) -> None:
 def test_every_page_that_a_message_names_is_there() -> None:
     pages = pages_of(folder())
     sources = [path for top in ("regnf_cli", "regnf_core", "regnf_state") for path in (ROOT / top).rglob("*.py")]
-    named = {
-        name for text in [*(path.read_text() for path in sources), *HINTS.values()] for name in NAMED.findall(text)
-    }
+    named = set(NAMED.findall("\n".join([*(path.read_text() for path in sources), *HINTS.values()])))
     assert {"families", "import-gate", "how-to/symmetry"} <= named
     assert {name for name in named if not name.startswith("adr/")} <= set(pages)
 

@@ -46,29 +46,19 @@ def test_a_worker_is_missing_only_where_the_service_says_so(
 
 
 def test_the_watch_counts_only_an_absence_without_a_break() -> None:
-    now, lives, looks = [100.0], [True], []
-
-    def look_at(seconds: float) -> None:
+    now, looks = [100.0], []
+    watch = WorkerWatch(60.0, clock=lambda: now[0])
+    there, absent = [(100.0, True), (104.9, True)], [(105.0, False), (164.0, False), (169.0, True), (174.0, False)]
+    for seconds, lives in [*there, *absent, (230.0, False), (233.9, False)]:
         now[0] = seconds
         if watch.due:
             looks.append(seconds)
-            watch.saw(lives[0])
-
-    watch = WorkerWatch(60.0, clock=lambda: now[0])
-    look_at(100.0)
-    look_at(104.9)
-    assert looks == [100.0], "not more often than every five seconds"
-    lives[0] = False
-    look_at(105.0)
-    look_at(164.0)
-    lives[0] = True
-    look_at(169.0)
-    lives[0] = False
-    look_at(174.0)
-    look_at(230.0)
-    look_at(233.9)
+            watch.saw(lives)
+    assert looks[:2] == [100.0, 105.0], "not more often than every five seconds"
+    now[0] = 234.0
+    assert watch.due
     with pytest.raises(NoWorkerError, match="60 s"):
-        look_at(234.0)
+        watch.saw(False)
 
 
 def test_artifacts_stay_in_the_folder(run: Run, demo: list[object], serve: Serve, tmp_path: Path) -> None:
