@@ -215,4 +215,3 @@ def test_a_real_run_is_inspected_in_an_archive(run: Run, tmp_path: Path) -> None
     outcome = run("inspect", archive, "--json", code=0)
     report = json.loads(outcome.stdout)
     assert (report["family"], report["settings"]["trainer"]) == ("neus", "NeuS")
-    assert "recording/config.conf\n" in outcome.stderr
