@@ -38,12 +38,23 @@ def test_a_whole_installation(quick: None, run: Run) -> None:
     assert code in (0, 3)  # a machine may be short of memory
 
 
-def test_a_redis_that_does_not_answer(quick: None, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REGNF_REDIS_URL", "redis://:secret@127.0.0.1:1/0")
+@pytest.mark.parametrize(
+    ("name", "value", "subject", "said"),
+    [
+        ("REGNF_REDIS_URL", "redis://:secret@127.0.0.1:1/0", "redis", "Start it"),
+        ("REGNF_PORT", "eighty", "settings", "REGNF_PORT"),
+    ],
+)
+def test_a_redis_that_does_not_answer_and_a_faulty_setting(
+    quick: None, run: Run, monkeypatch: pytest.MonkeyPatch, name: str, value: str, subject: str, said: str
+) -> None:
+    monkeypatch.setenv(name, value)
     code, found = findings_of(run)
-    assert (code, found["redis"]["state"]) == (3, "error")
-    assert "REGNF_REDIS_URL" in found["redis"]["hint"]
-    assert "secret" not in str(found)
+    assert (code, found[subject]["state"], name in str(found[subject])) == (3, "error", True)
+    told = run("doctor").stdout
+    assert f"{subject}: " in told
+    assert said in told
+    assert "secret" not in str(found) + told
 
 
 def test_how_fields_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,20 +67,6 @@ def test_how_fields_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(library.SWITCH, "0")
     (found,) = doctor.check_native()
     assert found.found == "torch: compiled code is off, REGNF_NATIVE is 0"
-
-
-def test_a_faulty_setting(quick: None, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REGNF_PORT", "eighty")
-    code, found = findings_of(run)
-    assert (code, found["settings"]["state"]) == (3, "error")
-    assert "REGNF_PORT" in found["settings"]["found"]
-
-
-def test_in_words(quick: None, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REGNF_REDIS_URL", "redis://127.0.0.1:1/0")
-    done = run("doctor")
-    assert done.code == 3
-    assert "redis: Start it" in done.stdout
 
 
 def test_a_port_that_is_taken() -> None:

@@ -18,8 +18,7 @@ def test_a_dataset_becomes_a_field_with_snapshots_and_a_checkpoint(run: Run, tmp
     write_dataset(scenes.images(count=3), tmp_path / "images")
     output, exported = tmp_path / "two.safetensors", tmp_path / "two.ckpt"
     more = ("--snapshots", "10,50", "--sdfstudio", exported, "--start", "object", "--label", "two")
-    outcome = run("fit", tmp_path / "images", output, *SMALL, *more)
-    assert outcome.code == 0, outcome.stderr
+    outcome = run("fit", tmp_path / "images", output, *SMALL, *more, code=0)
     assert "eikonal_error" in outcome.stdout
     assert read_description(output)["label"] == "two"
     names = {"images", "two.safetensors", "two.ckpt", "config.yml", "two-after-10-percent.safetensors"}
@@ -28,8 +27,9 @@ def test_a_dataset_becomes_a_field_with_snapshots_and_a_checkpoint(run: Run, tmp
 
 def test_a_dataset_becomes_a_map(run: Run, tmp_path: Path) -> None:
     write_dataset(scenes.images(count=3), tmp_path / "images")
-    outcome = run("fuse", tmp_path / "images", tmp_path / "map.safetensors", "--voxel", "0.02", "--label", "two")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(
+        "fuse", tmp_path / "images", tmp_path / "map.safetensors", "--voxel", "0.02", "--label", "two", code=0
+    )
     assert "depth_error_median" in outcome.stdout
     description = read_description(tmp_path / "map.safetensors")
     assert (description["label"], description["kind"]) == ("two", "voxel_blocks")
@@ -72,10 +72,8 @@ def test_cameras_of_opengl_are_refused_and_the_option_takes_them(run: Run, tmp_p
     images = recording(8)
     write_dataset(replace(images, T_world_camera=images.T_world_camera @ OPENGL), tmp_path / "images")
     command = "fuse", tmp_path / "images", tmp_path / "map.safetensors", "--voxel", "0.06"
-    refused = run(*command)
-    assert refused.code == 2
+    refused = run(*command, code=2)
     assert "DATASET_FRAMES_DISAGREE" in refused.stderr
     assert "--camera-axes opengl" in " ".join(refused.stderr.split())
-    outcome = run(*command, "--camera-axes", "opengl")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(*command, "--camera-axes", "opengl", code=0)
     assert "warning" not in outcome.stdout + outcome.stderr

@@ -53,8 +53,7 @@ def symmetric(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
 
 
 def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[object], tmp_path: Path) -> None:
-    outcome = run(*exact, "--json", "--output", tmp_path / "new" / "out")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(*exact, "--json", "--output", tmp_path / "new" / "out", code=0)
     document = json.loads(outcome.stdout)
     assert document["verdict"] == "registered"
     assert document["metrics"]["rotation_error_rad"] < 0.03
@@ -69,15 +68,13 @@ def test_a_rejected_registration_ends_with_1(run: Run, exact: list[object], tmp_
     (tmp_path / "options.json").write_text('{"optimization": {"iterations": 1}}')
     far = {"T_scene_object": {"matrix": np.eye(4).tolist()}}
     (tmp_path / "truth.json").write_text(json.dumps(far))  # as results spell it
-    outcome = run(*exact, "--preset", "paper", "--options", tmp_path / "options.json")
-    assert outcome.code == 1, outcome.stderr
+    outcome = run(*exact, "--preset", "paper", "--options", tmp_path / "options.json", code=1)
     assert outcome.stdout.startswith("verdict      rejected")
     assert "rotation_error_rad" in outcome.stdout
 
 
 def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: Run, symmetric: list[object]) -> None:
-    outcome = run(*symmetric)
-    assert outcome.code == 4, outcome.stderr
+    outcome = run(*symmetric, code=4)
     said = outcome.stdout
     assert said.startswith("verdict      ambiguous  (SEVERAL_POSES_AGREE)")
     assert VERDICT_REASONS["SEVERAL_POSES_AGREE"] in said
@@ -108,36 +105,26 @@ def test_a_given_start(run: Run, exact: list[object], tmp_path: Path) -> None:
     near = chair_pose().matrix()
     near[0, 3] += 0.02
     (tmp_path / "start.json").write_text(json.dumps({"T_object_scene": {"matrix": near.tolist()}}))
-    outcome = run(*exact, "--json", "--initial-transform", tmp_path / "start.json")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(*exact, "--json", "--initial-transform", tmp_path / "start.json", code=0)
     assert json.loads(outcome.stdout)["metrics"]["rotation_error_rad"] < 0.01
     (tmp_path / "start.json").write_text(json.dumps(np.eye(4).tolist()))
-    outcome = run(*exact, "--preset", "paper", "--initial-transform", tmp_path / "start.json")
-    assert outcome.code == 2
+    outcome = run(*exact, "--preset", "paper", "--initial-transform", tmp_path / "start.json", code=2)
     assert outcome.stderr.startswith("PRESET_UNSUITABLE ")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{}",
-        '{"T_object_scene": {"scale": 2}}',
-        '{"T_object_scene": null}',
-        "[[1, 2], [3]]",
-        "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
-        "[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
-        '"abcd"',
-        "7",
-    ],
-)
+NO_TRANSFORMS = (
+    "{}", '{"T_object_scene": {"scale": 2}}', '{"T_object_scene": null}', "[[1, 2], [3]]", '"abcd"', "7",
+    "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
+    "[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("option", ["--initial-transform", "--ground-truth"])
-def test_a_file_without_a_transform_is_refused(
-    option: str, text: str, run: Run, exact: list[object], tmp_path: Path
-) -> None:
-    (tmp_path / "T.json").write_text(text)
-    outcome = run(*exact, option, tmp_path / "T.json")
-    assert outcome.code == 2
-    assert outcome.stderr.startswith("INVALID_TRANSFORM ")
+def test_a_file_without_a_transform_is_refused(option: str, run: Run, exact: list[object], tmp_path: Path) -> None:
+    for text in NO_TRANSFORMS:
+        (tmp_path / "T.json").write_text(text)
+        outcome = run(*exact, option, tmp_path / "T.json")
+        assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "INVALID_TRANSFORM"), text
 
 
 def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
@@ -150,18 +137,7 @@ def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
         read_options(file, "robust")
 
 
-@pytest.mark.parametrize(
-    ("detection", "said"),
-    [
-        ("[" * 100_000, "MALFORMED_JSON"),
-        ('{"min": [0, 0, 0]}', "box.json: detection.max is missing"),
-        ('{"center": [5, 5, 5], "size": [1, 1, 1]}', "DETECTION_OUTSIDE_SCENE"),
-        ('{"center": [0, 0, 0.9], "size": [1e-9, 1e-9, 1e-9]}', "NO_SURFACE_IN_DETECTION"),
-    ],
-)
-def test_detections_that_are_refused(detection: str, said: str, run: Run, exact: list[object], tmp_path: Path) -> None:
-    (tmp_path / "box.json").write_text(detection)
+def test_a_box_of_air_is_refused(run: Run, exact: list[object], tmp_path: Path) -> None:
+    (tmp_path / "box.json").write_text('{"center": [0, 0, 0.9], "size": [1e-9, 1e-9, 1e-9]}')
     outcome = run(*exact)
-    assert outcome.code == 2
-    assert said in outcome.stderr
-    assert outcome.stdout == ""
+    assert (outcome.code, outcome.stdout, "NO_SURFACE_IN_DETECTION" in outcome.stderr) == (2, "", True)

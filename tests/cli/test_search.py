@@ -29,8 +29,7 @@ def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_the_right_chair_comes_first(run: Run, tmp_path: Path) -> None:
-    outcome = run(*DEMO, "--json", "--output", tmp_path / "out")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(*DEMO, "--json", "--output", tmp_path / "out", code=0)
     document = json.loads(outcome.stdout)
     assert (document["object"], document["verdict"]) == (str(CHAIRS[1]), "registered")
     assert [one["object"] for one in document["candidates"]] == [str(CHAIRS[1]), str(CHAIRS[0])]
@@ -41,18 +40,9 @@ def test_the_right_chair_comes_first(run: Run, tmp_path: Path) -> None:
     assert len(list((tmp_path / "cache" / "regnf" / "object-models").iterdir())) == 2
 
 
-def test_a_model_of_an_older_engine_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "cache" / "regnf" / "object-models"
-    object_model(find_source(CHAIRS[0]), RobustOptions())
-    (kept,) = folder.iterdir()
-    kept.write_bytes(b"of an older engine")
-    monkeypatch.setattr(object_models, "ENGINE_REVISION", object_models.ENGINE_REVISION + 1)
-    object_model(find_source(CHAIRS[0]), RobustOptions())
-    assert kept.read_bytes() == b"of an older engine"
-    assert len(list(folder.iterdir())) == 2
-
-
-def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) -> None:
+def test_a_model_is_kept_and_made_again_when_it_does_not_read_or_is_of_an_older_engine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = object_model(find_source(CHAIRS[0]), RobustOptions())
     (kept,) = (tmp_path / "cache" / "regnf" / "object-models").iterdir()
     again = object_model(find_source(CHAIRS[0]), RobustOptions())
@@ -65,6 +55,12 @@ def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) ->
     few = object_model(find_source(CHAIRS[0]), RobustOptions(object_samples=300))
     assert len(few.samples) < len(first.samples)
     assert list(kept.parent.iterdir()) == [kept]
+    kept.unlink()
+    kept.write_bytes(b"of an older engine")
+    monkeypatch.setattr(object_models, "ENGINE_REVISION", object_models.ENGINE_REVISION + 1)
+    object_model(find_source(CHAIRS[0]), RobustOptions())
+    assert kept.read_bytes() == b"of an older engine"
+    assert len(list(kept.parent.iterdir())) == 2
 
 
 def test_what_is_no_library(tmp_path: Path) -> None:
@@ -95,8 +91,7 @@ def test_a_library_is_the_fields_of_its_folders_each_once(tmp_path: Path) -> Non
 
 def test_the_published_method_searches_nothing(run: Run, tmp_path: Path) -> None:
     (tmp_path / "options.json").write_text('{"preset": "paper"}')
-    outcome = run(*DEMO, "--options", tmp_path / "options.json")
-    assert outcome.code == 2
+    outcome = run(*DEMO, "--options", tmp_path / "options.json", code=2)
     assert outcome.stderr.startswith("PRESET_UNSUITABLE ")
 
 
@@ -106,13 +101,9 @@ def candidate(name: str, stage: str, score: float | None, verdict: str | None = 
 
 
 def test_a_ranking_is_printed_as_far_as_asked(capfd: pytest.CaptureFixture[str]) -> None:
-    ranking = [
-        candidate("[a]", "refined", 0.01, "registered"),
-        candidate("b", "coarse", 0.2),
-        candidate("c", "signature", None),
-        candidate("air", "unusable", None),
-    ]
-    show_ranking({"candidates": ranking}, 2)
+    first, second = candidate("[a]", "refined", 0.01, "registered"), candidate("b", "coarse", 0.2)
+    rest = [candidate("c", "signature", None), candidate("air", "unusable", None)]
+    show_ranking({"candidates": [first, second, *rest]}, 2)
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]
     assert lines[2:] == [
         ["1", "[a]", "0.0100", "registered", "(BECAUSE)"],
@@ -133,8 +124,7 @@ def searching() -> Answers:
 
 
 def test_a_search_on_a_server_names_the_files(run: Run, serve: Serve) -> None:
-    outcome = run(*DEMO, "--server", serve(searching()), "--json")
-    assert outcome.code == 4, outcome.stderr
+    outcome = run(*DEMO, "--server", serve(searching()), "--json", code=4)
     document = json.loads(outcome.stdout)
     assert document["object"] == str(CHAIRS[1])
     assert [one["object"] for one in document["candidates"]] == [str(CHAIRS[1]), str(CHAIRS[0])]

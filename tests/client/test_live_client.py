@@ -48,9 +48,7 @@ def test_a_pose_from_files(found: Result) -> None:
     point = np.array([[0.1, 0.2, 0.3]])
     assert np.allclose(found.apply(point), point @ TRUTH[:3, :3].T + TRUTH[:3, 3], atol=0.01)
     assert np.allclose(found.T_scene_object @ found.T_object_scene, np.eye(4), atol=1e-9)
-    assert found.covariance is not None
-    assert found.covariance.shape == (7, 7)
-    assert found.source == str(CHAIR)
+    assert (np.shape(found.covariance), found.source) == ((7, 7), str(CHAIR))
 
 
 def test_fields_that_the_service_has_are_not_sent(live_stack: Live, found: Result) -> None:
@@ -65,8 +63,7 @@ def test_what_a_box_may_be(client: Client) -> None:
     low, high = np.array(BOX["center"]) - np.array(BOX["size"]) / 2, np.array(BOX["center"]) + np.array(BOX["size"]) / 2
     jobs = [client.submit(ROOM, CHAIR, box, QUICK) for box in (BOX, (low, high), {"min": low, "max": high})]
     assert len({job.id for job in jobs[1:]}) == 1
-    assert client.wait(jobs[0]).finished
-    assert client.wait(jobs[1]).finished
+    assert all(client.wait(job).finished for job in jobs[:2])
 
 
 def test_files_of_a_result(client: Client, found: Result, tmp_path: Path) -> None:
@@ -128,10 +125,8 @@ def test_searches_and_batches_of_one_scene(client: Client) -> None:
     assert {one.source for one in ranked.candidates} == {str(ROOM), str(CHAIR)}
     outcomes = client.register_batch(ROOM, [BOX, FAR], [CHAIR], options=UPRIGHT, seed=4713)
     assert [(one.detection, one.object) for one in outcomes] == [(0, 0), (1, 0)]
-    assert outcomes[0].result is not None
-    assert outcomes[1].result is None
-    assert outcomes[1].error is not None
-    assert outcomes[1].error.reason == "DETECTION_OUTSIDE_SCENE"
+    assert [one.result is None for one in outcomes] == [False, True]
+    assert [one.error and one.error.reason for one in outcomes] == [None, "DETECTION_OUTSIDE_SCENE"]
 
 
 def test_a_rendering(client: Client, found: Result) -> None:
@@ -176,13 +171,11 @@ def test_files_in_results_out(live_stack: Live) -> None:
     pairs = [Pair(ROOM, CHAIR, BOX, UPRIGHT, seed=5100 + number, key=str(number)) for number in range(2)]
     with Client(live_stack.address) as client:
         found = {one.key: one for one in client.batch([*pairs, Pair(ROOM, CHAIR, FAR, key="far")], timeout_s=250)}
-        assert found["0"].job is not None
-        whole = client.result(found["0"].job)
+        whole = client.result(found["0"])  # type: ignore[arg-type]
     assert {found[str(number)].status for number in range(2)} == {"successful"}
     assert found["far"].error is not None
     assert found["far"].error.reason == "DETECTION_OUTSIDE_SCENE"
-    assert found["0"].T_object_scene is not None
-    assert (found["0"].T_object_scene == whole.T_object_scene).all()
+    np.testing.assert_array_equal(found["0"].T_object_scene, whole.T_object_scene)  # type: ignore[arg-type]
     assert found["0"].verdict == whole.verdict
 
 

@@ -19,21 +19,27 @@ def refusal(status: int = 429, reason: str = "RATE_LIMITED", after: str | None =
     return httpx.Response(status, json={"reason": reason, "detail": "not now"}, headers=headers)
 
 
-@pytest.mark.parametrize("reason", ["RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE"])
-def test_what_is_too_fast_is_asked_again_when_the_service_says(reason: str, slept: list[float]) -> None:
-    answers = [refusal(reason=reason)] * 3 + [httpx.Response(200, json=JOB)]
+LIMITS = ("RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE")
+WAITED = [
+    *((429, reason, "3", 3.0, 6.0) for reason in LIMITS),
+    (409, "ARTIFACT_NOT_READY", "1", 1.0, 2.0),
+    (503, "STORAGE_UNAVAILABLE", "7", 7.0, 14.0),
+    *((status, "STORAGE_UNAVAILABLE", None, 0.0, 60.0) for status in (502, 503, 504)),
+]
+
+
+@pytest.mark.parametrize(("status", "reason", "after", "least", "most"), WAITED)
+def test_what_passes_is_asked_again_when_the_service_says(
+    status: int, reason: str, after: str | None, least: float, most: float, slept: list[float], tmp_path: Path
+) -> None:
+    answers = [refusal(status, reason, after)] * 4 + [httpx.Response(200, json=JOB)]
     assert pretended(lambda _: answers.pop(0)).job("j").status == "running"
-    assert len(slept) == 3
-    assert all(3.0 <= wait <= 6.0 for wait in slept)
-
-
-def test_what_passes_is_waited_for(slept: list[float]) -> None:
-    answers = [refusal(409, "ARTIFACT_NOT_READY", "1")] * 2 + [httpx.Response(200, content=b"points")]
-    assert pretended(lambda _: answers.pop(0)).artifact("j", "scene_points.ply") == b"points"
-    assert len(slept) == 2
-    answers = [refusal(503, "STORAGE_UNAVAILABLE", "7"), httpx.Response(200, json=JOB)]
-    pretended(lambda _: answers.pop(0)).job("j")
-    assert 7.0 <= slept[-1] <= 14.0
+    assert len(slept) == 4
+    assert all(least <= wait <= most for wait in slept)
+    assert after or slept[-1] > slept[0]
+    answers = [refusal(status, reason, after), httpx.Response(200, content=b"bytes")]
+    path = pretended(lambda _: answers.pop(0)).download("j", "a.ply", tmp_path / "a.ply")
+    assert path.read_bytes() == b"bytes"
 
 
 def test_patience_ends(slept: list[float]) -> None:
@@ -57,14 +63,6 @@ def test_what_time_does_not_mend_is_told_at_once(answer: httpx.Response, slept: 
         pretended(lambda _: answer).job("j")
     assert caught.value.status == answer.status_code
     assert slept == []
-
-
-@pytest.mark.parametrize("status", [502, 503, 504])
-def test_a_service_that_is_away_for_a_moment_is_waited_for(status: int, slept: list[float]) -> None:
-    answers = [refusal(status, "STORAGE_UNAVAILABLE", None)] * 4 + [httpx.Response(200, json=JOB)]
-    assert pretended(lambda _: answers.pop(0)).job("j").id == "j"
-    assert len(slept) == 4
-    assert slept[-1] > slept[0]
 
 
 def test_nothing_that_answers_is_told_with_what_to_do(slept: list[float]) -> None:
@@ -131,10 +129,3 @@ def test_an_upload_is_sent_again_as_a_whole(slept: list[float], tmp_path: Path) 
     assert pretended(answer).upload(path).state == "ready"
     assert len(bodies) == 3
     assert all(path.read_bytes() in body for body in bodies)
-
-
-def test_a_download_that_is_refused_is_asked_for_again(slept: list[float], tmp_path: Path) -> None:
-    answers = [refusal(reason="RATE_LIMITED"), httpx.Response(200, content=b"bytes")]
-    path = pretended(lambda _: answers.pop(0)).download("j", "a.ply", tmp_path / "a.ply")
-    assert path.read_bytes() == b"bytes"
-    assert len(slept) == 1

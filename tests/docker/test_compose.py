@@ -17,10 +17,6 @@ from tests.docker.files import COMPOSE, DOCKERFILES, ROOT, compose, services
 COMPOSE_ONLY = {"REGNF_PUBLISH", "REGNF_TLS_DIR"}
 
 
-def settings_names() -> set[str]:
-    return {f"REGNF_{name.upper()}" for name in Settings.model_fields}
-
-
 def test_follows_the_compose_specification() -> None:
     checker = Path(sys.executable).with_name("check-jsonschema")
     command = [str(checker), "--builtin-schema", "vendor.compose-spec", str(COMPOSE)]
@@ -46,15 +42,11 @@ def test_what_the_programs_are_given() -> None:
     assert reserved == [{"driver": "nvidia", "count": 1, "capabilities": ["gpu"]}]
     assert services()["worker-gpu"]["environment"]["REGNF_DEVICE"] == "cuda"
     assert "reservations" not in services()["worker"]["deploy"]["resources"]
-    environment = services()["api"]["environment"]
-    assert environment["REGNF_HOST"] == "0.0.0.0"
-    assert environment["REGNF_ALLOW_UNAUTHENTICATED"] == "${REGNF_ALLOW_UNAUTHENTICATED:-false}"
-    assert environment["REGNF_API_TOKENS"] == "${REGNF_API_TOKENS:-[]}"
     memory = services()["worker"]["deploy"]["resources"]["limits"]["memory"]
     assert int(memory.removesuffix("G")) * 2**30 > Settings.model_fields["import_memory_bytes"].default
     texts = [path.read_text() for path in (COMPOSE, *DOCKERFILES)]
     named = set(re.findall(r"REGNF_[A-Z_]*[A-Z]", "\n".join(texts)))
-    assert named - COMPOSE_ONLY <= settings_names()
+    assert named - COMPOSE_ONLY <= {f"REGNF_{name.upper()}" for name in Settings.model_fields}
     document = compose()
     used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
     used = {name for name in used if not name.startswith((".", "$"))}
@@ -96,9 +88,8 @@ def test_every_service_is_hardened() -> None:
 def test_redis_forgets_nothing() -> None:
     redis = services()["redis"]
     command = " ".join(redis["command"])
-    assert "--appendonly yes" in command
-    assert "--appendfsync everysec" in command
-    assert "--maxmemory-policy noeviction" in command
+    for said in ("--appendonly yes", "--appendfsync everysec", "--maxmemory-policy noeviction"):
+        assert said in command
     assert redis["volumes"] == ["redis:/data", "./redis.sh:/etc/redis.sh:ro"]
     assert "ports" not in redis
     assert redis["user"].split(":")[0] not in ("0", "root")
@@ -113,9 +104,11 @@ def test_programs_wait_for_redis_share_the_state_and_are_built_here() -> None:
         service = services()[name]
         assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
         assert service["volumes"] == ["state:/var/lib/regnf", "redis:/run/redis:ro"]
-        assert service["environment"]["REGNF_REDIS_PASSWORD"] == "@/run/redis/password"
-        assert service["environment"]["REGNF_STATE_DIR"] == "/var/lib/regnf"
-        assert service["environment"]["REGNF_REDIS_URL"] == "redis://redis:6379/0"
+        assert service["environment"].items() >= {
+            ("REGNF_REDIS_PASSWORD", "@/run/redis/password"),
+            ("REGNF_STATE_DIR", "/var/lib/regnf"),
+            ("REGNF_REDIS_URL", "redis://redis:6379/0"),
+        }
         context = (COMPOSE.parent / service["build"]["context"]).resolve()
         assert context == ROOT
         assert (context / service["build"]["dockerfile"]).is_file()
@@ -143,6 +136,5 @@ def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch)
             default = re.fullmatch(r"\$\{\w+:-(.*)\}", value)
             monkeypatch.setenv(variable, default[1] if default else value.removeprefix("@"))
     settings = Settings()
-    assert settings.api_tokens == frozenset()
-    assert settings.allow_unauthenticated is False
-    assert settings.threads == 2
+    found = settings.host, settings.api_tokens, settings.allow_unauthenticated, settings.threads
+    assert found == ("0.0.0.0", frozenset(), False, 2)

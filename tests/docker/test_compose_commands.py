@@ -53,10 +53,9 @@ def test_what_a_command_starts_has_what_it_needs(command: ComposeCommand, monkey
         assert services["grafana"]["environment"]["GF_SECURITY_ADMIN_PASSWORD"]
 
 
-@pytest.mark.parametrize("publish", ["0.0.0.0:8080", "8080", "192.0.2.1:8080"])
-def test_published_to_others_it_does_not_start_without_tokens(publish: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    services = render(COMPOSE, {"REGNF_PUBLISH": publish}, ["cpu"])
-    assert services["proxy"]["ports"] == [f"{publish}:8000"]
+def test_published_to_others_it_does_not_start_without_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
+    services = render(COMPOSE, {"REGNF_PUBLISH": "0.0.0.0:8080"}, ["cpu"])
+    assert services["proxy"]["ports"] == ["0.0.0.0:8080:8000"]
     with pytest.raises(StartError) as caught:
         check_access(settings_of(services["api"], monkeypatch))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"

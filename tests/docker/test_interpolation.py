@@ -72,11 +72,9 @@ def test_finds_commands_with_what_is_set_for_them(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    "command", ["docker compose -f a.yaml up --wiat", "docker compose -f a.yaml pu", "sh docker compose "]
-)
-def test_a_command_that_compose_does_not_know_is_an_error(tmp_path: Path, command: str) -> None:
+def test_a_command_that_compose_does_not_know_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "docker").mkdir()
-    (tmp_path / "README.md").write_text(f"```\n{command}\n```\n")
-    with pytest.raises(ComposeError):
-        documented_commands(tmp_path)
+    for command in ("docker compose -f a.yaml up --wiat", "docker compose -f a.yaml pu", "sh docker compose "):
+        (tmp_path / "README.md").write_text(f"```\n{command}\n```\n")
+        with pytest.raises(ComposeError):
+            documented_commands(tmp_path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +21,7 @@ from regnf_state.settings import Settings
 from tests.docker.files import ROOT, services
 from tests.redis_server import installed_servers
 from tests.state.record_makers import finished, job
+from tests.worker.bench import eventually
 
 SCRIPT = ROOT / "docker/redis.sh"
 
@@ -34,11 +34,7 @@ def started(program: str, folder: Path) -> subprocess.Popen[bytes]:
     given = services()["redis"]["command"][2:]
     options = [*given, "--port", "0", "--unixsocket", str(folder / "s"), "--loglevel", "warning"]
     process = subprocess.Popen(["sh", str(SCRIPT), *options], env=environment, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 20
-    while not ((folder / "password").exists() and answers(address(folder))):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    eventually(lambda: (folder / "password").exists() and answers(address(folder)), "the server", 20)
     return process
 
 
@@ -62,15 +58,8 @@ def test_without_the_password_nothing_is_done_nor_what_changes_the_server(folder
     assert re.fullmatch(r"[0-9a-f]{64}", (folder / "password").read_text())
     assert (folder / "users.acl").stat().st_mode & 0o077 == 0
     with connect(address(folder)) as redis:
-        for command in (
-            "CONFIG SET dir /tmp",
-            "SAVE",
-            "MODULE LIST",
-            "FLUSHALL",
-            "REPLICAOF a 1",
-            "ACL LIST",
-            "SHUTDOWN",
-        ):
+        refused = ("CONFIG SET dir /tmp", "SAVE", "MODULE LIST", "FLUSHALL", "REPLICAOF a 1", "ACL LIST", "SHUTDOWN")
+        for command in refused:
             with pytest.raises(NoPermissionError):
                 redis.execute_command(*command.split())  # type: ignore[no-untyped-call]
 

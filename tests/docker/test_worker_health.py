@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
+import runpy
 import subprocess
 import sys
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,16 +19,11 @@ SCRIPT = ROOT / "docker" / "worker_health.py"
 
 
 @pytest.fixture(scope="module")
-def health() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("worker_health", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def health() -> SimpleNamespace:
+    return SimpleNamespace(**runpy.run_path(str(SCRIPT)))
 
 
-def test_a_worker_of_this_host_that_reports_is_alive(health: ModuleType, redis: Redis) -> None:
+def test_a_worker_of_this_host_that_reports_is_alive(health: SimpleNamespace, redis: Redis) -> None:
     """Another host's does not count, nor one that said goodbye, or whose registration has run out."""
     workers = {}
     for host in ("here", "gone", "silent"):
@@ -42,21 +37,20 @@ def test_a_worker_of_this_host_that_reports_is_alive(health: ModuleType, redis: 
     assert [health.is_alive(redis, host) for host in ("here", "gone", "silent")] == [True, False, False]
 
 
-@pytest.mark.parametrize(
-    ("url", "said"), [(None, "set REGNF_REDIS_URL"), ("unix:///nowhere/socket", "Redis does not answer")]
-)
-def test_says_what_is_wrong(url: str | None, said: str) -> None:
-    environment = {"PYTHONPATH": str(ROOT)} | ({"REGNF_REDIS_URL": url} if url else {})
+def checked(**variables: str) -> tuple[int, str]:
+    environment = {"PYTHONPATH": str(ROOT)} | variables
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 1
-    assert said in run.stderr
+    return run.returncode, run.stderr
+
+
+def test_says_what_is_wrong() -> None:
+    for variables, said in (({}, "set REGNF_REDIS_URL"), ({"REGNF_REDIS_URL": "unix:///no"}, "Redis does not answer")):
+        status, printed = checked(**variables)
+        assert (status, said in printed) == (1, True)
 
 
 def test_exit_status_follows_the_worker(redis_url: str, redis: Redis) -> None:
-    environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": redis_url}
-    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
-    assert (run.returncode, run.stderr) == (1, "no worker of this host has reported lately\n")
+    assert checked(REGNF_REDIS_URL=redis_url) == (1, "no worker of this host has reported lately\n")
     worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis)
     worker.register_birth()
-    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
-    assert (run.returncode, run.stderr) == (0, "")
+    assert checked(REGNF_REDIS_URL=redis_url) == (0, "")

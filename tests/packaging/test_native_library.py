@@ -42,7 +42,7 @@ def test_the_checkouts_own_library_is_of_these_sources() -> None:
     assert found.sources == sources_digest(SOURCES), "run scripts/setup.sh"
 
 
-def test_what_is_built_loads_and_is_not_built_twice(built: Path) -> None:
+def test_what_is_built_loads_and_is_not_built_twice(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = library.load(built)
     assert found.variants[-1].name == "plain"
     assert found.sources == sources_digest(SOURCES)
@@ -50,6 +50,9 @@ def test_what_is_built_loads_and_is_not_built_twice(built: Path) -> None:
     build(SOURCES, built)
     assert built.stat().st_ino == before
     assert [path.name for path in built.parent.iterdir()] == [NAME]
+    other = built.rename(built.with_name("other.so"))
+    monkeypatch.setattr(library, "_LAYOUT", 0)
+    assert library.load(other).fastest is None, "it is of another layout"
 
 
 def test_a_library_of_older_sources_goes(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,12 +89,6 @@ def test_what_is_no_library_is_not_used_nor_any_by_the_switch(tmp_path: Path, mo
     assert library.variant() is None
     monkeypatch.delenv(library.SWITCH)
     assert library.variant() is library.load().fastest
-
-
-def test_a_library_of_another_layout_is_not_used(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    other = built.rename(built.with_name("other.so"))
-    monkeypatch.setattr(library, "_LAYOUT", 0)
-    assert library.load(other).fastest is None
 
 
 def test_fields_are_evaluated_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:

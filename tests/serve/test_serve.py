@@ -63,21 +63,20 @@ def listening_sockets(pid: int) -> set[str]:
     return {entry[9] for entry in tables if entry[3] == "0A" and f"socket:[{entry[9]}]" in inodes}
 
 
-@pytest.mark.parametrize(
-    ("number", "workers"), [(signal.SIGTERM, ()), (signal.SIGINT, NO_WORKER), (signal.SIGHUP, NO_WORKER)]
-)
-def test_a_signal_ends_everything_in_order(tmp_path: Path, number: signal.Signals, workers: tuple[str, ...]) -> None:
-    with started(tmp_path / "state", *workers) as service:
-        if not workers:
-            service.await_ready()
-        folder = service.socket_dir()
-        service.look()
-        service.process.send_signal(number)
-        assert service.process.wait(DEADLINE_S) == 0
-        assert service.all_gone(), "nothing outlives the one who waited for it"
-        assert not folder.exists()
-        assert "killed" not in service.log()
-        assert "Traceback" not in service.log()
+def ends_in_order(service: Service, number: signal.Signals = signal.SIGTERM) -> None:
+    folder = service.socket_dir()
+    service.look()
+    service.process.send_signal(number)
+    assert service.process.wait(DEADLINE_S) == 0
+    assert service.all_gone(), "nothing outlives the one who waited for it"
+    assert not folder.exists()
+    assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in service.log()] == []
+
+
+def test_a_signal_ends_everything_in_order(tmp_path: Path) -> None:
+    with started(tmp_path / "state") as service:
+        service.await_ready()
+        ends_in_order(service)
 
 
 def test_ctrl_c_reaches_the_supervisor_alone(shared: Service) -> None:
@@ -95,8 +94,9 @@ def test_a_killed_supervisor_takes_everything_along(tmp_path: Path) -> None:
         service.process.wait()
         eventually(service.all_gone, "the end of every process", DEADLINE_S)
         assert folder.exists(), "nobody was left to remove it"
-        with started(service.state_dir, *NO_WORKER):
+        with started(service.state_dir, *NO_WORKER) as following:
             assert not folder.exists(), "the next one does"
+            ends_in_order(following, signal.SIGHUP)
 
 
 def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def upload(address: str, content: bytes) -> str:
     return str(answer.json()["sha256"])
 
 
-def test_whoever_waits_is_answered_before_the_end_and_state_survives_it(tmp_path: Path) -> None:
+def test_whoever_waits_is_answered_before_the_end_and_the_next_service_has_their_fields(tmp_path: Path) -> None:
     """Without a worker there is no news: the stop alone ends what is waited for, in order."""
     with started(tmp_path / "state", *NO_WORKER) as service:
         scene, object_ = (upload(service.address, name) for name in (b"scene", b"object"))
@@ -146,9 +146,9 @@ def test_whoever_waits_is_answered_before_the_end_and_state_survives_it(tmp_path
         assert service.process.wait(DEADLINE_S) == 0
         log = service.log()
         assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
-    with started(tmp_path / "state", *NO_WORKER) as again:
-        assert httpx.get(f"{again.address}/fields/{scene}").json()["state"] == "validating"
-        assert httpx.get(f"{again.address}/jobs/{job}").json()["status"] == "accepted"
+    with started(tmp_path / "state", *NO_WORKER) as following:
+        assert httpx.get(f"{following.address}/fields/{scene}").json()["state"] == "validating"
+        ends_in_order(following, signal.SIGINT)
 
 
 @contextmanager
@@ -161,28 +161,16 @@ def sent(address: str, asked: str) -> Iterator[BinaryIO]:
             yield answer
 
 
-def refused(*arguments: str, state_dir: Path, **settings: object) -> str:
-    done = subprocess.run(
-        command(state_dir, *arguments), env=environment(**settings), capture_output=True, text=True, timeout=DEADLINE_S
-    )
-    assert done.returncode == 3, done
-    assert done.stdout == ""
-    assert "Traceback" not in done.stderr
-    return done.stderr
-
-
 def test_one_service_to_a_state_folder(shared: Service) -> None:
     shared.await_ready()
-    assert "STATE_DIR_IN_USE" in refused(state_dir=shared.state_dir)
+    another = command(shared.state_dir)
+    done = subprocess.run(another, env=environment(), capture_output=True, text=True, timeout=DEADLINE_S)
+    assert (done.returncode, done.stdout, "STATE_DIR_IN_USE" in done.stderr) == (3, "", True), done.stderr
+    assert "Traceback" not in done.stderr
     assert shared.is_ready()
 
 
-def test_beyond_loopback_over_a_redis_of_its_own_operator(tmp_path: Path) -> None:
-    """Only behind a proxy, and with tokens. Without an embedded Redis there is one child less."""
-    assert "UNAUTHENTICATED_PUBLIC_BIND" in refused("--host", "0.0.0.0", state_dir=tmp_path / "state")
-    settings = {"behind_proxy": "true", "api_tokens": '["0123456789abcdef0123456789abcdef"]'}
-    with (
-        private_redis() as url,
-        started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, redis_url=url, **settings) as service,
-    ):
-        assert ["regnf_cli.api_process" in command_of(pid) for pid in service.look()] == [True]
+def test_without_an_embedded_redis_there_is_one_child_less(tmp_path: Path) -> None:
+    with private_redis() as url, started(tmp_path / "state", *NO_WORKER, redis_url=url) as service:
+        assert [command_of(pid) for pid in service.look() if "regnf_cli.api_process" not in command_of(pid)] == []
+        assert len(service.look()) == 1
