@@ -18,7 +18,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_service.fields.uploads import Upload
 from regnf_service.http.body import _Collector
 from regnf_state.blobs.base import StorageFullError, StorageUnavailableError
-from tests.contract.bad_input import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
+from tests.contract.conftest import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
 pytestmark = pytest.mark.usefixtures("nothing_of_an_upload_stays")

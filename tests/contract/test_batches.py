@@ -236,7 +236,6 @@ def test_a_caller_has_so_many_batches_and_the_oldest_that_has_ended_goes(worlds:
 
 
 def test_what_is_kept_and_told_of_problems_is_bounded(world: World) -> None:
-    """Of a batch of the worst lines; in a page of all batches."""
     bad = {"scene": 1, "object": 2, "detection": {"x" * 200: 1}, **{f"unknown-{n}-" + "y" * 150: n for n in range(60)}}
     answer = post(world, [{**bad, "seed": -seed} for seed in range(600)])
     assert answer.status_code == 200, answer.text
@@ -344,7 +343,6 @@ def test_lists_and_looks_beside_deletes_and_cancels_fail_in_no_way(world: World)
 def test_the_same_pairs_spelled_differently_and_posted_at_once_are_one_batch(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the storage takes its time."""
     lines = pairs(world, 5)
     longer = [{**one, "options": {"preset": "robust"}} for one in lines]
     whole, meeting = LocalBlobWriter.commit, threading.Barrier(2)

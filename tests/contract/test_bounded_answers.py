@@ -53,7 +53,6 @@ def pieces(world: World, path: str, method: str = "GET") -> list[int]:
 
 @pytest.fixture
 def large(world: World) -> dict[str, str]:
-    """A world in which every file is large; the addresses of these."""
     sha256 = world.ready_field("large")
     world.client.post("/library", json={"name": "large", "field": sha256})
     for name in (PICTURE_NAME, *MESH_NAMES):
@@ -81,7 +80,6 @@ def test_files_are_sent_a_block_at_a_time(world: World, large: dict[str, str], n
 
 
 def many_jobs(world: World, count: int) -> list[str]:
-    """Jobs whose records are large, newest first."""
     ids = []
     for seed in range(count):
         ids.insert(0, world.submit(seed=seed))
@@ -164,7 +162,6 @@ def test_a_filter_looks_at_a_few_hundred_records_a_call(
 
 
 def stored(world: World, known: str, name: str) -> dict[str, str]:
-    """What is stored of a field, under another name."""
     held = {key.decode(): value.decode() for key, value in world.redis.hgetall(f"regnf:field:{known}").items()}
     return held | {"document": held["document"].replace(known, name)}
 

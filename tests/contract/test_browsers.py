@@ -83,7 +83,6 @@ def test_two_hosts_or_none_and_web_sockets_are_refused(browsed: World) -> None:
 
 
 def bare_call(app: FastAPI, path: str, headers: list[tuple[bytes, bytes]], kind: str = "http") -> int:
-    """The status of the answer, or the code with which a web socket is closed."""
     sent: list[dict[str, object]] = []
 
     async def receive() -> dict[str, object]:

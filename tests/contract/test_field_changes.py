@@ -229,7 +229,6 @@ def test_changes_that_are_refused(world: World) -> None:
 
 
 def question(world: World, name: str) -> str:
-    """An upload that was rejected with a question; its bytes are kept."""
     send(world, data=field_bytes(name))
     imported(world, "LATENT_MISSING")
     return f"fields/{sha256(field_bytes(name))}/original"
@@ -293,7 +292,6 @@ FIRST = f"{PLACE}/candidates/1.png"
 
 
 def asked_about(world: World, asked: Sequence[Candidate] = ASKED, **said: Any) -> None:
-    """The field is sent, unless it is there, and its import ends with a question."""
     if not world.queue.imports:
         send(world, said or None)
     imported(world, "LAYOUT_AMBIGUOUS", asked)

@@ -220,8 +220,6 @@ def test_a_failed_job_answers_with_its_own_problem(world: World) -> None:
 
 
 def test_ranges(world: World, job_id: str) -> None:
-    """One is honored, what is none gets the whole, one past the end is refused."""
-
     def ranged(asked: str) -> httpx.Response:
         return world.client.get(f"/jobs/{job_id}/artifacts/scene_points.ply", headers={"Range": asked})
 
@@ -272,7 +270,6 @@ def test_only_the_fixed_names_are_artifacts(world: World, job_id: str) -> None:
 
 
 def addresses(world: World) -> list[str]:
-    """One of each kind of address that sends an ETag."""
     job, known, asked = world.submit(), world.ready_field("a"), "a" * 64
     world.succeed(job, {"trace.json": b"[]"})
     now = world.records.now()

@@ -176,7 +176,6 @@ def test_requests_name_objects_by_entries(world: World) -> None:
 
 
 def test_entries_are_selected_a_page_at_a_time(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between two pages other callers' requests go on."""
     chairs = [world.ready_field(f"chair {number}") for number in range(5)]
     for number, field in enumerate(chairs):
         add(world, field, f"chair {number}", tags=["seat"])

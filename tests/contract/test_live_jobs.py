@@ -180,7 +180,6 @@ def substitution(fields: dict[str, str]) -> dict[str, Any]:
 
 
 def rendered(client: httpx.Client, fields: dict[str, str], **changes: Any) -> dict[str, Any]:
-    """The document of a rendering's job once it has ended."""
     answer = client.post("/render", json={"scene": fields["scene"], **SMALL, **changes})
     assert answer.status_code in (200, 202), answer.text
     return finished(client, answer.json()["id"])
@@ -205,7 +204,6 @@ def failed(client: httpx.Client, stack: Live, fields: dict[str, str], reason: st
 
 @pytest.fixture(scope="module")
 def everything(live_stack: Live, demo_fields: dict[str, str]) -> dict[str, Any]:
-    """The result of a substitution with every output."""
     with live_stack.client() as client:
         asked = {"outputs": OUTPUTS, "before": True, "mesh_resolution": 32, "field_resolution": 48}
         return result_of(client, rendered(client, demo_fields, edits=[substitution(demo_fields)], **asked))
@@ -244,8 +242,9 @@ def test_the_edited_scene_is_a_field_like_any_other(
     again = {"scene": sha, "object": demo_fields["object"]}
     picture = result_of(live_client, rendered(live_client, again, edits=[substitution(demo_fields)]))
     assert picture["frames"] == 2
-    answer = live_client.post("/register?dry_run=true", json=demo_request(again))
-    assert (answer.status_code, answer.json()["valid"]) == (200, True)
+    job = finished(live_client, live_client.post("/register", json=demo_request(again)).json()["id"])
+    assert job["status"] == "successful", job
+    validator("ResultDocument").validate(live_client.get(job["links"]["result"]).json())
 
 
 def test_a_registration_and_then_its_rendering(live_client: httpx.Client, demo_fields: dict[str, str]) -> None:
@@ -258,7 +257,6 @@ def test_a_registration_and_then_its_rendering(live_client: httpx.Client, demo_f
 
 
 def deepest_place() -> list[float]:
-    """A place in the scene's matter."""
     scene = open_field(DATA / "mix-room.safetensors")
     low, high = scene.bounds
     steps = torch.linspace(0.0, 1.0, 24)

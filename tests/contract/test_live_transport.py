@@ -39,7 +39,6 @@ def head_of(method: str, path: str, **headers: object) -> bytes:
 
 
 def upload_of(data: bytes) -> bytes:
-    """The head of an upload of these bytes, and they themselves."""
     return head_of("PUT", f"/fields/{sha256(data)}", Content_Length=len(data)) + data
 
 
@@ -160,7 +159,6 @@ def test_hundreds_of_aborted_uploads_leave_nothing(live: Live, client: httpx.Cli
 
 
 def test_eight_uploads_of_one_file_at_once_are_one_field(live: Live, client: httpx.Client) -> None:
-    """And a file under its name takes nobody's place."""
     data = field_bytes("twins", 500_000)
 
     def upload(_: int) -> int:

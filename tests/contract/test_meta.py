@@ -46,7 +46,6 @@ def broken() -> None:
 def test_not_ready_when_something_is_missing(
     world: World, monkeypatch: pytest.MonkeyPatch, missing: str, reason: str, holder: str, name: str, stand_in: Any
 ) -> None:
-    """What takes requests needs no worker."""
     with monkeypatch.context() as patch:
         patch.setattr(getattr(world, holder), name, stand_in)
         problem = assert_refused(world.client.get("/readyz"), 503, "NOT_READY")

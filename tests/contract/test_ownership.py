@@ -22,7 +22,6 @@ ALICE, BOB = {"Authorization": "Bearer alices-token"}, {"Authorization": "Bearer
 
 @pytest.fixture
 def shared(tmp_path: Path, worlds: Callable[..., World]) -> World:
-    """A service of two callers; its client is alice's."""
     file = tmp_path / "tokens"
     file.write_text("# who may call\n\nalice:alices-token\nbob:bobs-token\nbob:bobs-next-token\n")
     made = worlds(api_tokens=f"@{file}")
@@ -37,7 +36,6 @@ def bob(shared: World) -> Iterator[httpx.Client]:
 
 
 def ready(world: World, client: httpx.Client, caller: str, data: bytes, **report: Any) -> str:
-    """A caller's field whose import went well."""
     assert client.put(f"/fields/{sha256(data)}", content=data).status_code == 201
     world.records.update_field(reference_of(caller, sha256(data)), state="ready", report=report)
     return sha256(data)
@@ -50,7 +48,6 @@ def ask(client: httpx.Client, **changes: Any) -> httpx.Response:
 
 @pytest.fixture
 def alices_job(shared: World) -> str:
-    """A finished job of alice's with an artifact, her fields ready."""
     for data in (SCENE, OBJECT):
         ready(shared, shared.client, "alice", data)
     job_id = str(ask(shared.client).json()["id"])

@@ -20,14 +20,12 @@ def post(world: World, headers: dict[str, str] | None = None, **changes: Any) ->
 
 
 def request_of(world: World, job_id: str) -> dict[str, Any]:
-    """What a job's record holds of its request."""
     record = world.records.get_job(job_id)
     assert record is not None
     return record.request
 
 
 def jobs_of(world: World, spellings: Sequence[dict[str, Any]]) -> list[str]:
-    """The ids of the jobs that these requests, or changes of a good one, become."""
     return [str(post(world, **one).json()["id"]) for one in spellings]
 
 
@@ -119,7 +117,6 @@ def test_a_results_own_transform_is_a_start_and_a_truth(world: World) -> None:
 
 
 def library(world: World, *names: str) -> dict[str, Any]:
-    """A search among these objects, uploading them the first time."""
     request = world.valid_request()
     del request["object"]
     for name in names:
@@ -163,10 +160,9 @@ def test_a_job_that_has_ended_says_what_was_asked_for(world: World, kind: str) -
 
 
 def test_as_many_candidates_as_are_allowed(world: World) -> None:
-    request, now = library(world), world.records.now()
-    names = [f"{number:064x}" for number in range(512)]
+    request, names = library(world), [f"{number:064x}" for number in range(512)]
     for sha in names:
-        world.records.create_field(FieldRecord(sha, "validating", 600, now, now))
+        world.records.restore_field(FieldRecord(sha, "validating", 600, 1.0, 1.0))
     assert world.client.post("/register", json=request | {"candidates": names}).status_code == 202
 
 

@@ -13,7 +13,7 @@ import pytest
 from regnf_service.http.schemas.scenes import MOST_CAMERAS
 from regnf_state.reasons import REASONS
 from regnf_state.registration_request import RenderingRequest, request_of
-from tests.contract.bad_input import post
+from tests.contract.conftest import post
 from tests.contract.test_openapi import validator
 from tests.contract.world import (
     ALICE,
@@ -36,14 +36,12 @@ STATION = {"position": [0.9, 0.0, 0.5], "target": [0.0, 0.0, 0.0]}
 
 
 def registered(world: World, **changes: Any) -> str:
-    """A finished registration; its job's id."""
     job_id = world.submit(**changes)
     world.succeed(job_id)
     return job_id
 
 
 def rendering(world: World, **changes: Any) -> dict[str, Any]:
-    """A request whose object and transform are given."""
     known = world.valid_request()
     edit = {"kind": "substitution", "object": known["object"], "T_object_scene": MATRIX}
     return {"scene": known["scene"], "edits": [edit], "size": [64, 48], "orbit": {"frames": 4}} | changes

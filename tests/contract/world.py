@@ -30,7 +30,6 @@ BOB = {"Authorization": "Bearer the-secret-of-bob"}
 
 
 def field_bytes(name: str, size: int = 600) -> bytes:
-    """Bytes that begin as a safetensors file does; different for each name."""
     header = json.dumps({"__metadata__": {"name": name}}).encode()
     return (len(header).to_bytes(8, "little") + header).ljust(size, b"\0")
 
@@ -40,7 +39,6 @@ def sha256(data: bytes) -> str:
 
 
 def put(client: httpx.Client, data: bytes, **headers: str) -> httpx.Response:
-    """Upload a field's file under its digest."""
     return client.put(f"/fields/{sha256(data)}", content=data, headers=headers)
 
 
@@ -65,8 +63,6 @@ RESULT = {
 
 @dataclass
 class World:
-    """The service, its stores, and a client."""
-
     settings: Settings
     redis: Redis
     records: ShiftedJournaledRecords
@@ -94,7 +90,6 @@ class World:
         return sha256(data)
 
     def submit(self, **changes: Any) -> str:
-        """Post a registration; the job's id."""
         answer = self.client.post("/register", json=self.valid_request() | changes)
         assert answer.status_code == 202, answer.text
         return str(answer.json()["id"])
@@ -108,7 +103,6 @@ class World:
         return {"scene": scene, "object": object_, "detection": BOX}
 
     def run(self, job_id: str) -> JobRecord:
-        """What a worker does first."""
         record = self.records.get_job(job_id)
         assert record is not None
         if record.status == "running":
@@ -144,7 +138,6 @@ class World:
 
 
 def pointers(problem: dict[str, Any]) -> list[str]:
-    """The places in a body that a problem names."""
     return [one["pointer"] for one in problem["errors"]]
 
 

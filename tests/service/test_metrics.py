@@ -32,7 +32,6 @@ def redis(redis_url: str) -> Iterator[Redis]:
 
 
 def values(text: str) -> dict[tuple[str, ...], float]:
-    """Every sample by its name and its labels' values in the order of their names."""
     samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
     return {(one.name, *(value for _, value in sorted(one.labels.items()))): one.value for one in samples}
 

@@ -44,7 +44,6 @@ def test_content_digests() -> None:
 
 
 def outcome(read: Callable[[Any], Any], value: Any) -> Any:
-    """What ``read`` makes of the value, or the reason it gives."""
     try:
         return read(value)
     except Problem as refused:

@@ -14,7 +14,7 @@ from redis import Redis
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Message, RedisOutbox, line_of
-from tests.service.webhook_receiver import KEY, OneByOne, Receiver, ask, deliverer, delivery, due, finish, hmac_by_hand
+from tests.service.conftest import KEY, OneByOne, Receiver, ask, deliverer, delivery, due, finish, hmac_by_hand
 
 
 def test_a_name_that_resolves_to_a_private_address_is_not_followed(redis: Redis, receiver: Receiver) -> None:

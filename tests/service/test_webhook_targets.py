@@ -9,7 +9,7 @@ import pytest
 
 from regnf_service.tokens import TokensError
 from regnf_service.webhooks.targets import AllowList, is_public, read_secrets, signed_headers
-from tests.service.webhook_receiver import KEY, SECRET, hmac_by_hand
+from tests.service.conftest import KEY, SECRET, hmac_by_hand
 
 
 @pytest.mark.parametrize(

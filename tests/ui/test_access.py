@@ -9,8 +9,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
 from tests.ui.conftest import Files, Visit
-from tests.ui.home import CHAIR, click_at, give_files, open_page
-from tests.ui.pixels import blue
+from tests.ui.home import CHAIR, blue, click_at, give_files, open_page
 
 pytestmark = pytest.mark.browser
 NONE: dict[str, list[str]] = {"dark": [], "light": []}

@@ -23,9 +23,8 @@ from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from tests.stores import private_stores
 from tests.ui.conftest import ARGUMENTS, Visit, chromium
-from tests.ui.fixture_server import FixtureServer
 from tests.ui.home import served
-from tests.ui.stories import field_picture
+from tests.ui.stories import FixtureServer, field_picture
 from tests.ui.synthetic import JOB_ID, Synthetic
 
 pytestmark = pytest.mark.browser
@@ -34,8 +33,6 @@ SCENE, OBJECT = "a3" * 32, "7c" * 32
 
 @dataclass(frozen=True)
 class RealService:
-    """The application on a port of its own, with one accepted job and its two fields in its store."""
-
     origin: str
     records: RecordStore
     blobs: BlobStore
@@ -66,7 +63,6 @@ def real_service(data: Synthetic) -> Iterator[RealService]:
 
 @pytest.fixture(scope="module")
 def service(running_server: FixtureServer) -> Iterator[RealService]:
-    """For tests that change nothing."""
     with real_service(running_server.stage.data) as made:
         yield made
 
@@ -131,7 +127,6 @@ class _EvilPage(BaseHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def evil_port() -> Iterator[int]:
-    """Where a page of another site is served."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), _EvilPage)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
     thread.start()
