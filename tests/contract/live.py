@@ -67,11 +67,7 @@ class Live:
 @contextmanager
 def live_service(folder: Path, with_worker: bool = True, **settings: object) -> Iterator[Live]:
     """Start everything; the API answers once this yields, and is ready if it has a worker."""
-    with (
-        private_redis() as redis_url,
-        socket.create_server(("127.0.0.1", 0)) as listener,
-        ExitStack() as stack,
-    ):
+    with private_redis() as redis_url, socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:
         plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         usual = {"redis_url": redis_url, "state_dir": folder, "max_upload_bytes": MAX_UPLOAD, "device": "cpu"}
         environment = plain | variables(**usual | settings)

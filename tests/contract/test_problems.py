@@ -14,15 +14,10 @@ from regnf_service.upkeep.reaper import Reaper
 from tests.contract.world import NOBODY, World, assert_refused
 
 ALLOWED = {
-    "/fields/" + "0" * 64: "DELETE, GET, HEAD, PATCH, PUT",
-    "/v1/fields": "GET, POST",
-    "/jobs/x": "DELETE, GET",
-    "/jobs/x/cancel": "POST",
-    "/healthz": "GET, HEAD",
-    "/v1/": "GET, HEAD",
-    "/register": "POST",
+    "/fields/" + "0" * 64: "DELETE, GET, HEAD, PATCH, PUT", "/v1/fields": "GET, POST", "/jobs/x": "DELETE, GET",
+    "/jobs/x/cancel": "POST", "/healthz": "GET, HEAD", "/v1/": "GET, HEAD", "/register": "POST",
     "/static/favicon.svg": "GET, HEAD",
-}
+}  # fmt: skip
 
 
 def test_unknown_addresses_and_methods(world: World) -> None:

@@ -102,9 +102,13 @@ class World:
                 self.ready_field(name)
         return {"scene": scene, "object": object_, "detection": BOX}
 
-    def run(self, job_id: str) -> JobRecord:
+    def job(self, job_id: str) -> JobRecord:
         record = self.records.get_job(job_id)
         assert record is not None
+        return record
+
+    def run(self, job_id: str) -> JobRecord:
+        record = self.job(job_id)
         if record.status == "running":
             return record
         return self.records.update_job(job_id, record.attempt, status="running", phase="loading")

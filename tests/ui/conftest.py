@@ -77,7 +77,7 @@ def server(running_server: FixtureServer) -> FixtureServer:
 @pytest.fixture
 def context_options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """What a test overrides to look through another kind of screen; a module's VIEWPORT says how large it is."""
-    width, height = getattr(request.module, "VIEWPORT", (1100, 700))
+    width, height = getattr(request.module, "VIEWPORT", (1000, 600))
     return {"viewport": {"width": width, "height": height}, "reduced_motion": "reduce"}
 
 
