@@ -5,9 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import threading
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import Mock
@@ -91,20 +89,6 @@ def test_storage_that_fails_keeps_nothing(
         answer = world.client.put(PUT_GOOD, content=GOOD)
     assert_refused(answer, status, reason)
     assert int(answer.headers["retry-after"]) > 0
-
-
-def test_uploads_of_one_hash_at_once_are_one_field(world: World) -> None:
-    def slowly() -> Iterator[bytes]:
-        for start in range(0, len(GOOD), 100):
-            time.sleep(0.001)
-            yield GOOD[start : start + 100]
-
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(lambda _: world.client.put(PUT_GOOD, content=slowly()).status_code, range(8)))
-    assert sorted(answers) == [200] * 7 + [201]
-    assert world.queue.imports == [(sha256(GOOD), 1)]
-    assert world.blobs.blobs == {f"fields/{sha256(GOOD)}/original": GOOD}
-    assert world.client.delete(PUT_GOOD).status_code == 204
 
 
 # in parts

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
+from itertools import product
 from typing import Any
 
 import httpx
@@ -281,24 +282,21 @@ def addresses(world: World) -> list[str]:
     return [*places, f"/jobs/{job}", f"/fields/{known}", f"/jobs/{job}/artifacts/trace.json"]
 
 
-@pytest.mark.parametrize("place", range(5))
-def test_every_etag_is_honored(world: World, place: int) -> None:
+def test_every_etag_is_honored(world: World) -> None:
     """As RFC 9110 defines it: weak comparison, lists, `*`. A malformed header sets no condition."""
-    path = addresses(world)[place]
-    of_a_job = path.startswith("/jobs/") and path.count("/") == 2
-    for method in ("GET",) if of_a_job else ("GET", "HEAD"):
+    for path, method in product(addresses(world), ("GET", "HEAD")):
         whole = world.client.request(method, path)
+        if whole.status_code == 405:  # a job's document
+            continue
         etag = whole.headers["etag"]
         held = (etag, f"W/{etag}", f'"x", {etag}', f'W/"x" ,,W/{etag} ', "*", " * ", f'"a,b", {etag}')
         others = ('"x"', f'W/"x", "{etag[1:-2]}"', f'"x,{etag[1:]}', '""')
         malformed = ("", etag[1:-1], f"{etag} {etag}", f"w/{etag}", f"{etag}, *", etag[:-1], f'{etag[:-1]} "')
-        for header in held:
+        for header in held + others + malformed:
             answer = world.client.request(method, path, headers={"If-None-Match": header})
-            assert (answer.status_code, answer.content) == (304, b""), header
-            assert all(answer.headers[one] == whole.headers[one] for one in ("etag", "cache-control"))
-        for header in others + malformed:
-            answer = world.client.request(method, path, headers={"If-None-Match": header})
-            assert answer.status_code == 200, header
+            assert answer.status_code == (304 if header in held else 200), (path, header)
+            assert (answer.content == b"") == (header in held or method == "HEAD")
+            assert [answer.headers[one] == whole.headers[one] for one in ("etag", "cache-control")] == [True, True]
 
 
 def test_an_etag_holds_until_something_changes_and_a_heartbeat_is_no_change(world: World) -> None:

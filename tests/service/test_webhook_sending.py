@@ -136,15 +136,14 @@ def test_many_deliverers_send_each_message_once(redis: Redis, redis_url: str, re
 
 def test_a_job_that_is_deleted_or_started_anew_takes_its_message_along(redis: Redis, receiver: Receiver) -> None:
     store, outbox = RecordStore(redis), RedisOutbox(redis)
-    finish(redis, receiver.address, "failed")
-    record = store.get_job("j1")
-    assert record is not None
-    again, _ = store.create_job(record, 10)
-    assert (again.attempt, outbox.waiting(), delivery(redis).state) == (2, 0, "waiting")
+    finish(redis, f"{receiver.address}/first", "failed")
+    again = ask(redis, f"{receiver.address}/second")
+    assert (again.attempt, again.webhooks) == (2, [f"{receiver.address}/second", f"{receiver.address}/first"])
+    assert (outbox.waiting(), delivery(redis).state) == (0, "waiting")
     store.update_job("j1", 2, status="dismissed")
-    assert (outbox.waiting(), delivery(redis).state) == (1, "pending")
+    assert (outbox.waiting(), delivery(redis).state) == (2, "pending")
     store.delete_job("j1")
-    assert (outbox.waiting(), redis.exists("regnf:webhook:j1:0")) == (0, 0)
+    assert (outbox.waiting(), redis.keys("regnf:webhook:*")) == (0, [])
     redis.zadd(due(receiver.address), {"gone-1-0": 0})
     redis.zadd("regnf:webhooks:lines", {line_of("alice", receiver.address): 0})
     assert deliverer(redis, [receiver.address]).run_once()
@@ -182,18 +181,6 @@ def test_every_request_is_told_of_the_end_by_itself(redis: Redis, receiver: Rece
     assert [sent.run_once() for _ in range(4)] == [True, True, True, False]
     assert sorted(path for path, _, _ in receiver.received) == ["/first", "/second", "/third"]
     assert sorted(delivery(redis, place).state for place in range(3)) == ["delivered", "failed", "pending"]
-
-
-def test_all_messages_of_a_job_go_with_it(redis: Redis, receiver: Receiver) -> None:
-    store, outbox = RecordStore(redis), RedisOutbox(redis)
-    finish(redis, f"{receiver.address}/first", "failed")
-    again = ask(redis, f"{receiver.address}/second")
-    assert (again.attempt, again.webhooks) == (2, [f"{receiver.address}/second", f"{receiver.address}/first"])
-    assert outbox.waiting() == 0
-    store.update_job("j1", 2, status="dismissed")
-    assert outbox.waiting() == 2
-    store.delete_job("j1")
-    assert (outbox.waiting(), redis.keys("regnf:webhook:*")) == (0, [])
 
 
 def test_webhooks_that_come_at_the_same_time_are_all_kept(redis: Redis, redis_url: str, receiver: Receiver) -> None:
