@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator
-from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from redis import Redis
 
 from regnf_core.options import RegistrationOptions
 from regnf_core.rendering.request import RenderOptions
 from regnf_service.http import body as parsing
 from regnf_service.http.schemas import reading
 from regnf_service.http.strict_json import MOST_VALUES, count_values
-from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256, transform
+from tests.contract.world import BOX, World, assert_refused, field_bytes, sha256, transform
 
-ALICE = {"Authorization": "Bearer open-sesame-open-sesame"}
 SEARCH = {"scene": "a" * 64, "detection": BOX, "candidates": [{"field": f"{n:064x}"} for n in range(512)]}
-
-
-@pytest.fixture
-def guarded(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
-    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"alice:open-sesame-open-sesame"}))
-    with made.client:
-        yield made
 
 
 @pytest.mark.parametrize(
@@ -160,35 +151,25 @@ def test_in_a_body(world: World, body: str) -> None:
         members = request | members
     elif path == "/render":
         members = {"scene": request["scene"]} | members
-    answer = send(world, method, path, json.dumps(members))
+    text = json.dumps(members)
+    answer = send(world, method, path, text)
     assert answer.status_code not in (400, 415, 422), f"it is no request as it stands: {answer.text}"
-    for place, changed in changed_numbers(members):
+    tried = list(changed_numbers(text))
+    assert len(tried) >= 3 * len(HUGE)
+    for changed in tried:
         answer = send(world, method, path, changed)
-        assert answer.status_code < 500, (place, answer.text)
+        assert answer.status_code < 500, (changed[:2000], answer.text)
 
 
 def send(world: World, method: str, path: str, text: str) -> Any:
     return world.client.request(method, path, content=text, headers={"Content-Type": "application/json"})
 
 
-def changed_numbers(members: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """The body as text with each of its numbers in turn replaced by each of the huge ones, and where."""
-    for place in numbers_of(members):
+def changed_numbers(text: str) -> Iterator[str]:
+    """The body with each of its numbers in turn replaced by each of the huge ones."""
+    for found in re.finditer(r"(?<=[\[ ])-?[\d.]+(?:e[+-]?\d+)?(?=[,\]}])", text):
         for value in HUGE:
-            changed = deepcopy(members)
-            holder: Any = changed
-            for part in place[:-1]:
-                holder = holder[part]
-            holder[place[-1]] = value
-            yield f"{place}: {str(value)[:12]}", json.dumps(changed)
-
-
-def numbers_of(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    if isinstance(value, dict | list):
-        for part, held in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from numbers_of(held, (*place, part))
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        yield place
+            yield text[: found.start()] + json.dumps(value) + text[found.end() :]
 
 
 def test_in_a_header(world: World) -> None:

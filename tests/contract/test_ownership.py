@@ -57,26 +57,15 @@ def alices_job(shared: World) -> str:
     return job_id
 
 
-ROUTES: dict[str, tuple[str, ...]] = {
-    "/fields/{field}": ("GET", "HEAD", "PATCH", "DELETE"),
-    "/fields/{field}?wait=1": ("GET",),
-    "/fields/{field}/mesh.glb": ("GET", "HEAD"),
-    "/fields/{field}/preview.png": ("GET", "HEAD"),
-    "/fields/{field}/candidates/1.png": ("GET", "HEAD"),
-    "/library/{entry}": ("GET", "PATCH", "DELETE"),
-    "/library/{entry}/file": ("GET",),
-    "/jobs/{job}": ("GET", "DELETE"),
-    "/jobs/{job}?wait=1": ("GET",),
-    "/jobs/{job}/request": ("GET",),
-    "/jobs/{job}/events": ("GET",),
-    "/jobs/{job}/result": ("GET",),
-    "/jobs/{job}/artifacts/trace.json": ("GET", "HEAD"),
-    "/jobs/{job}/cancel": ("POST",),
-    "/batches/{batch}": ("GET", "DELETE"),
-    "/batches/{batch}?wait=1": ("GET",),
-    "/batches/{batch}/results": ("GET",),
-    "/batches/{batch}/cancel": ("POST",),
-}
+ROUTES = {path: methods.split() for path, methods in {
+    "/fields/{field}": "GET HEAD PATCH DELETE", "/fields/{field}?wait=1": "GET", "/fields/{field}/mesh.glb": "GET HEAD",
+    "/fields/{field}/preview.png": "GET HEAD", "/fields/{field}/candidates/1.png": "GET HEAD",
+    "/library/{entry}": "GET PATCH DELETE", "/library/{entry}/file": "GET",
+    "/jobs/{job}": "GET DELETE", "/jobs/{job}?wait=1": "GET", "/jobs/{job}/request": "GET", "/jobs/{job}/events": "GET",
+    "/jobs/{job}/result": "GET", "/jobs/{job}/artifacts/trace.json": "GET HEAD", "/jobs/{job}/cancel": "POST",
+    "/batches/{batch}": "GET DELETE", "/batches/{batch}?wait=1": "GET", "/batches/{batch}/results": "GET",
+    "/batches/{batch}/cancel": "POST",
+}.items()}  # fmt: skip
 OPEN = {("PUT", "/fields/{field}"), ("GET", "/jobs/{job}/view"), ("HEAD", "/jobs/{job}/view")}
 
 

@@ -48,17 +48,10 @@ def transform(scale: float = 1.0) -> dict[str, Any]:
 
 
 RESULT = {
-    "verdict": "registered",
-    "verdict_reason": "SURFACES_AGREE",
-    "probability": 0.95,
-    "T_scene_object": transform(0.5),
-    "T_object_scene": transform(2.0),
-    "center_scene": [0.0, 0.0, 0.0],
-    "center_object": [0.0, 0.0, 0.0],
-    "alternatives": [],
-    "metrics": {"residual_rms": 0.001},
-    "seed": 0,
-}
+    "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.95,
+    "T_scene_object": transform(0.5), "T_object_scene": transform(2.0), "center_scene": [0.0, 0.0, 0.0],
+    "center_object": [0.0, 0.0, 0.0], "alternatives": [], "metrics": {"residual_rms": 0.001}, "seed": 0,
+}  # fmt: skip
 
 
 @dataclass
