@@ -16,6 +16,7 @@ from tests.ui.stories import LABELS, TOKEN
 from tests.ui.synthetic import ITERATIONS
 
 pytestmark = pytest.mark.browser
+VIEWPORT = (1100, 700)
 ROOM, CHAIR = LABELS["a3"], LABELS["7c"]
 
 
