@@ -25,7 +25,6 @@ _Value = TypeVar("_Value")
 
 
 def eventually(look: Callable[[], _Value | None], what: str, deadline_s: float = DEADLINE_S) -> _Value:
-    """What ``look`` returns once that is truthy. Fails after the deadline."""
     end = time.monotonic() + deadline_s
     while not (value := look()):
         assert time.monotonic() < end, f"{what} did not come about within {deadline_s} s"
@@ -35,8 +34,6 @@ def eventually(look: Callable[[], _Value | None], what: str, deadline_s: float =
 
 @dataclass
 class Live:
-    """A running service: its address, its folder and the API's process."""
-
     port: int
     folder: Path
     api: subprocess.Popen[bytes]
@@ -50,7 +47,6 @@ class Live:
         return httpx.Client(base_url=self.address, timeout=60)
 
     def connect(self) -> socket.socket:
-        """A bare connection, for clients that misbehave."""
         return socket.create_connection(("127.0.0.1", self.port), timeout=DEADLINE_S)
 
     def peak_memory(self) -> int:
@@ -71,11 +67,7 @@ class Live:
 @contextmanager
 def live_service(folder: Path, with_worker: bool = True, **settings: object) -> Iterator[Live]:
     """Start everything; the API answers once this yields, and is ready if it has a worker."""
-    with (
-        private_redis() as redis_url,
-        socket.create_server(("127.0.0.1", 0)) as listener,
-        ExitStack() as stack,
-    ):
+    with private_redis() as redis_url, socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:
         plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         usual = {"redis_url": redis_url, "state_dir": folder, "max_upload_bytes": MAX_UPLOAD, "device": "cpu"}
         environment = plain | variables(**usual | settings)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from tests.contract.bad_input import post
+from tests.contract.conftest import post
 from tests.contract.world import BOX, NOBODY, World, assert_refused, make_world, pointers
 
 stays = pytest.mark.usefixtures("nothing_of_a_request_stays")
@@ -21,7 +21,6 @@ UNIT: dict[str, Any] = {"center": [0, 0, 0], "size": [1, 1, 1]}
 
 
 def rows(*changes: tuple[int, int, Any]) -> Any:
-    """The identity with some entries changed."""
     changed = [list(row) for row in IDENTITY]
     for row, column, value in changes:
         changed[row][column] = value

@@ -51,9 +51,7 @@ def pieces(world: World, path: str, method: str = "GET") -> list[int]:
     return sizes
 
 
-@pytest.fixture
-def large(world: World) -> dict[str, str]:
-    """A world in which every file is large; the addresses of these."""
+def test_files_are_sent_a_block_at_a_time(world: World) -> None:
     sha256 = world.ready_field("large")
     world.client.post("/library", json={"name": "large", "field": sha256})
     for name in (PICTURE_NAME, *MESH_NAMES):
@@ -61,27 +59,16 @@ def large(world: World) -> dict[str, str]:
     world.blobs.put(f"fields/{sha256}/field.safetensors", LARGE)
     job = world.submit()
     world.succeed(job, {"aligned.glb": LARGE})
-    return {
-        "preview": f"/fields/{sha256}/preview.png",
-        "mesh": f"/fields/{sha256}/mesh.glb",
-        "coarse mesh": f"/fields/{sha256}/mesh.glb?detail=coarse",
-        "library file": "/library/large/file",
-        "artifact": f"/jobs/{job}/artifacts/aligned.glb",
-    }
-
-
-@pytest.mark.parametrize("name", ["preview", "mesh", "coarse mesh", "library file", "artifact"])
-def test_files_are_sent_a_block_at_a_time(world: World, large: dict[str, str], name: str) -> None:
-    sizes = pieces(world, large[name])
-    assert sum(sizes) == len(LARGE)
-    assert max(sizes) <= MIB
-    if name != "library file":
-        assert world.client.head(large[name]).headers["content-length"] == str(len(LARGE))
-        assert sum(pieces(world, large[name], "HEAD")) == 0, "nothing is read for a HEAD"
+    shown = [f"/fields/{sha256}/{name}" for name in ("preview.png", "mesh.glb", "mesh.glb?detail=coarse")]
+    for path in (*shown, f"/jobs/{job}/artifacts/aligned.glb", "/library/large/file"):
+        sizes = pieces(world, path)
+        assert (sum(sizes), max(sizes) <= MIB) == (len(LARGE), True), path
+        if "library" not in path:
+            assert world.client.head(path).headers["content-length"] == str(len(LARGE))
+            assert sum(pieces(world, path, "HEAD")) == 0, "nothing is read for a HEAD"
 
 
 def many_jobs(world: World, count: int) -> list[str]:
-    """Jobs whose records are large, newest first."""
     ids = []
     for seed in range(count):
         ids.insert(0, world.submit(seed=seed))
@@ -99,35 +86,24 @@ def many_fields(world: World, count: int) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("path", "member", "name", "make"),
-    [("/jobs", "jobs", "id", many_jobs), ("/fields", "fields", "sha256", many_fields)],
+    ("kind", "name", "filtered", "make"),
+    [("jobs", "id", "status=failed", many_jobs), ("fields", "sha256", "label=nope", many_fields)],
 )
-def test_pages_of_large_records_are_short(
-    world: World, path: str, member: str, name: str, make: Callable[[World, int], list[str]]
+def test_pages_of_large_records_are_short_and_read_a_few_at_a_time(
+    world: World, monkeypatch: pytest.MonkeyPatch, kind: str, name: str, filtered: str, make: Any
 ) -> None:
     """All 40 of them have 3.2 MB."""
-    if member == "jobs":
-        world.valid_request()
-    made = make(world, 40)
-    seen: list[str] = []
-    token: str | None = ""
+    world.valid_request()
+    made, seen, token = make(world, 40), list[str](), ""
+    at_once = watched(monkeypatch)
     while token is not None:
-        answer = world.client.get(path, params={"limit": 200} | ({"page_token": token} if token else {}))
+        answer = world.client.get(f"/{kind}", params={"limit": 200} | ({"page_token": token} if token else {}))
         assert len(answer.content) <= MIB
-        seen += [one[name] for one in answer.json()[member]]
+        seen += [one[name] for one in answer.json()[kind]]
         token = answer.json()["next_page_token"]
     assert seen[: len(made)] == made, "each exactly once"
     assert len(seen) == len(set(seen))
-
-
-@pytest.mark.parametrize("path", ["/jobs?status=failed", "/jobs?limit=200", "/fields?label=nope", "/fields?limit=200"])
-def test_large_records_are_read_a_few_at_a_time(world: World, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
-    """Of each caller's records, however large, a few are in memory at once."""
-    many = many_jobs if "jobs" in path else many_fields
-    world.valid_request()
-    many(world, 40)
-    at_once = watched(monkeypatch)
-    assert world.client.get(path).status_code == 200
+    assert world.client.get(f"/{kind}?{filtered}").status_code == 200
     assert max(at_once) * 80_000 <= 1.5 * MIB
 
 
@@ -164,7 +140,6 @@ def test_a_filter_looks_at_a_few_hundred_records_a_call(
 
 
 def stored(world: World, known: str, name: str) -> dict[str, str]:
-    """What is stored of a field, under another name."""
     held = {key.decode(): value.decode() for key, value in world.redis.hgetall(f"regnf:field:{known}").items()}
     return held | {"document": held["document"].replace(known, name)}
 

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.contract.bad_input import announced
+from tests.contract.conftest import announced
 from tests.contract.world import World, assert_refused, field_bytes, put, sha256
 
 A, B = field_bytes("a"), field_bytes("b")

@@ -32,13 +32,8 @@ def test_an_entry_from_its_making_to_its_end(world: World) -> None:
     assert (made.status_code, made.headers["location"]) == (201, "/library/office%20chair")
     entry = world.client.get(made.headers["location"]).json()
     assert entry == made.json()
-    assert (entry["field"], entry["tags"], entry["unit"], entry["note"]) == (
-        chair,
-        ["oak", "seat"],
-        "cm",
-        "of the hall",
-    )
-    assert (entry["symmetry"], entry["symmetry_source"], entry["state"]) == (UNIT, "said", "ready")
+    assert entry | {"field": chair, "tags": ["oak", "seat"], "unit": "cm", "note": "of the hall", "symmetry": UNIT,
+                    "symmetry_source": "said", "state": "ready"} == entry  # fmt: skip
     assert entry["links"]["preview"] == f"/fields/{chair}/preview.png"
     assert world.client.get(f"/fields/{chair}").json()["library"] == {"name": "office chair", "tags": ["oak", "seat"]}
     assert add(world, chair, tags=["seat", "oak"], unit="cm", note="of the hall", symmetry=TURNED).status_code == 200
@@ -176,7 +171,6 @@ def test_requests_name_objects_by_entries(world: World) -> None:
 
 
 def test_entries_are_selected_a_page_at_a_time(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between two pages other callers' requests go on."""
     chairs = [world.ready_field(f"chair {number}") for number in range(5)]
     for number, field in enumerate(chairs):
         add(world, field, f"chair {number}", tags=["seat"])

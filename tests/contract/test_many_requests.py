@@ -20,7 +20,6 @@ REQUEST = b"GET /openapi.yaml HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 @pytest.fixture
 def limited(worlds: Callable[..., World]) -> Callable[..., World]:
-    """Makes a service where a caller has one request in progress."""
     return partial(worlds, max_requests_per_caller=1)
 
 

@@ -46,7 +46,6 @@ def broken() -> None:
 def test_not_ready_when_something_is_missing(
     world: World, monkeypatch: pytest.MonkeyPatch, missing: str, reason: str, holder: str, name: str, stand_in: Any
 ) -> None:
-    """What takes requests needs no worker."""
     with monkeypatch.context() as patch:
         patch.setattr(getattr(world, holder), name, stand_in)
         problem = assert_refused(world.client.get("/readyz"), 503, "NOT_READY")
@@ -78,35 +77,25 @@ PAGES = ("/", "/v1/", "/jobs", "/fields", "/v1/jobs", "/v1/fields")
 FOLLOWED = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
 
 
-@pytest.mark.parametrize("address", PAGES)
-def test_browser_gets_a_page_and_a_program_json(world: World, address: str) -> None:
-    page = world.client.get(address, headers=BROWSER)
-    assert (page.status_code, page.headers["content-type"].split(";")[0]) == (200, "text/html")
-    assert page.headers["content-security-policy"].startswith("default-src 'self'")
-    assert "<script" in page.text
-    for accept in ("*/*", "application/json", "application/json, text/html", ""):
-        answer = world.client.get(address, headers={"Accept": accept})
-        assert answer.headers["content-type"] == "application/json", accept
-        assert answer.headers["vary"] == page.headers["vary"] == "Accept"
-
-
-def test_page_needs_no_token_and_its_data_do(worlds: Callable[..., World]) -> None:
-    world = worlds(api_tokens=TOKENS)
-    world.client.headers.pop("Authorization", None)
+def test_a_browser_gets_a_page_without_a_token_and_a_program_json_with_one(worlds: Callable[..., World]) -> None:
+    client = worlds(api_tokens=TOKENS).client
     for address in PAGES:
-        assert world.client.get(address, headers=BROWSER).status_code == 200
-        assert_refused(world.client.get(address), 401, "UNAUTHENTICATED")
-        assert_refused(world.client.post(address, headers=BROWSER), 401, "UNAUTHENTICATED")
-    assert "text/html" in world.client.head("/", headers=BROWSER).headers["content-type"]
+        page = client.get(address, headers=BROWSER)
+        assert (page.status_code, page.headers["content-type"].split(";")[0]) == (200, "text/html")
+        assert page.headers["content-security-policy"].startswith("default-src 'self'")
+        assert "<script" in page.text
+        assert client.get(address, headers=BROWSER | FOLLOWED).status_code == 200, "links of other sites lead there"
+        for accept in ("*/*", "application/json", "application/json, text/html", ""):
+            answer = client.get(address, headers=ALICE | {"Accept": accept})
+            assert answer.headers["content-type"] == "application/json", accept
+            assert answer.headers["vary"] == page.headers["vary"] == "Accept"
+        for method, headers in (("GET", {}), ("POST", BROWSER)):
+            assert_refused(client.request(method, address, headers=headers), 401, "UNAUTHENTICATED")
+    assert "text/html" in client.head("/", headers=BROWSER).headers["content-type"]
     for address in ("/version", "/demo", "/jobs/", "/openapi.yaml", f"/fields/{'0' * 64}"):
-        assert_refused(world.client.get(address, headers=BROWSER), 401, "UNAUTHENTICATED")
-    assert world.client.get("/jobs", headers=BROWSER | ALICE).headers["content-type"].startswith("text/html")
-
-
-def test_links_of_other_sites_lead_to_the_pages(world: World) -> None:
-    for address in PAGES:
-        assert world.client.get(address, headers=BROWSER | FOLLOWED).status_code == 200
-    assert_refused(world.client.get("/demo", headers=BROWSER | FOLLOWED), 403, "ORIGIN_NOT_ALLOWED")
+        assert_refused(client.get(address, headers=BROWSER), 401, "UNAUTHENTICATED")
+    assert client.get("/jobs", headers=BROWSER | ALICE).headers["content-type"].startswith("text/html")
+    assert_refused(client.get("/demo", headers=BROWSER | FOLLOWED | ALICE), 403, "ORIGIN_NOT_ALLOWED")
 
 
 def test_mesh_of_a_ready_field(world: World) -> None:
@@ -151,7 +140,8 @@ def test_demo(worlds: Callable[..., World], tmp_path: Path) -> None:
     for name in ("mix-room.safetensors", "armchair.safetensors"):
         (tmp_path / name).write_bytes(name.encode())
     world = worlds(demo_dir=tmp_path)
-    assert_refused(world.client.get("/demo"), 404, "NOT_FOUND")  # not complete
+    for address in ("/demo", "/demo/armchair.safetensors"):
+        assert_refused(world.client.get(address), 404, "NOT_FOUND")  # not complete
     (tmp_path / "detection.json").write_text(json.dumps(box))
     (tmp_path / "secret").write_bytes(b"no part of it")
     demo = world.client.get("/v1/demo").json()
@@ -159,8 +149,3 @@ def test_demo(worlds: Callable[..., World], tmp_path: Path) -> None:
     assert world.client.get(demo["object"]["address"]).content == b"armchair.safetensors"
     for name in ("secret", "detection.json", "..%2fsecret", "%2e%2e/secret"):
         assert world.client.get(f"/demo/{name}").status_code == 404
-
-
-def test_service_without_a_demo(world: World) -> None:
-    assert_refused(world.client.get("/demo"), 404, "NOT_FOUND")
-    assert_refused(world.client.get("/demo/armchair.safetensors"), 404, "NOT_FOUND")

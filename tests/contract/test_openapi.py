@@ -55,11 +55,6 @@ def script(name: str) -> Any:
     return module
 
 
-def test_the_script_writes_what_is_committed() -> None:
-    writer = script("write_openapi")
-    assert writer.current_contract() == writer.TARGET.read_text(encoding="utf-8")
-
-
 def test_every_option_says_what_it_is_for_and_every_reference_leads_somewhere() -> None:
     schemas = CONTRACT["components"]["schemas"]
     for group in ("RobustOptions", "RegistrationOptions"):
@@ -82,7 +77,6 @@ def test_every_refusal_is_in_the_table_of_reasons() -> None:
 
 
 def test_every_example_is_accepted(world: World) -> None:
-    """Between fields under the hashes that the examples name."""
     now = world.records.now()
     for sha in (SCENE, OBJECT, OTHER):
         world.records.create_field(FieldRecord(sha, "validating", 600, now, now))
@@ -162,7 +156,6 @@ def test_times_and_addresses_have_formats_and_closed_sets_are_enums() -> None:
 
 
 def test_the_documents_list_every_reason_and_address() -> None:
-    """Those of verdicts in the same words."""
     errors = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
     assert [reason for reason in REASONS if f"`{reason}`" not in errors] == []
     api = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")

@@ -16,7 +16,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_state.blobs.local import LocalBlobWriter
 from regnf_state.pieces import Pieces
 from tests.contract import world as contract
-from tests.contract.bad_input import announced
+from tests.contract.conftest import announced
 from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, sha256
 
 DATA = field_bytes("in pieces", 2000)
@@ -36,7 +36,6 @@ def put(
 
 
 def ask(world: World, data: bytes = DATA, **headers: str) -> httpx.Response:
-    """How much of a file has arrived."""
     span = {"Content-Range": f"bytes */{len(data)}"}
     return world.client.put(f"/fields/{sha256(data)}", content=b"", headers=span | headers)
 

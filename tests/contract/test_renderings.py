@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from regnf_service.http.schemas.scenes import MOST_CAMERAS
+from regnf_state.reasons import REASONS
 from regnf_state.registration_request import RenderingRequest, request_of
+from tests.contract.conftest import post
 from tests.contract.test_openapi import validator
 from tests.contract.world import (
     ALICE,
@@ -34,14 +36,12 @@ STATION = {"position": [0.9, 0.0, 0.5], "target": [0.0, 0.0, 0.0]}
 
 
 def registered(world: World, **changes: Any) -> str:
-    """A finished registration; its job's id."""
     job_id = world.submit(**changes)
     world.succeed(job_id)
     return job_id
 
 
 def rendering(world: World, **changes: Any) -> dict[str, Any]:
-    """A request whose object and transform are given."""
     known = world.valid_request()
     edit = {"kind": "substitution", "object": known["object"], "T_object_scene": MATRIX}
     return {"scene": known["scene"], "edits": [edit], "size": [64, 48], "orbit": {"frames": 4}} | changes
@@ -54,10 +54,7 @@ def render(world: World, headers: dict[str, str] | None = None, **changes: Any) 
 def asked_of(world: World, answer: httpx.Response) -> RenderingRequest:
     """What the record of a rendering's job holds of its request."""
     assert answer.status_code == 202, answer.text
-    job_id = answer.json()["id"]
-    record = world.records.get_job(job_id)
-    assert record is not None
-    found = request_of(record)
+    found = request_of(world.job(answer.json()["id"]))
     assert isinstance(found, RenderingRequest)
     return found
 
@@ -161,8 +158,7 @@ def test_cameras_of_a_file(world: World) -> None:
         file = {"document": document | {"frames": frames}, **more}
         return world.client.post("/render", json=asked | {"transforms": file})
 
-    poses = asked_of(world, posted(frames, every=3, T_scene_file=MATRIX)).rendering.poses
-    assert poses is not None
+    poses = asked_of(world, posted(frames, every=3, T_scene_file=MATRIX)).rendering.poses or []
     assert len(poses) == 3
     assert poses[0].intrinsics == [50.0, 50.0, 25.0, 20.0]
     expected = np.array(turned) @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -201,3 +197,102 @@ def test_jobs_of_others_cannot_be_named(worlds: Callable[..., World]) -> None:
     mine = client.post("/render", json=asked, headers=ALICE)
     assert asked_of(world, mine).objects == (f"{known['object']}_alice",)
     assert_refused(client.get(f"/jobs/{mine.json()['id']}", headers=BOB), 404, "JOB_NOT_FOUND")
+
+
+# renderings that cannot be made are refused before a job exists, with a reason and a place, and leave nothing
+
+
+stays = pytest.mark.usefixtures("nothing_of_a_request_stays")
+OBJECT = sha256(field_bytes("object"))
+MATRIX = transform(2.0)["matrix"]
+EDIT: dict[str, Any] = {"kind": "substitution", "object": OBJECT, "T_object_scene": MATRIX}
+STATION: dict[str, Any] = {"position": [0.9, 0.0, 0.5], "target": [0.0, 0.0, 0.0]}
+POSE: dict[str, Any] = {"T_scene_camera": transform()["matrix"], "intrinsics": [50, 50, 32, 24], "size": [64, 48]}
+SHEARED = [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+FAR = {"min": [50, 50, 50], "max": [51, 51, 51]}
+
+
+def edit(**changes: Any) -> dict[str, Any]:
+    return {"edits": [EDIT | changes]}
+
+
+def removal(box: Any) -> dict[str, Any]:
+    return {"edits": [{"kind": "removal", "detection": box}]}
+
+
+def pose(**changes: Any) -> dict[str, Any]:
+    return {"poses": [POSE | changes]}
+
+
+BAD: dict[str, list[tuple[dict[str, Any], str]]] = {
+    "INVALID_TRANSFORM": [
+        (edit(T_object_scene=SHEARED), "/edits/0/T_object_scene"),
+        (edit(T_object_scene=MIRROR), "/edits/0/T_object_scene"),
+        (edit(T_object_scene=[[float("nan"), 0, 0, 0], *MATRIX[1:]]), "/edits/0/T_object_scene/0/0"),
+        (edit(T_object_scene=[[2, 0, 0, 1e300], *MATRIX[1:]]), "/edits/0/T_object_scene/0/3"),
+    ],
+    "EDIT_INVALID": [
+        ({"edits": [{"kind": "removal", "T_object_scene": MATRIX}]}, "/edits/0"),
+        ({"edits": [{"kind": "substitution"}]}, "/edits/0"), ({"edits": [{"kind": "explosion"}]}, "/edits/0"),
+        (edit(job="0" * 32), "/edits/0"),
+        ({"edits": EDIT}, "/edits"), ({"edits": [EDIT] * 65}, "/edits"), (edit(colour=1), "/edits/0/colour"),
+        (edit(tint=[2, 0, 0]), "/edits/0/tint/0"), (edit(object="abc"), "/edits/0/object"),
+        ({"edits": [{"kind": "substitution", "job": "../x"}]}, "/edits/0/job"),
+    ],
+    "INVALID_DETECTION": [(removal({"min": [0, 0, 0], "max": [0, 1, 1]}), "/edits/0/detection/max/0")],
+    "DETECTION_OUTSIDE_SCENE": [(removal(FAR), "/edits/0/detection"),
+    ({"orbit": {"detection": FAR}}, "/orbit/detection")],
+    "FIELD_NOT_FOUND": [(edit(object="0" * 64), "/edits/0/object"), ({"scene": "0" * 64}, "/scene")],
+    "RENDER_TOO_LARGE": [
+        ({"size": [40_000, 25_000]}, ""), ({"orbit": {"frames": 1_000_000}}, ""),
+        ({"size": [4000, 4000], "orbit": {"frames": 2000}}, ""),
+        ({"size": [1920, 1080], "orbit": {"frames": 360}, "options": {"mode": "volume"}, "outputs": ["animation"],
+          "before": False}, "/size"),  # more work than a job may be
+        ({"size": [640, 480], "orbit": {"frames": 1000}, "edits": [EDIT]}, "/outputs"),  # more files
+        ({"options": {"memory_mb": 65536}, "size": [4000, 4000], "orbit": {"frames": 1}}, "/size"),
+        ({"outputs": ["field"], "field_resolution": 900}, "/field_resolution"),
+    ],
+    "CAMERA_INVALID": [
+        ({"size": [0, 48]}, "/size/0"), ({"look_at": []}, "/look_at"), ({"orbit": {"edit": 3}}, ""),
+        ({"look_at": [STATION | {"target": STATION["position"]}]}, "/look_at/0"),
+        (pose(T_scene_camera=SHEARED), "/poses/0/T_scene_camera"), (pose(T_scene_camera=MATRIX), "/poses/0"),
+        (pose(intrinsics=[0, 50, 32, 24]), "/poses/0"),
+        ({"transforms": {"document": {"frames": "no"}}}, ""), ({"transforms": {"document": {}}}, ""),
+    ],
+    "INVALID_REQUEST": [
+        ({"orbit": {}, "look_at": [STATION]}, ""), ({"outputs": ["hologram"]}, "/outputs/0"),
+        ({"outputs": []}, "/outputs"),
+        ({"camera": 1}, "/camera"), ({"seed": "1"}, "/seed"),
+    ],
+    "INVALID_OPTIONS": [({"options": {"fog": 1}}, "/options/fog"),
+    ({"options": {"antialias": 9}}, "/options/antialias")],
+    "WEBHOOK_NOT_ALLOWED": [({"webhook": {"url": "https://elsewhere.example/"}}, "/webhook/url")],
+}  # fmt: skip
+
+
+@stays
+@pytest.mark.parametrize("reason", BAD)
+def test_refused(world: World, reason: str) -> None:
+    scene = world.valid_request()["scene"]
+    for change, pointer in BAD[reason]:
+        answer = post(world, {"scene": scene, "size": [64, 48]} | change, "/render")
+        problem = assert_refused(answer, REASONS[reason].status, reason)
+        found = pointers(problem) if "errors" in problem else []
+        assert pointer in found or (pointer == "" and not any(found)), (change, problem)
+
+
+@stays
+def test_bodies_that_are_no_request(world: World) -> None:
+    for body in (b"", b"[]", b"null", b"{", b'{"scene": 1}', b"\xff"):
+        answer = post(world, body, "/render")
+        assert answer.status_code in (400, 422), answer.text
+        assert_refused(answer, answer.status_code, answer.json()["reason"])
+    assert_refused(world.client.post("/render", files={"scene": b"x"}), 415, "UNSUPPORTED_MEDIA_TYPE")
+
+
+def test_a_rejected_object_is_refused(world: World) -> None:
+    scene, object_ = world.valid_request()["scene"], world.rejected_field("a broken chair")
+    edits = [EDIT | {"object": object_}, {"kind": "removal", "detection": BOX}]
+    problem = assert_refused(post(world, {"scene": scene, "edits": edits}, "/render"), 422, "FIELD_REJECTED")
+    assert pointers(problem) == ["/edits/0/object"]

@@ -20,7 +20,6 @@ _ROOM = 3 * 512 * 1024
 
 @pytest.fixture
 def redis() -> Iterator[Redis]:
-    """A server of its own: its memory is limited."""
     with private_redis() as url, connect(url) as made:
         yield made
 
@@ -32,7 +31,6 @@ def served(folder: Path, redis: Redis, **settings: Any) -> World:
 
 
 def ready(world: World, caller: str) -> dict[str, Any]:
-    """A request of a caller who has both fields."""
     names = {}
     for role in ("scene", "object"):
         data = field_bytes(role)

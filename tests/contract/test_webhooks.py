@@ -75,9 +75,7 @@ def test_a_webhook_makes_no_other_job_and_is_added_to_the_one_there_is(told: Wor
         assert (answer.json()["id"], answer.json()["status"], answer.json()["attempts"]) == (job_id, state, 1)
         assert (answer.headers["etag"] != before.headers["etag"]) is is_new
     assert urls(told, job_id) == [URL, f"{URL}/2", f"{URL}/3"]
-    record = told.records.get_job(job_id)
-    assert record is not None
-    assert record.request["webhook"] == {"url": URL}
+    assert told.job(job_id).request["webhook"] == {"url": URL}
 
 
 def test_a_job_without_a_webhook_gets_that_of_a_later_request(told: World) -> None:
@@ -91,8 +89,7 @@ def test_a_job_that_is_started_anew_holds_the_later_request_and_tells_all(told: 
     told.fail(job_id, reason="WORKER_LOST")
     assert told.submit(webhook={"url": f"{URL}/2"}, detection=BOX | {"label": "armchair"}) == job_id
     assert urls(told, job_id) == [f"{URL}/2", URL]
-    record = told.records.get_job(job_id)
-    assert record is not None
+    record = told.job(job_id)
     assert (record.attempt, record.request["detection"]["label"]) == (2, "armchair")
     assert record.inputs["detection"]["label"] == "armchair"
 

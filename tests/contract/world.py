@@ -30,7 +30,6 @@ BOB = {"Authorization": "Bearer the-secret-of-bob"}
 
 
 def field_bytes(name: str, size: int = 600) -> bytes:
-    """Bytes that begin as a safetensors file does; different for each name."""
     header = json.dumps({"__metadata__": {"name": name}}).encode()
     return (len(header).to_bytes(8, "little") + header).ljust(size, b"\0")
 
@@ -40,7 +39,6 @@ def sha256(data: bytes) -> str:
 
 
 def put(client: httpx.Client, data: bytes, **headers: str) -> httpx.Response:
-    """Upload a field's file under its digest."""
     return client.put(f"/fields/{sha256(data)}", content=data, headers=headers)
 
 
@@ -50,23 +48,14 @@ def transform(scale: float = 1.0) -> dict[str, Any]:
 
 
 RESULT = {
-    "verdict": "registered",
-    "verdict_reason": "SURFACES_AGREE",
-    "probability": 0.95,
-    "T_scene_object": transform(0.5),
-    "T_object_scene": transform(2.0),
-    "center_scene": [0.0, 0.0, 0.0],
-    "center_object": [0.0, 0.0, 0.0],
-    "alternatives": [],
-    "metrics": {"residual_rms": 0.001},
-    "seed": 0,
-}
+    "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.95,
+    "T_scene_object": transform(0.5), "T_object_scene": transform(2.0), "center_scene": [0.0, 0.0, 0.0],
+    "center_object": [0.0, 0.0, 0.0], "alternatives": [], "metrics": {"residual_rms": 0.001}, "seed": 0,
+}  # fmt: skip
 
 
 @dataclass
 class World:
-    """The service, its stores, and a client."""
-
     settings: Settings
     redis: Redis
     records: ShiftedJournaledRecords
@@ -94,7 +83,6 @@ class World:
         return sha256(data)
 
     def submit(self, **changes: Any) -> str:
-        """Post a registration; the job's id."""
         answer = self.client.post("/register", json=self.valid_request() | changes)
         assert answer.status_code == 202, answer.text
         return str(answer.json()["id"])
@@ -107,10 +95,13 @@ class World:
                 self.ready_field(name)
         return {"scene": scene, "object": object_, "detection": BOX}
 
-    def run(self, job_id: str) -> JobRecord:
-        """What a worker does first."""
+    def job(self, job_id: str) -> JobRecord:
         record = self.records.get_job(job_id)
         assert record is not None
+        return record
+
+    def run(self, job_id: str) -> JobRecord:
+        record = self.job(job_id)
         if record.status == "running":
             return record
         return self.records.update_job(job_id, record.attempt, status="running", phase="loading")
@@ -144,7 +135,6 @@ class World:
 
 
 def pointers(problem: dict[str, Any]) -> list[str]:
-    """The places in a body that a problem names."""
     return [one["pointer"] for one in problem["errors"]]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -33,7 +32,6 @@ def redis(redis_url: str) -> Iterator[Redis]:
 
 
 def values(text: str) -> dict[tuple[str, ...], float]:
-    """Every sample by its name and its labels' values in the order of their names."""
     samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
     return {(one.name, *(value for _, value in sorted(one.labels.items()))): one.value for one in samples}
 
@@ -159,11 +157,3 @@ def test_they_have_a_port_of_their_own(tmp_path: Path, any_redis: Redis) -> None
         httpx.get(f"http://127.0.0.1:{port}/metrics")
     with served(metrics.registry, None):
         pass
-
-
-def test_the_verdict_is_kept_with_the_job(redis: Redis) -> None:
-    store = RecordStore(redis)
-    record = job(store, "j")
-    assert replace(record, verdict=None) == record
-    store.update_job("j", 1, status="running")
-    assert store.update_job("j", 1, status="successful", verdict="registered").verdict == "registered"

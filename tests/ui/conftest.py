@@ -16,8 +16,8 @@ from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 from regnf_state.settings import Settings
 from tests.ui import room
-from tests.ui.fixture_server import FixtureServer
 from tests.ui.home import home, register, upload
+from tests.ui.stories import FixtureServer
 
 # SwiftShader draws WebGL without a GPU, and nothing else, being slow. The others keep the browser from calling home.
 ARGUMENTS = [
@@ -33,8 +33,6 @@ DRIVER = "GL Driver Message"
 
 @dataclass
 class Visit:
-    """One open page, with everything it asked for and complained about."""
-
     page: Page
     server: FixtureServer
     requests: list[str] = field(default_factory=list)
@@ -79,7 +77,7 @@ def server(running_server: FixtureServer) -> FixtureServer:
 @pytest.fixture
 def context_options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """What a test overrides to look through another kind of screen; a module's VIEWPORT says how large it is."""
-    width, height = getattr(request.module, "VIEWPORT", (1100, 700))
+    width, height = getattr(request.module, "VIEWPORT", (1000, 600))
     return {"viewport": {"width": width, "height": height}, "reduced_motion": "reduce"}
 
 
@@ -105,7 +103,6 @@ def kept_window() -> dict[str, Page]:
 
 
 def forget(page: Page) -> None:
-    """Leave the window as it was opened."""
     page.unroute_all()
     page.context.set_offline(False)
     page.context.clear_permissions()
@@ -159,7 +156,6 @@ def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Vis
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    """A room, the chair that stands in it, and a stool that does not."""
     folder = tmp_path_factory.mktemp("own")
     stool = folder / "stool.glb"
     trimesh.creation.box((0.4, 0.3, 0.5)).export(stool)
@@ -174,7 +170,6 @@ def running_home() -> Iterator[str]:
 
 @pytest.fixture
 def service(running_home: str, visit: Visit) -> Iterator[str]:
-    """The address of a service that has nothing yet."""
     yield running_home
     if visit.page.url.startswith(running_home):
         visit.page.evaluate("() => { sessionStorage.clear(); localStorage.clear(); }")
@@ -187,6 +182,5 @@ def service(running_home: str, visit: Visit) -> Iterator[str]:
 
 @pytest.fixture
 def filled(service: str, files: Files) -> str:
-    """The address of a service that has a room, a chair, and a job with both."""
     register(service, upload(service, files[:2]))
     return service

@@ -1,18 +1,32 @@
-"""The stories that the pretended job API tells: what the documents of its jobs, results and fields say."""
+"""A pretended job API for the page. A job's id is the story that its documents, its result and its fields tell."""
 
 from __future__ import annotations
 
 import io
+import json
 import math
+import mimetypes
+import re
 import threading
 from collections.abc import Callable
-from typing import Any
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from PIL import Image
 
 from regnf_core.errors import HINTS
-from tests.ui.synthetic import JOB_ID, Synthetic, rotation, sim3_document, similarity
+from tests.ui.synthetic import (
+    JOB_ID,
+    Synthetic,
+    object_mesh,
+    rotation,
+    scene_mesh,
+    sim3_document,
+    similarity,
+    synthetic,
+)
 
 STEPS: tuple[dict[str, Any], ...] = (
     {"status": "accepted", "queue_position": 3},
@@ -70,7 +84,6 @@ class Stage:
         self.changed = threading.Condition()
 
     def set(self, **state: Any) -> None:
-        """Change the state, and tell those who wait."""
         with self.changed:
             self.__dict__.update(state)
             self.changed.notify_all()
@@ -93,7 +106,6 @@ class Stage:
         return document | (_WAITING | STEPS[self.step] if story in ("live", "polled") else JOBS.get(story, {}))
 
     def rendering(self) -> dict[str, Any]:
-        """What the service answers when a rendering is asked for."""
         return self.job("rendered") | {"status": "accepted", **_WAITING}
 
     def result(self, story: str) -> dict[str, Any]:
@@ -110,7 +122,6 @@ def _listed(data: Synthetic, name: str) -> dict[str, Any]:
 
 
 def _ambiguous(data: Synthetic) -> dict[str, Any]:
-    """Two more poses, a covariance, a symmetry and options."""
     correlation = np.eye(7) + 0.3 * (np.eye(7, k=3) + np.eye(7, k=-3))
 
     def alternative(axis: list[float], angle: float, score: float, relation: str) -> dict[str, Any]:
@@ -138,8 +149,6 @@ def _ambiguous(data: Synthetic) -> dict[str, Any]:
 
 
 def _judged(data: Synthetic) -> dict[str, Any]:
-    """One more pose that was judged, and rejected."""
-
     def judged(T: dict[str, Any], reason: str, probability: float, free: float) -> dict[str, Any]:
         metrics = {"probability": probability, "free_space_violations": free, "score": None}
         return {"T_object_scene": T, "reason": reason, "detail": f"<b>{reason}</b>", "metrics": metrics}
@@ -150,8 +159,6 @@ def _judged(data: Synthetic) -> dict[str, Any]:
 
 
 def _searched(data: Synthetic) -> dict[str, Any]:
-    """The best of a search among twelve objects."""
-
     def candidate(number: int, stage: str, score: float | None, verdict: str | None = None) -> dict[str, Any]:
         reason = "NO_SURFACE_IN_OBJECT" if stage == "unusable" else None
         return {"object": f"{number:02x}" * 32, "stage": stage, "score": score, "verdict": verdict,
@@ -194,3 +201,145 @@ def field_picture(sha256: str) -> bytes:
     buffer = io.BytesIO()
     Image.new("RGB", (96, 32), f"#{sha256[:6]}").save(buffer, "PNG")
     return buffer.getvalue()
+
+
+# a small HTTP server with the page and a pretended job API, for the browser tests and for looking at the page
+
+
+WEB = Path(__file__).resolve().parents[2] / "service" / "regnf_service" / "web"
+CONTENT_SECURITY_POLICY = "default-src 'self'"
+TOKEN = "open-sesame"
+
+
+class Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    stage: ClassVar[Stage]
+
+    def do_GET(self) -> None:
+        path = self.path.split("?")[0].removeprefix("/v1")
+        if path.startswith("/static/"):
+            return self._file(WEB / path.removeprefix("/static/"))
+        if field := re.fullmatch(r"/fields/([0-9a-f]{64})(/mesh\.glb|/preview\.png|/candidates/1\.png)?", path):
+            return self._field(field[1], field[2] or "")
+        match = re.fullmatch(r"/jobs/(\w+)(/.*)?", path)
+        if not match:
+            return self._problem(404, "NOT_FOUND")
+        story, rest = match[1], match[2] or ""
+        if rest == "/view":
+            return self._file(WEB / "view.html")
+        if story not in STORIES:
+            return self._problem(404, "JOB_NOT_FOUND")
+        if story == "locked" and self._stranger():
+            return self._problem(401, "UNAUTHENTICATED")
+        return self._job(story, rest)
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        if self.path.endswith("/render"):
+            return self._json(202, self.stage.rendering())
+        if not self.path.endswith("/cancel"):
+            return self._problem(404, "NOT_FOUND")
+        self.stage.set(cancelled=True)
+        return self._json(202, {})
+
+    def _stranger(self) -> bool:
+        return self.headers.get("Authorization") != f"Bearer {TOKEN}"
+
+    def _field(self, sha256: str, rest: str) -> None:
+        if rest == "":
+            return self._json(200, field_document(sha256))
+        if rest == "/mesh.glb":
+            return self._bytes(200, scene_mesh() if sha256 == MESHED["scene"] else object_mesh(), "model/gltf-binary")
+        if "/locked/" in self.headers.get("Referer", "") and self._stranger():
+            return self._problem(401, "UNAUTHENTICATED")
+        return self._bytes(200, field_picture(sha256), "image/png")
+
+    def _job(self, story: str, rest: str) -> None:
+        if rest == "":
+            return self._json(200, self.stage.job(story))
+        if rest == "/result":
+            return self._json(200, self.stage.result(story))
+        if rest == "/events":
+            return self._problem(404, "NOT_FOUND") if story == "polled" else self._events(story)
+        name = rest.removeprefix("/artifacts/")
+        if (story, name) == ("rendered", STRIP):
+            return self._bytes(200, field_picture("7c" * 32), "image/png")
+        if name not in self.stage.data.artifacts or (story == "bare" and name == "trace.json"):
+            return self._problem(404, "ARTIFACT_NOT_FOUND")
+        data = self.stage.data.artifacts[name]
+        return self._bytes(200, data[:50] if story == "broken" else data, "application/octet-stream")
+
+    def _events(self, story: str) -> None:
+        """One event a change, until the job has ended or the server closes."""
+        self.send_response(200)
+        self.send_header("Content-Type", "text/event-stream")
+        self.send_header("Connection", "close")
+        self.end_headers()
+        self.close_connection = True
+        # a stream begins with the past: here an earlier attempt, which failed
+        past = {"status": "failed", "phase": "loading", "progress": 0.1, "attempt": 0, "updated": 1_779_999_000.0}
+        line = f"retry: 2000\n\nid: 0-1\nevent: status\ndata: {json.dumps(past)}\n\n"
+        stage, told, number = self.stage, dict[str, Any](), 0
+        while True:
+            try:
+                self.wfile.write(line.encode())
+                self.wfile.flush()
+            except OSError:
+                return
+            if stage.closing or told.get("status", "accepted") not in ("accepted", "running"):
+                return
+            before = told
+            with stage.changed:
+                stage.changed.wait_for(lambda known=before: stage.closing or stage.job(story) != known, timeout=0.5)
+                told = stage.job(story)
+            number += told != before
+            data = {name: told[name] for name in ("status", "phase", "progress", "error")} | {"attempt": 1}
+            event = f"id: {number}-0\nevent: progress\ndata: {json.dumps(data)}\n\n"
+            line = event if told != before else ": still here\n\n"
+
+    def _file(self, path: Path) -> None:
+        if not path.is_file() or WEB not in path.resolve().parents:
+            return self._problem(404, "NOT_FOUND")
+        return self._bytes(200, path.read_bytes(), mimetypes.guess_type(path.name)[0] or "text/plain")
+
+    def _problem(self, status: int, reason: str) -> None:
+        self._json(status, {"title": reason.replace("_", " ").capitalize(), "status": status, "reason": reason})
+
+    def _json(self, status: int, document: dict[str, Any]) -> None:
+        self._bytes(status, json.dumps(document).encode(), "application/json")
+
+    def _bytes(self, status: int, data: bytes, media_type: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", media_type)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Content-Security-Policy", CONTENT_SECURITY_POLICY)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, *_: object) -> None:
+        """Tests need no access log."""
+
+
+class FixtureServer:
+    """Serves on a free port of the loopback interface, in a thread of its own, while the context is open."""
+
+    def __init__(self) -> None:
+        self.stage = Stage(synthetic())
+        handler = type("BoundHandler", (Handler,), {"stage": self.stage})
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05})
+        self.origin = f"http://127.0.0.1:{self._server.server_address[1]}"
+
+    def __enter__(self) -> FixtureServer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stage.set(closing=True)
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def view(self, story: str) -> str:
+        return f"{self.origin}/jobs/{story}/view"

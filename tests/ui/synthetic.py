@@ -29,7 +29,6 @@ _SPACING = 0.018
 
 
 def rotation(axis: list[float], angle: float) -> Array:
-    """The rotation matrix (3, 3) about an axis."""
     turn: Array = rotation_matrix(angle, axis)[:3, :3]
     return turn
 
@@ -43,7 +42,6 @@ def similarity(scale: float, turn: Array, shift: list[float]) -> Array:
 
 
 def sim3_document(matrix: Array) -> dict[str, Any]:
-    """As the API writes it: the matrix and its parts."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     w, x, y, z = quaternion_from_matrix(similarity(1.0, matrix[:3, :3] / scale, [0, 0, 0])).tolist()
     parts = {"rotation_quaternion_xyzw": [x, y, z, w], "translation": matrix[:3, 3].tolist()}
@@ -58,7 +56,6 @@ LIBRARY_FROM_CHAIR = similarity(1.6, rotation([0, 0, 1], math.radians(30)), [0.0
 
 
 def _boxes(*corners: list[float]) -> trimesh.Trimesh:
-    """Boxes of lower and upper corners, one mesh."""
     made = [trimesh.creation.box(bounds=[corner[:3], corner[3:]]) for corner in corners]
     mesh = trimesh.util.concatenate(made)
     assert isinstance(mesh, trimesh.Trimesh)
@@ -85,13 +82,11 @@ def room() -> trimesh.Trimesh:
 
 
 def scene_mesh() -> bytes:
-    """The display mesh of the room with its chair."""
     both = trimesh.util.concatenate([room(), chair(CHAIR_IN_SCENE)])
     return mesh_file(both.vertices, both.faces)
 
 
 def object_mesh() -> bytes:
-    """The display mesh of the chair by itself."""
     alone = chair(LIBRARY_FROM_CHAIR)
     return mesh_file(alone.vertices, alone.faces)
 
@@ -103,7 +98,6 @@ def _samples(mesh: trimesh.Trimesh, spacing: float) -> tuple[Array, Array]:
 
 
 def _ply(points: Array, normals: Array, color: tuple[int, int, int]) -> bytes:
-    """A binary little-endian PLY file: x y z nx ny nz red green blue."""
     reals, colors = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
     rows = np.empty(len(points), [(name, "<f4") for name in reals] + [(name, "u1") for name in colors])
     for name, values in zip((*reals, *colors), (*points.T, *normals.T, *color), strict=True):
@@ -118,8 +112,6 @@ def _ply(points: Array, normals: Array, color: tuple[int, int, int]) -> bytes:
 
 @dataclass(frozen=True)
 class Synthetic:
-    """What the fixture serves: the result document, the detection and the artifacts' bytes."""
-
     result: dict[str, Any]
     detection: dict[str, Any]
     artifacts: dict[str, bytes]
@@ -156,7 +148,6 @@ def _residuals(points: Array, rng: np.random.Generator) -> Array:
 
 
 def synthetic() -> Synthetic:
-    """The whole made-up registration; always the same."""
     rng = np.random.default_rng(7)
     T_scene_object = CHAIR_IN_SCENE @ np.linalg.inv(LIBRARY_FROM_CHAIR)
     T_object_scene = np.linalg.inv(T_scene_object)

@@ -42,7 +42,6 @@ def test_every_operation_is_listed_and_folded_and_the_search_leaves_what_matches
 
 
 def test_an_address_is_tried(visit: Visit, service: str) -> None:
-    """A body is at first the contract's first example."""
     page = open_docs(visit, service, "#get_job")
     form = page.locator("#get_job form")
     form.get_by_role("button", name="Send GET").click()

@@ -11,8 +11,7 @@ from playwright.sync_api import Page, Route, expect
 
 from tests.ui import room
 from tests.ui.conftest import Files, Visit
-from tests.ui.home import CHAIR, NETWORK, choose_scene, click_at, give_files, open_page, register, upload
-from tests.ui.pixels import box_of
+from tests.ui.home import CHAIR, NETWORK, box_of, choose_scene, click_at, give_files, open_page, register, upload
 
 pytestmark = pytest.mark.browser
 VIEWPORT = (1280, 800)

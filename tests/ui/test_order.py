@@ -11,8 +11,7 @@ from playwright.sync_api import Page, Route, expect
 from regnf_state.settings import Settings
 from tests.ui import room
 from tests.ui.conftest import Files, Visit
-from tests.ui.delays import Held
-from tests.ui.home import CHAIR, choose_scene, click_at, give_files, home, open_page
+from tests.ui.home import CHAIR, Held, choose_scene, click_at, give_files, home, open_page
 
 pytestmark = pytest.mark.browser
 VIEWPORT = (1280, 800)

@@ -1,77 +1,50 @@
-"""The page served by the real application, over the real stores; and pages of other sites in a real browser.
-
-Those try what pages can do to a service on this machine, and get nothing.
-"""
+"""Pages of other sites in a real browser: they try what pages can do to a service on this machine, and get nothing."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from regnf_state.blobs.base import BlobStore
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from tests.stores import private_stores
-from tests.ui.conftest import ARGUMENTS, Visit, chromium
-from tests.ui.fixture_server import FixtureServer
+from tests.ui.conftest import ARGUMENTS, chromium
 from tests.ui.home import served
 from tests.ui.stories import field_picture
-from tests.ui.synthetic import JOB_ID, Synthetic
+from tests.ui.synthetic import JOB_ID, synthetic
 
 pytestmark = pytest.mark.browser
 SCENE, OBJECT = "a3" * 32, "7c" * 32
 
 
-@dataclass(frozen=True)
-class RealService:
-    """The application on a port of its own, with one accepted job and its two fields in its store."""
-
+class RealService(NamedTuple):
     origin: str
     records: RecordStore
-    blobs: BlobStore
 
     @property
     def view(self) -> str:
         return f"{self.origin}/jobs/{JOB_ID}/view"
 
-    def accept(self, detection: dict[str, object]) -> None:
-        now = time.time()
-        inputs = {"scene": SCENE, "object": OBJECT, "seed": 7, "detection": detection}
-        job = JobRecord(
-            JOB_ID, "registration", "accepted", request={"scene": SCENE}, inputs=inputs, created=now, updated=now
-        )
-        self.records.create_job(job, max_active=10)
-        for sha256 in (SCENE, OBJECT):
-            self.records.create_field(FieldRecord(sha256, "ready", bytes=1, created=now, updated=now))
-            self.blobs.put(f"fields/{sha256}/preview.png", field_picture(sha256))
-
-
-@contextmanager
-def real_service(data: Synthetic) -> Iterator[RealService]:
-    with private_stores() as stores, served(Settings(), stores) as origin:
-        made = RealService(origin, stores.records, stores.blobs)
-        made.accept(data.detection)
-        yield made
-
 
 @pytest.fixture(scope="module")
-def service(running_server: FixtureServer) -> Iterator[RealService]:
-    """For tests that change nothing."""
-    with real_service(running_server.stage.data) as made:
-        yield made
+def service() -> Iterator[RealService]:
+    """The application on a port of its own, with one accepted job and its two fields in its store."""
+    with private_stores() as stores, served(Settings(), stores) as origin:
+        now, inputs = time.time(), {"scene": SCENE, "object": OBJECT, "seed": 7, "detection": synthetic().detection}
+        stores.records.create_job(JobRecord(JOB_ID, "registration", "accepted", {"scene": SCENE}, inputs, now, now), 10)
+        for sha256 in (SCENE, OBJECT):
+            stores.records.create_field(FieldRecord(sha256, "ready", 1, now, now))
+            stores.blobs.put(f"fields/{sha256}/preview.png", field_picture(sha256))
+        yield RealService(origin, stores.records)
 
-
-# pages of other sites
 
 EVIL, REBOUND = "evil.example", "rebound.example"
 RULES = f"--host-resolver-rules=MAP {EVIL} 127.0.0.1, MAP {REBOUND} 127.0.0.1, MAP localhost 127.0.0.1"
@@ -131,7 +104,6 @@ class _EvilPage(BaseHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def evil_port() -> Iterator[int]:
-    """Where a page of another site is served."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), _EvilPage)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
     thread.start()
@@ -202,26 +174,3 @@ def test_a_name_that_is_made_to_lead_here_opens_nothing(page: Page, service: Rea
     calls = [["GET", "/fields"], ["DELETE", f"/fields/{SCENE}"], ["POST", f"/jobs/{JOB_ID}/cancel"], ["GET", "/jobs"]]
     calls += [["GET", f"/fields/{SCENE}/preview.png"], ["PUT", f"/fields/{SCENE}"], ["DELETE", f"/jobs/{JOB_ID}"]]
     assert set(page.evaluate(script, calls)) == {421}
-
-
-# the page itself
-
-
-def test_follows_a_job_of_the_real_service_to_its_end(visit: Visit) -> None:
-    page = visit.page
-    with real_service(visit.server.stage.data) as service:
-        page.goto(service.view)
-        expect(page.locator("#message-title")).to_have_text("In the queue")
-        service.records.update_job(JOB_ID, 1, status="running")
-        service.records.update_job(JOB_ID, 1, phase="optimizing", progress=0.5)
-        expect(page.locator("#message-title")).to_have_text("Optimizing", timeout=30_000)
-        service.records.update_job(JOB_ID, 1, progress=0.75)
-        expect(page.locator("#message-text")).to_have_text("75 % done", timeout=30_000)
-        error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "12 points were found; 500 are needed."}
-        service.records.update_job(JOB_ID, 1, status="failed", error=error)
-        expect(page.locator("#message-text")).to_have_text("12 points were found; 500 are needed.", timeout=30_000)
-        expect(page.locator("#message-title")).to_have_text("No surface in the detection")
-        expect(page.locator("#field-pictures canvas")).to_have_count(2)
-        assert visit.complaints == []
-        assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
-        page.goto("about:blank")  # lets go of the connections before the server ends

@@ -29,7 +29,6 @@ VIEWPORT = (1280, 800)
 
 @pytest.fixture
 def serving(tmp_path: Path) -> Iterator[str]:
-    """The address of `regnf serve` with a state of its own."""
     command = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(tmp_path / "state")]
     plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
     with (

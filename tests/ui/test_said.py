@@ -12,8 +12,7 @@ from playwright.sync_api import Route, expect
 
 from regnf_core.options import RobustOptions
 from tests.ui.conftest import Files, Visit
-from tests.ui.home import CHAIR, NETWORK, choose_scene, click_at, give_files, open_page, register, upload
-from tests.ui.pixels import box_of
+from tests.ui.home import CHAIR, NETWORK, box_of, choose_scene, click_at, give_files, open_page, register, upload
 from tests.ui.test_access import NONE, in_both_themes
 
 pytestmark = pytest.mark.browser
@@ -170,7 +169,6 @@ def test_an_import_that_waits_says_so(visit: Visit, service: str, files: Files) 
 def test_the_result_lies_over_the_scene_and_nothing_scrolls_but_the_panel(
     visit: Visit, service: str, files: Files
 ) -> None:
-    """The options are those of the contract."""
     page = visit.page
     open_page(page, service)
     page.locator("#options > summary").click()

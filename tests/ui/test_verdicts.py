@@ -10,9 +10,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.ui.conftest import Visit
-from tests.ui.fixture_server import WEB
-from tests.ui.pixels import canvas_pixels, changed_share
-from tests.ui.stories import DETAIL, LABELS, OPTIONS, ORDERING, SIGMAS, WARNING
+from tests.ui.home import canvas_pixels, changed_share
+from tests.ui.stories import DETAIL, LABELS, OPTIONS, ORDERING, SIGMAS, WARNING, WEB
 from tests.ui.test_access import NONE, in_both_themes
 
 pytestmark = pytest.mark.browser
@@ -126,7 +125,6 @@ def test_what_is_known_of_a_pose_is_told(visit: Visit) -> None:
 
 
 def test_every_alternative_moves_the_object_and_the_result_comes_back(visit: Visit) -> None:
-    """The colors of residuals say whose they are."""
     page = visit.open("ambiguous")
     poses, note = page.locator("#pose-list label"), page.locator("#transform-note")
     relations = ["172 degrees about z", "180 degrees about x"]
@@ -180,7 +178,6 @@ def test_a_search_shows_its_ranking(visit: Visit) -> None:
 
 
 def red_share(page: Page) -> float:
-    """The share of the view that is marked red."""
     red, green, blue = np.moveaxis(canvas_pixels(page), -1, 0)
     return float(((red - green > 90) & (red - blue > 90)).mean())
 

@@ -11,12 +11,12 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.ui.conftest import Visit
-from tests.ui.fixture_server import TOKEN
-from tests.ui.pixels import Mask, blue, box_of, canvas_pixels, changed_share, differs, orange, overlap
-from tests.ui.stories import LABELS
+from tests.ui.home import Mask, blue, box_of, canvas_pixels, changed_share, differs, orange, overlap
+from tests.ui.stories import LABELS, TOKEN
 from tests.ui.synthetic import ITERATIONS
 
 pytestmark = pytest.mark.browser
+VIEWPORT = (1100, 700)
 ROOM, CHAIR = LABELS["a3"], LABELS["7c"]
 
 
@@ -40,7 +40,6 @@ def assert_layers(page: Page, least: dict[str, float]) -> None:
 
 
 def distance(one: Mask, other: Mask) -> float:
-    """Between the middles of two masks, pixels."""
     return math.dist(*(np.argwhere(mask).mean(axis=0) for mask in (one, other)))
 
 
