@@ -10,11 +10,11 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.composite import BoxField, SurfaceSource, UnionField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_mesh
+from tests.core.importing.archives import assert_refused
 
 BOX = BoxField((-0.3, -0.2, -0.1), (0.3, 0.2, 0.5))
 
@@ -84,9 +84,7 @@ def test_mesh_moves() -> None:
     ],
 )
 def test_what_is_no_mesh_is_refused(vertices: object, faces: object) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        MeshField(np.asarray(vertices), np.asarray(faces))
-    assert caught.value.reason == "MESH_INVALID"
+    assert_refused(lambda: MeshField(np.asarray(vertices), np.asarray(faces)), "MESH_INVALID")
 
 
 @pytest.mark.parametrize(
@@ -100,9 +98,7 @@ def test_what_is_no_mesh_is_refused(vertices: object, faces: object) -> None:
 )
 def test_files_that_hold_no_sound_mesh_are_refused(name: str, content: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(content)
-    with pytest.raises(FieldFormatError) as caught:
-        load_mesh(tmp_path / name)
-    assert caught.value.reason == "MESH_INVALID"
+    assert_refused(lambda: load_mesh(tmp_path / name), "MESH_INVALID")
     with pytest.raises(FileNotFoundError):
         load_mesh(tmp_path / "absent.glb")
     with pytest.raises(IsADirectoryError):

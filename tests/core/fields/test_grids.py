@@ -10,13 +10,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields import voxel_blocks
 from regnf_core.fields.build import build_field, open_field
 from regnf_core.fields.observation import SdfField, has_color
 from regnf_core.fields.voxel_blocks import CellIndex
 from regnf_core.schema.safe_format import parse_description, write_safe_field
 from tests.core.fields.grids import numeric_gradient, slow_trilinear
+from tests.core.importing.archives import assert_refused
 
 # The index of occupied cells: against a search through all of them.
 
@@ -74,9 +74,7 @@ def test_few_cells_far_apart_take_little_memory() -> None:
     ],
 )
 def test_faulty_cells_are_refused(cells: torch.Tensor) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        CellIndex.of(cells)
-    assert caught.value.reason == "FIELD_INDEX_INVALID"
+    assert_refused(lambda: CellIndex.of(cells), "FIELD_INDEX_INVALID")
 
 
 # The kind ``voxel_grid``: against slow interpolation, on the grid's borders, and far outside.
@@ -156,9 +154,10 @@ def test_colors_are_interpolated_between_the_nodes_that_have_one() -> None:
 def test_colors_of_other_shapes_are_refused(tmp_path: Path) -> None:
     described = description(color={"form": "values"})
     colors = np.zeros((*VALUES.shape[:2], 3), np.float32)
-    with pytest.raises(FieldFormatError) as error:
-        write_safe_field(tmp_path / "f.safetensors", described, {"values": VALUES, "color.values": colors})
-    assert error.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(
+        lambda: write_safe_field(tmp_path / "f.safetensors", described, {"values": VALUES, "color.values": colors}),
+        "FIELD_SHAPES_MISMATCH",
+    )
 
 
 def test_half_precision_stays_half_and_is_evaluated_in_single(tmp_path: Path) -> None:
@@ -183,15 +182,11 @@ def test_world_scale_moves_the_grid_along() -> None:
     "values", [np.zeros((4, 4), np.float32), np.zeros((1, 4, 4), np.float32), np.zeros((4, 4, 4), np.int32)]
 )
 def test_other_shapes_and_types_are_refused(tmp_path: Path, values: NDArray[Any]) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        write_safe_field(tmp_path / "f", description(), {"values": values})
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(lambda: write_safe_field(tmp_path / "f", description(), {"values": values}), "FIELD_SHAPES_MISMATCH")
 
 
 @pytest.mark.parametrize(
     "changes", [{"spacing": [0.1, 0.0, 0.1]}, {"spacing": [0.1, -0.1, 0.1]}, {"origin": [0.0, float("nan"), 0.0]}]
 )
 def test_faulty_placements_are_refused(changes: dict[str, Any]) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        parse_description(description(**changes))
-    assert caught.value.reason == "SAFE_FORMAT_INVALID"
+    assert_refused(lambda: parse_description(description(**changes)), "SAFE_FORMAT_INVALID")

@@ -12,11 +12,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field, open_field
 from regnf_core.fields.observation import SdfField
 from regnf_core.schema.safe_format import parse_description, write_safe_field
 from tests.core.fields.grids import numeric_gradient
+from tests.core.importing.archives import assert_refused
 
 Array = NDArray[Any]
 CELL, REACH, MOST = 0.3, 2.5, 0.9
@@ -169,6 +169,4 @@ def test_a_place_on_a_point_is_finite() -> None:
     ],
 )
 def test_tensors_that_do_not_fit_are_refused(tmp_path: Path, change: dict[str, Array]) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        write_safe_field(tmp_path / "f", description(), tensors() | change)
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(lambda: write_safe_field(tmp_path / "f", description(), tensors() | change), "FIELD_SHAPES_MISMATCH")

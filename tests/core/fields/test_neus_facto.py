@@ -146,12 +146,9 @@ CONTRACTED = ("linf", "sdf_contracted", "gradient_contracted_wrt_input")
 @pytest.mark.parametrize(
     ("family", "contraction", "values", "gradients"),
     [
-        ("sdfstudio_neus_facto", *RAW),
-        ("sdfstudio_neus_facto", *CONTRACTED),
-        ("sdfstudio_neus_facto_angelo", *RAW),
-        ("sdfstudio_neus_facto_angelo", *CONTRACTED),
-        ("sdfstudio_neus", *RAW),
-        ("sdfstudio_neus", *CONTRACTED),
+        *(("sdfstudio_neus_facto", *RAW), ("sdfstudio_neus_facto", *CONTRACTED)),
+        *(("sdfstudio_neus_facto_angelo", *RAW), ("sdfstudio_neus_facto_angelo", *CONTRACTED)),
+        *(("sdfstudio_neus", *RAW), ("sdfstudio_neus", *CONTRACTED)),
         ("nerfstudio_neus_facto", "linf_grid", "sdf", "gradient"),
     ],
 )

@@ -110,11 +110,8 @@ def without_tensor(name: str) -> Tensors:
         with_tensor("layers.1.bias", tensors()["layers.1.bias"][:-1]),
         with_tensor("layers.2.weight", tensors()["layers.2.weight"][:0]),
         with_tensor("layers.1.weight", tensors()["layers.1.weight"][0, 0]),
-        with_tensor("color.weight", tensors()["layers.1.weight"]),
-        without_tensor("hash_table"),
-        without_tensor("layers.1.bias"),
-        without_tensor("layers.1.weight"),
-        {"hash_table": tensors()["hash_table"]},
+        *(with_tensor("color.weight", tensors()["layers.1.weight"]), without_tensor("hash_table")),
+        *(without_tensor("layers.1.bias"), without_tensor("layers.1.weight"), {"hash_table": tensors()["hash_table"]}),
     ],
 )
 def test_tensors_that_do_not_fit_the_description(faulty: Tensors, tmp_path: Path) -> None:

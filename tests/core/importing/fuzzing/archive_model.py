@@ -12,13 +12,7 @@ from tests.core.importing.fuzzing.byte_mutations import NUMBERS, little
 _LOCAL_FIELDS = {"version": 2, "flags": 2, "method": 2, "time": 2, "date": 2, "crc": 4, "packed": 4, "size": 4}
 _CENTRAL_FIELDS = {"made_by": 2, **_LOCAL_FIELDS}
 _NAMES: tuple[bytes, ...] = (
-    b"archive/../x",
-    b"/x",
-    b"x",
-    b"archive/data.pkl",
-    b"archive/data/0",
-    b"archive/code/x.py",
-    b"other/y",
+    *(b"archive/../x", b"/x", b"x", b"archive/data.pkl", b"archive/data/0", b"archive/code/x.py", b"other/y"),
 )
 _NAMES += (b"archive/\xff", b"archive/a\0b", b"archive/" + b"n" * 600, b"archive/byteorder", b"archive/constants.pkl")
 

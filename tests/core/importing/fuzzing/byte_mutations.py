@@ -7,19 +7,7 @@ import struct
 from random import Random
 
 NUMBERS: tuple[int, ...] = (
-    0,
-    1,
-    2,
-    0x7F,
-    0xFF,
-    0x100,
-    0x7FFF,
-    0xFFFF,
-    1 << 16,
-    (1 << 31) - 1,
-    1 << 31,
-    (1 << 32) - 1,
-    1 << 32,
+    *(0, 1, 2, 0x7F, 0xFF, 0x100, 0x7FFF, 0xFFFF, 1 << 16, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 32),
 )
 NUMBERS += ((1 << 47), (1 << 48) - 1, 1 << 48, (1 << 62), (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 """Where counts, lengths and offsets change their nature."""

@@ -27,24 +27,15 @@ _WORDS: tuple[bytes, ...] = (
 _LEGACY_PICKLES = 5
 _HEADER_END = b"end_header\n"
 _STATEMENTS = (
-    "DELETE FROM {table} WHERE rowid % 2",
-    "DELETE FROM {table}",
-    "INSERT INTO {table} SELECT * FROM {table}",
-    "INSERT INTO {table} SELECT * FROM {table} LIMIT 1",
-    "UPDATE {table} SET {column} = {value}",
-    "UPDATE {table} SET {column} = {value} WHERE rowid = 1",
-    "ALTER TABLE {table} RENAME COLUMN {column} TO odd",
-    "ALTER TABLE {table} DROP COLUMN {column}",
-    "ALTER TABLE {table} RENAME TO odd",
-    "ALTER TABLE {table} ADD COLUMN {column}_more",
-    "CREATE VIEW odd AS SELECT * FROM {table}",
+    *("DELETE FROM {table} WHERE rowid % 2", "DELETE FROM {table}", "INSERT INTO {table} SELECT * FROM {table}"),
+    *("INSERT INTO {table} SELECT * FROM {table} LIMIT 1", "UPDATE {table} SET {column} = {value}"),
+    *("UPDATE {table} SET {column} = {value} WHERE rowid = 1", "ALTER TABLE {table} RENAME COLUMN {column} TO odd"),
+    *("ALTER TABLE {table} DROP COLUMN {column}", "ALTER TABLE {table} RENAME TO odd"),
+    *("ALTER TABLE {table} ADD COLUMN {column}_more", "CREATE VIEW odd AS SELECT * FROM {table}"),
     "CREATE TABLE occupancy_layer_data AS SELECT * FROM {table}",
-    "CREATE TABLE other_tsdf_layer_data AS SELECT * FROM {table}",
-    "CREATE INDEX odd ON {table}({column})",
-    "CREATE TRIGGER odd AFTER INSERT ON {table} BEGIN DELETE FROM {table}; END",
-    "PRAGMA user_version = {value}",
-    "PRAGMA application_id = {value}",
-    "PRAGMA auto_vacuum = 1",
+    *("CREATE TABLE other_tsdf_layer_data AS SELECT * FROM {table}", "CREATE INDEX odd ON {table}({column})"),
+    *("CREATE TRIGGER odd AFTER INSERT ON {table} BEGIN DELETE FROM {table}; END", "PRAGMA user_version = {value}"),
+    *("PRAGMA application_id = {value}", "PRAGMA auto_vacuum = 1"),
 )
 _BLOB = "a block"
 _VALUES: tuple[str, ...] = (

@@ -11,12 +11,7 @@ import numpy as np
 import torch
 import trimesh
 
-from tests.core.importing import (
-    onnx_models,
-    test_nvblox,
-    test_pin_slam,
-    test_voxel_block_grid,
-)
+from tests.core.importing import onnx_models, test_nvblox, test_pin_slam, test_voxel_block_grid
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.fuzzing.run_files import make_runs, make_settings

@@ -21,17 +21,7 @@ _FIELDS = {
     "prefix": (345, 500),
 }
 _NAMES = (
-    b"../x",
-    b"/etc/passwd",
-    b"run/config.yml",
-    b"",
-    b".",
-    b"./",
-    b"a\\b",
-    b"a\0b",
-    b"\xff",
-    b"n" * 100,
-    b"run//x",
+    *(b"../x", b"/etc/passwd", b"run/config.yml", b"", b".", b"./", b"a\\b", b"a\0b", b"\xff", b"n" * 100, b"run//x"),
 )
 _SIZES = (b"00000000000", b"77777777777", b"\x80" + b"\xff" * 11, b"\x80" + bytes(10) + b"\x01", b"x" * 12, b"", b"1")
 _KINDS = (b"0", b"\0", b"1", b"2", b"3", b"5", b"6", b"7", b"S", b"x", b"g", b"L", b"K", b"V", b"\xff")

@@ -32,15 +32,7 @@ PARTS = ("container", "pickle", "tensors", "header", "settings")
 _TAKEN = "taken"
 _LIMITS = ImportLimits(wall_s=100, tensor_bytes=BUDGET)
 _QUIET = (
-    "object.",
-    "sys._getframe",
-    "code.__new__",
-    "builtins.id",
-    "gc.",
-    "tempfile.",
-    "time.",
-    "sys.",
-    "mmap.",
+    *("object.", "sys._getframe", "code.__new__", "builtins.id", "gc.", "tempfile.", "time.", "sys.", "mmap."),
     "sqlite3.",
 )
 """Beginnings of the audit events that mean nothing here."""

@@ -70,12 +70,7 @@ def distances(folder: Path, name: str, data: bytes, shift: tuple[float, float, f
 
 @pytest.mark.parametrize(
     ("write", "shift"),
-    [
-        (obj, UTM),
-        (glb, ECEF),
-        (lambda s: ply(s, "ascii"), NEARBY),
-        (lambda s: ply(s, "binary_little_endian"), UTM),
-    ],
+    [(obj, UTM), (glb, ECEF), (lambda s: ply(s, "ascii"), NEARBY), (lambda s: ply(s, "binary_little_endian"), UTM)],
     ids=["obj", "glb", "ply text", "ply"],
 )
 def test_a_mesh_keeps_its_digits(write, shift: tuple[float, float, float], tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -132,13 +132,8 @@ def test_compressed_points_unpack_to_exactly_what_is_claimed() -> None:
     assert bytes(unpack_lzf(memoryview(packed), len(raw))) == raw
     assert bytes(unpack_lzf(memoryview(b"\x02abc\xe0\x09\x02"), 21)) == b"abc" * 7  # a copy that overlaps itself
     for faulty, size in (
-        (packed, len(raw) - 1),
-        (packed, len(raw) + 1),
-        (packed[:-1], len(raw)),
-        (b"\x20\x05", 3),
-        (b"\xe0", 9),
-        (b"\x00", 1),
-        (b"\x00a", 1 << 40),
+        *((packed, len(raw) - 1), (packed, len(raw) + 1), (packed[:-1], len(raw)), (b"\x20\x05", 3), (b"\xe0", 9)),
+        *((b"\x00", 1), (b"\x00a", 1 << 40)),
     ):
         assert_refused(partial(unpack_lzf, memoryview(faulty), size), "MESH_INVALID")
 
@@ -158,13 +153,10 @@ STL = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
-        ("# File exported by Houdini\ng\n" + SHEET, "obj"),
-        ("o\ns off\nusemtl\n" + SHEET, "obj"),
-        ("# licence\n" + "# words\n" * 200 + SHEET, "obj"),
-        ("\ufeff" + SHEET, "obj"),
+        *(("# File exported by Houdini\ng\n" + SHEET, "obj"), ("o\ns off\nusemtl\n" + SHEET, "obj")),
+        *(("# licence\n" + "# words\n" * 200 + SHEET, "obj"), ("\ufeff" + SHEET, "obj")),
         ("\ufeff# begun\r\n" + SHEET.replace("\n", "\r\n"), "obj"),
-        ("solid " + "/" * 900 + " vertex 1 2 3\n" + STL, "stl"),
-        ("\n  SOLID THING\n" + STL.upper(), "stl"),
+        *(("solid " + "/" * 900 + " vertex 1 2 3\n" + STL, "stl"), ("\n  SOLID THING\n" + STL.upper(), "stl")),
         ("\ufeffsolid thing\n" + STL, "stl"),
     ],
 )
@@ -218,28 +210,16 @@ def test_ply_vertices_with_lists_are_read() -> None:
 @pytest.mark.parametrize(
     ("head", "named"),
     [
-        (b"LASF\0\0", "LAS"),
-        (b"ASTM-E57", "E57"),
-        (b"PXR-USDC\0", "USD"),
-        (b"#usda 1.0\n", "USD"),
-        (b"Kaydara FBX Binary  \0", "FBX"),
-        (b"ISO-10303-21;\nHEADER;", "STEP"),
-        (b"# vtk DataFile Version 3.0\n", "VTK"),
-        (b'<?xml version="1.0"?>\n<VTKFile type="PolyData">', "VTK"),
-        (b'<?xml version="1.0"?>\n<robot name="r">', "URDF"),
-        (b"BLENDER-v300", "Blender"),
-        (b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"),
-        (b"# Octomap OcTree binary file\n", "OctoMap"),
-        (b"NRRD0004\n", "NRRD"),
-        (b"\xef\xbb\xbf\r\n<robot name='arm'>", "URDF"),
-        (b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo"),
-        (b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF"),
-        (b"AC1032\0\0", "DWG"),
-        (b"#X3D V3.0 utf8\n", "X3D"),
-        (b"\xef\xbb\xbf<?xml version='1.0'?>\n<COLLADA version='1.4.1'>", "COLLADA"),
-        (b"COFF BINARY\n", "OFF"),
-        (b"OFF8 12 0\n", "OFF"),
-        (b"# a license\n\nSTCNOFF\n8 12 0\n", "OFF"),
+        *((b"LASF\0\0", "LAS"), (b"ASTM-E57", "E57"), (b"PXR-USDC\0", "USD"), (b"#usda 1.0\n", "USD")),
+        *((b"Kaydara FBX Binary  \0", "FBX"), (b"ISO-10303-21;\nHEADER;", "STEP")),
+        *((b"# vtk DataFile Version 3.0\n", "VTK"), (b'<?xml version="1.0"?>\n<VTKFile type="PolyData">', "VTK")),
+        *((b'<?xml version="1.0"?>\n<robot name="r">', "URDF"), (b"BLENDER-v300", "Blender")),
+        *((b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"), (b"# Octomap OcTree binary file\n", "OctoMap")),
+        *((b"NRRD0004\n", "NRRD"), (b"\xef\xbb\xbf\r\n<robot name='arm'>", "URDF")),
+        *((b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo"), (b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF")),
+        *((b"AC1032\0\0", "DWG"), (b"#X3D V3.0 utf8\n", "X3D")),
+        *((b"\xef\xbb\xbf<?xml version='1.0'?>\n<COLLADA version='1.4.1'>", "COLLADA"), (b"COFF BINARY\n", "OFF")),
+        *((b"OFF8 12 0\n", "OFF"), (b"# a license\n\nSTCNOFF\n8 12 0\n", "OFF")),
     ],
 )
 def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:

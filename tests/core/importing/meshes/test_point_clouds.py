@@ -174,10 +174,7 @@ def test_clouds_whose_normals_are_turned_in_patches_are_refused(
 @pytest.mark.parametrize(
     "cloud",
     [
-        (BALL, BALL),
-        (-BALL, BALL),
-        BOARDS[:2],
-        boxes((1.0, 1.0, 0.02))[:2],
+        *((BALL, BALL), (-BALL, BALL), BOARDS[:2], boxes((1.0, 1.0, 0.02))[:2]),
         (CROSS[0] - 2.0 * (CROSS[2] // 6)[:, None] * [1, 0, 0], CROSS[1]),
     ],
     ids=["ball", "hollow", "boards", "board", "boards that cross"],

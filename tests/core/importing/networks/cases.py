@@ -115,8 +115,4 @@ def siren(rng: np.random.Generator, steps: int) -> Case:
     )
 
 
-FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {
-    "neus": neus,
-    "deepsdf": deepsdf,
-    "siren": siren,
-}
+FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {"neus": neus, "deepsdf": deepsdf, "siren": siren}

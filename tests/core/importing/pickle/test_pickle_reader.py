@@ -162,13 +162,7 @@ def test_everything_done_to_a_placeholder_is_without_effect() -> None:
         b"P0\n",  # PERSID
         b"\x97",  # NEXT_BUFFER
         b"\x98",  # READONLY_BUFFER
-        b"I1\n",
-        b"L1L\n",
-        b"F1.5\n",
-        b"S'a'\n",
-        b"Va\n",
-        b"g0\n",
-        b"\xff",
+        *(b"I1\n", b"L1L\n", b"F1.5\n", b"S'a'\n", b"Va\n", b"g0\n", b"\xff"),
     ],
 )
 def test_opcodes_that_no_checkpoint_needs_are_refused(opcodes: bytes) -> None:
@@ -187,8 +181,7 @@ def test_other_protocols_are_refused(data: bytes) -> None:
         b"NN",  # two values
         b"(",  # a mark left over
         b"0",  # POP of nothing
-        b"a",
-        b"Na",
+        *(b"a", b"Na"),
         b"]NNs",  # a key for a list
         b"}Na",  # an item for a dict
         b"}(Nu",  # a key without a value
@@ -199,27 +192,18 @@ def test_other_protocols_are_refused(data: bytes) -> None:
         b"N)R",  # a call of None
         b"cos\nsystem\nNR",  # arguments that are no tuple
         b"Nq\x00}b",  # state for None
-        b"NQ",
-        text("storage") + b"Q",
+        *(b"NQ", text("storage") + b"Q"),
         b"X\x05\x00\x00\x00ab",  # a string cut short
         b"X\x01\x00\x00\x00\xff",  # not UTF-8
-        b"cos\x00\nsystem\n",
-        b"c" + b"a" * 600,
-        b"\x93",
-        b"NN\x93",
+        *(b"cos\x00\nsystem\n", b"c" + b"a" * 600, b"\x93", b"NN\x93"),
         b"\x95\xff\xff\xff\xff\xff\xff\xff\x7fN",  # a frame beyond the end
         b"\x95\x02\x00\x00\x00\x00\x00\x00\x00X\x00\x00\x00\x00",  # an opcode across a frame's end
         b"\x95\x0b\x00\x00\x00\x00\x00\x00\x00\x95\x01\x00\x00\x00\x00\x00\x00\x00N",  # a frame within a frame
         tensor("0", (2,), (1,)) + b"}b",  # state for a tensor
         tensor("0", (2,), (1,)) + b"NNs",  # an item of a tensor
-        tensor("0", (2,), (1, 1)),
-        tensor("0", (-2,), (1,)),
-        tensor("0", (2,), (-1,)),
-        tensor("0", (2,), (1,), offset=-1),
-        tensor("../0", (2,), (1,)),
-        storage("0", -1),
-        b"ctorch._utils\n_rebuild_tensor_v2\n)R",
-        b"ctorch._utils\n_rebuild_parameter\n)R",
+        *(tensor("0", (2,), (1, 1)), tensor("0", (-2,), (1,)), tensor("0", (2,), (-1,))),
+        *(tensor("0", (2,), (1,), offset=-1), tensor("../0", (2,), (1,)), storage("0", -1)),
+        *(b"ctorch._utils\n_rebuild_tensor_v2\n)R", b"ctorch._utils\n_rebuild_parameter\n)R"),
     ],
 )
 def test_pickles_that_make_no_sense_are_refused(body: bytes) -> None:
