@@ -15,7 +15,8 @@ from regnf_core.fields.build import build_field, open_field
 from regnf_core.fields.observation import SdfField, has_color
 from regnf_core.fields.voxel_blocks import CellIndex
 from regnf_core.schema.safe_format import parse_description, write_safe_field
-from tests.core.fields.grids import numeric_gradient, slow_trilinear
+from tests.core.fields.grids import slow_trilinear
+from tests.core.fields.reference import central_differences
 from tests.core.importing.archives import assert_refused
 
 # The index of occupied cells: against a search through all of them.
@@ -114,7 +115,7 @@ def test_values_and_gradients_are_those_of_slow_interpolation(reach: float, sign
     where = points(150, reach)
     value, gradient = field(sign=sign).signed_distance_and_gradient(torch.from_numpy(where))
     expected = [sign * slow(point, sign) for point in where]
-    slopes = [sign * numeric_gradient(lambda p: slow(p, sign), point) for point in where]
+    slopes = [sign * central_differences(lambda p: slow(p, sign), point) for point in where]
     np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=2e-5)
     np.testing.assert_allclose(gradient.numpy(), slopes, rtol=0, atol=2e-3)
 
