@@ -7,7 +7,6 @@ import sys
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
-import pytest
 import torch
 
 from regnf_core.fields.build import build_field
@@ -29,16 +28,18 @@ def test_entries_that_all_kinds_share_have_defaults() -> None:
     assert parse_description(description_to_dict(parsed)) == parsed
 
 
-@pytest.mark.parametrize("kind", [None, 3, ["neus_facto"], "neus-facto", {}])
-def test_unknown_kinds(kind: Any) -> None:
-    assert_refused(lambda: parse_description(description(kind=kind)), "FIELD_KIND_UNKNOWN")
-
-
-@pytest.mark.parametrize(
-    "changes", [{"sign": 0}, {"sign": 2}, {"world_scale": 0.0}, {"world_scale": float("nan")}, {"up_axis": "w"}]
-)
-def test_faulty_shared_entries(changes: dict[str, Any]) -> None:
-    assert_refused(lambda: parse_description(description(**changes)), "SAFE_FORMAT_INVALID")
+def test_faulty_shared_entries() -> None:
+    for kind in (None, 3, ["neus_facto"], "neus-facto", {}):
+        assert_refused(lambda kind=kind: parse_description(description(kind=kind)), "FIELD_KIND_UNKNOWN")
+    for name, value in (
+        ("sign", 0),
+        ("sign", 2),
+        ("world_scale", 0.0),
+        ("world_scale", float("nan")),
+        ("up_axis", "w"),
+    ):
+        faulty = description(**{name: value})
+        assert_refused(lambda faulty=faulty: parse_description(faulty), "SAFE_FORMAT_INVALID")
 
 
 def test_coordinates_and_distances_scale_together() -> None:
