@@ -11,16 +11,14 @@ import torch
 import trimesh
 
 import regnf
-from regnf_core.fields.build import build_field
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.dense_grid import convert as convert_grid
 from regnf_core.importing.mesh_file import load_mesh
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.safe_format import parse_description
 from regnf_core.surface.exporting import write_mesh
 from tests.core.importing.archives import saved
 from tests.core.importing.in_process import convert
-from tests.core.importing.meshes.mesh_files import BALL, converted, pcd
+from tests.core.importing.meshes.mesh_files import BALL, converted, field_of, pcd
 
 UTM, ECEF, NEARBY = (500_000.25, 5_000_000.5, 100.0), (4_000_000.3, 3_100_000.1, 2_200_000.7), (60_000.0, 0.0, 0.0)
 DOUBLE_PLY = (
@@ -61,8 +59,7 @@ def distances(data: bytes, shift: tuple[float, float, float]) -> torch.Tensor:
     """At places round the shape, which is moved by ``shift``."""
     found = converted(data)
     assert [warning for warning in found.warnings if not warning.startswith("SURFACE_RECONSTRUCTED")] == []
-    tensors = {name: torch.from_numpy(np.array(array)) for name, array in found.tensors.items()}
-    field = build_field(parse_description(found.description), tensors)
+    field = field_of(found)
     low, high = field.bounds
     assert (low < torch.tensor(shift)).all()
     assert (high > torch.tensor(shift)).all()
