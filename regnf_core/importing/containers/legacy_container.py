@@ -39,13 +39,34 @@ class TorchArchive:
         return self.entries[name].content(self.data)
 
 
-def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> TorchArchive:
+def read_archive(
+    data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES, members: list[Member] | None = None
+) -> TorchArchive:
     """Check the container's structure and list its entries. ``data`` is the whole file, usually a memory map.
 
+    members: what ``read_members`` listed, compressed entries and folders too, where the file was read already.
     Raises FieldFormatError: FILE_TRUNCATED, PICKLE_TOO_LARGE and the ARCHIVE_* reasons of docs/import-gate.md.
     """
+    listed = members or []
+    if not listed or any(member.method != STORED or member.name.endswith("/") for member in listed):
+        listed = _strictly_listed(data)
+    _refuse_programs(listed)
+    entries = _below_one_folder(listed)
+    if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in entries) > 1:
+        raise malformed("more than one data.pkl", "ARCHIVE_DUPLICATE_ENTRY")
+    if "data.pkl" not in entries:
+        raise malformed("the archive has no data.pkl: torch.save did not write it", "ARCHIVE_NO_PICKLE")
+    if entries["data.pkl"].size > max_pickle_bytes:
+        raise malformed(f"data.pkl is larger than {max_pickle_bytes} bytes", "PICKLE_TOO_LARGE")
+    archive = TorchArchive(data, entries)
+    if "byteorder" in entries and bytes(archive.read("byteorder")[:16]) != b"little":
+        raise malformed("the tensors are not little-endian", "ARCHIVE_BYTE_ORDER")
+    return archive
+
+
+def _strictly_listed(data: memoryview) -> list[Member]:
     try:
-        listed = read_members(data)
+        return read_members(data)
     except FieldFormatError as error:
         if error.reason == "ARCHIVE_COMPRESSED_ENTRY":
             inflatable: list[Member] = []
@@ -53,18 +74,6 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
                 inflatable = read_members(data, (STORED, DEFLATED))
             _refuse_programs(inflatable)
         raise
-    _refuse_programs(listed)
-    members = _below_one_folder(listed)
-    if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in members) > 1:
-        raise malformed("more than one data.pkl", "ARCHIVE_DUPLICATE_ENTRY")
-    if "data.pkl" not in members:
-        raise malformed("the archive has no data.pkl: torch.save did not write it", "ARCHIVE_NO_PICKLE")
-    if members["data.pkl"].size > max_pickle_bytes:
-        raise malformed(f"data.pkl is larger than {max_pickle_bytes} bytes", "PICKLE_TOO_LARGE")
-    archive = TorchArchive(data, members)
-    if "byteorder" in members and bytes(archive.read("byteorder")[:16]) != b"little":
-        raise malformed("the tensors are not little-endian", "ARCHIVE_BYTE_ORDER")
-    return archive
 
 
 def _refuse_programs(members: list[Member]) -> None:

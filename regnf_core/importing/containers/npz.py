@@ -69,12 +69,15 @@ _FEW = 64
 
 
 class ArraySource:
-    """The arrays of one .npz file by name. ``budget`` caps their bytes together, as float32 and as stored."""
+    """The arrays of one .npz file by name. ``budget`` caps their bytes together, as float32 and as stored.
 
-    def __init__(self, data: memoryview, budget: int) -> None:
+    members: what ``read_members`` listed, where the file was read already.
+    """
+
+    def __init__(self, data: memoryview, budget: int, members: list[Member] | None = None) -> None:
         self._data = data
         self._members: dict[str, Member] = {}
-        for member in read_members(data, (STORED, DEFLATED)):
+        for member in read_members(data, (STORED, DEFLATED)) if members is None else members:
             if "/" in member.name or not member.name.endswith(_SUFFIX):
                 raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
             self._members[member.name.removesuffix(_SUFFIX)] = member

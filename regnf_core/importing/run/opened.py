@@ -203,6 +203,8 @@ class OpenedUpload:
     settings: tuple[SettingsFile, ...] = ()
     siblings: dict[str, memoryview] = field(default_factory=dict)
     """Of a mesh in an archive, the files that it may refer to, by their names seen from its own folder."""
+    members: list[Member] | None = None
+    """Of a checkpoint or arrays in a zip file: what it lists, so that it is read once."""
 
 
 def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
@@ -211,21 +213,23 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     Raises FieldFormatError: AMBIGUOUS_RUN, RUN_WITHOUT_CHECKPOINT, ARCHIVE_NESTED, SETTINGS_TOO_LARGE, FILE_TRUNCATED
     and the ARCHIVE_* reasons of docs/import-gate.md.
     """
-    archive = _opened(data, most)
+    archive, members = _opened(data, most)
     if archive is None:
-        return OpenedUpload(data)
+        return OpenedUpload(data, members=members)
     name = choose_checkpoint(archive.sizes)
     settings = choose_settings(archive.sizes, name)
     _require_few(archive, settings)
     siblings = _siblings(archive, name)
     taken = archive.take({name, *settings, *siblings.values()}, folder)
-    if _opened(taken[name], most) is not None:
+    nested, members = _opened(taken[name], most)
+    if nested is not None:
         raise archive_error(f"{shown_path(name)} is an archive in the archive; give it by itself", "ARCHIVE_NESTED")
     return OpenedUpload(
         taken[name],
         name,
         tuple(SettingsFile(each, taken[each]) for each in settings),
         {seen: taken[each] for seen, each in siblings.items()},
+        members,
     )
 
 
@@ -236,7 +240,7 @@ def open_settings(
 
     Raises as ``open_upload``.
     """
-    archive = None if name.lower().endswith(".npz") else _opened(data, most)
+    archive = None if name.lower().endswith(".npz") else _opened(data, most)[0]
     if archive is None:
         if len(data) > MAX_SETTINGS_BYTES:
             raise _too_large(f"the settings have {len(data)} bytes")
@@ -247,18 +251,18 @@ def open_settings(
     return tuple(SettingsFile(each, content) for each, content in archive.take(archive.sizes, folder).items())
 
 
-def _opened(data: memoryview, most: int) -> ZipRun | TarRun | None:
-    """The archive of a run in ``data``, or None for any other file."""
+def _opened(data: memoryview, most: int) -> tuple[ZipRun | TarRun | None, list[Member] | None]:
+    """The archive of a run in ``data``, or None for any other file; and what any sound zip file lists."""
     kind = sniff_format(bytes(data[:HEAD_BYTES]))
     if kind in ("torch-zip", "npz"):
         try:
             members = read_members(data, (STORED, DEFLATED), folders=True)
         except FieldFormatError:
-            return None
-        return ZipRun(data, members, most) if _is_run(members, kind) else None
+            return None, None
+        return ZipRun(data, members, most) if _is_run(members, kind) else None, members
     if kind == "zip":
-        return ZipRun(data, read_members(data, (STORED, DEFLATED), folders=True), most)
-    return TarRun(data, None if kind == "tar" else kind, most) if kind in RUN_ARCHIVES else None
+        return ZipRun(data, members := read_members(data, (STORED, DEFLATED), folders=True), most), members
+    return TarRun(data, None if kind == "tar" else kind, most) if kind in RUN_ARCHIVES else None, None
 
 
 def _is_run(members: list[Member], kind: str) -> bool:

@@ -18,8 +18,7 @@ from regnf_core.importing.gate.convert import FIELD_NAME, convert_file, run
 from regnf_core.importing.gate.picture import candidate_name
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.archives import assert_refused
-from tests.core.importing.networks.shapes import random_shape
-from tests.core.importing.networks.training import in_cube, train
+from tests.core.importing.networks.training import in_cube, random_shape, train
 
 LAYOUT = GridLayout(levels=4, features=2, log2_size=12, base=8, growth=1.5, smoothstep=False)
 GRID = {

@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.fields.mesh import MeshField
-from tests.core.importing.meshes.test_facing import FURNISHED, converted
+from tests.core.importing.meshes.test_facing import FURNISHED, converted, distance
 
 Points = NDArray[np.float64]
-
-
-def evaluated(mesh: trimesh.Trimesh, points: Points, **said: str) -> NDArray[np.float32]:
-    found = converted(mesh, **said)
-    level = float(found.description["inside_above"])
-    field = MeshField(found.tensors["vertices"], found.tensors["faces"], inside_above=level)
-    return field.signed_distance(torch.from_numpy(points)).numpy()
 
 
 def distance_to(point: Points, triangles: Points) -> float:
@@ -48,9 +39,10 @@ def test_distances_and_solid_angles_by_hand() -> None:
     """A room with a hole in its wall: the nearest triangle, and all their solid angles added up."""
     kept = np.linalg.norm(FURNISHED.triangles_center - [2.0, 0.0, 1.5], axis=1) > 0.5
     room = trimesh.Trimesh(FURNISHED.vertices, FURNISHED.faces[kept], process=False)
-    level = float(converted(room, **{"as": "scene"}).description["inside_above"])
+    scene = converted(room, **{"as": "scene"})
+    level = float(scene.description["inside_above"])
     points = np.random.default_rng(3).uniform([-0.2, -0.2, -0.2], [4.2, 3.2, 2.7], (12, 3))
-    found = evaluated(room, points, **{"as": "scene"})
+    found = distance(scene, points)
     for point, value in zip(points, found, strict=True):
         winding = solid_angle(point, room.triangles) / (4.0 * np.pi)
         nearest = distance_to(point, room.triangles)

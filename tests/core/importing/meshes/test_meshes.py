@@ -33,11 +33,7 @@ def assert_same_distance(found: ConvertedField, mesh: MeshField) -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        exported("ply"),
-        exported("ply", encoding="ascii"),
-        exported("stl"),
-        exported("stl_ascii"),
-        exported("obj"),
+        *(exported("ply"), exported("ply", encoding="ascii"), exported("stl"), exported("stl_ascii"), exported("obj")),
         exported("glb"),
     ],
     ids=["ply", "ply text", "stl", "stl text", "obj", "glb"],

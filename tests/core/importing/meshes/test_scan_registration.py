@@ -9,20 +9,12 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.fields.build import build_field
-from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.meshes import read_mesh
 from regnf_core.library import register
-from regnf_core.schema.safe_format import parse_description
+from tests.core.importing.meshes.mesh_files import field_of
 from tests.core.importing.meshes.test_facing import converted, parts, together, without
 from tests.devdata import dev_data
-
-
-def field_of(found: ConvertedField) -> SdfField:
-    tensors = {name: torch.from_numpy(np.array(values)) for name, values in found.tensors.items()}
-    return build_field(parse_description(found.description), tensors)
 
 
 def furniture(name: str, T: NDArray[np.float64] | None = None) -> trimesh.Trimesh:

@@ -11,9 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from tests.core.importing.networks import slow_network as slow
-from tests.core.importing.networks.shapes import random_shape
 from tests.core.importing.networks.trained import Decoder, Implicit, Sines, split
-from tests.core.importing.networks.training import in_ball, in_cube, train
+from tests.core.importing.networks.training import in_ball, in_cube, random_shape, train
 
 Array = NDArray[np.float64]
 State = dict[str, Any]
@@ -35,17 +34,12 @@ def _numbers(state: State) -> State:
 
 
 def _trained(
-    network: torch.nn.Module,
-    rng: np.random.Generator,
-    steps: int,
-    ball: bool,
-    clamp: float | None = None,
-    rate: float = 2e-3,
+    network: torch.nn.Module, rng: np.random.Generator, steps: int, ball: bool, clamp: float | None = None
 ) -> None:
     """Trained for so many steps; or, for none, at random with about as much of the cube inside as outside."""
     if steps:
         sampler, seed = in_ball(1.0) if ball else in_cube(1.0), int(rng.integers(1 << 30))
-        train(network, list(network.parameters()), random_shape(rng), sampler, seed, steps, rate, clamp)
+        train(network, list(network.parameters()), random_shape(rng), sampler, seed, steps, 2e-3, clamp)
         return
     generator = torch.Generator().manual_seed(int(rng.integers(1 << 30)))
     with torch.no_grad():
@@ -61,11 +55,8 @@ def _trained(
 
 
 def neus(rng: np.random.Generator, steps: int) -> Case:
-    degree, scale, layers = (
-        int(rng.integers(0, 7)),
-        float(rng.choice([1.0, 1.0, 1.0, 3.0, 2.0])),
-        int(rng.integers(4, 7)),
-    )
+    degree, scale = int(rng.integers(0, 7)), float(rng.choice([1.0, 1.0, 1.0, 3.0, 2.0]))
+    layers = int(rng.integers(4, 7))
     skips = (layers // 2,) if rng.random() < 0.7 else ()
     network = Implicit(rng, degree, 48, layers, skips, scale, results=int(rng.choice([1, 9])))
     _trained(network, rng, steps, ball=True)
@@ -115,8 +106,4 @@ def siren(rng: np.random.Generator, steps: int) -> Case:
     )
 
 
-FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {
-    "neus": neus,
-    "deepsdf": deepsdf,
-    "siren": siren,
-}
+FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {"neus": neus, "deepsdf": deepsdf, "siren": siren}

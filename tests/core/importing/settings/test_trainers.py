@@ -17,10 +17,10 @@ from tests.core.importing.settings.configurations import ANGELO, BAND, NEUS_CONF
 from tests.core.importing.settings.translating import facts, linear, translated
 
 
-@pytest.mark.parametrize(("step", "opened"), [(0, 4), (999, 4), (5000, 9), (20000, 16)])
-def test_instant_nsr_pl_s_open_levels(step: int, opened: int) -> None:
-    found = translated({"neuralangelo-dtu-wmask.yaml": nsr("ProgressiveBandHashGrid", BAND)}, facts(global_step=step))
-    assert found.values["level_mask"] == opened
+def test_instant_nsr_pl_s_open_levels() -> None:
+    files = {"neuralangelo-dtu-wmask.yaml": nsr("ProgressiveBandHashGrid", BAND)}
+    steps = (0, 999, 5000, 20000)
+    assert [translated(files, facts(global_step=step)).values["level_mask"] for step in steps] == [4, 4, 9, 16]
 
 
 def test_instant_nsr_pl_s_other_functions() -> None:
@@ -83,10 +83,10 @@ def test_neus_in_a_report() -> None:
     }
 
 
-@pytest.mark.parametrize(("layers", "skip", "reason"), [(7, 4, "TENSORS"), (8, 5, "TENSORS"), (8, "4, 5", "TENSORS")])
-def test_neus_against_its_tensors(layers: int, skip: object, reason: str) -> None:
-    files = {"a.conf": NEUS_CONF.format(scale=1.0, layers=layers, skip=skip)}
-    assert_refused(lambda: translated(files, facts(NEUS)), f"SETTINGS_CONTRADICT_{reason}")
+def test_neus_against_its_tensors() -> None:
+    for layers, skip in ((7, 4), (8, 5), (8, "4, 5")):
+        files = {"a.conf": NEUS_CONF.format(scale=1.0, layers=layers, skip=skip)}
+        assert_refused(lambda files=files: translated(files, facts(NEUS)), "SETTINGS_CONTRADICT_TENSORS")
 
 
 DEEPSDF = linear("model_state_dict.module.lin", [512] * 3 + [253] + [512] * 4 + [1], [259] + [512] * 8)
@@ -124,31 +124,20 @@ def test_settings_that_nobody_knows() -> None:
 
 
 def test_nerfstudio_and_sdfstudio() -> None:
-    common = {
-        "levels": 16,
-        "features_per_level": 2,
-        "log2_table_size": 19,
-        "base_resolution": 16,
-        "top_resolution": 2048,
-    }
-    found = translated({"config.yml": studio(True)})
-    assert found.trainer == "nerfstudio"
-    assert found.values == {
-        "family": "nerfstudio_neus_facto",
-        "use_grid": True,
-        "hash": {**common, "interpolation": "smoothstep"},
-        "positional_encoding": {"degree": 6, "two_pi": True},
-        "contraction": "linf_grid",
-    }
-    found = translated({"config.yml": studio(False)})
-    assert found.trainer == "sdfstudio"
-    assert found.values == {
-        "family": "sdfstudio_neus_facto",
-        "use_grid": True,
-        "hash": {**common, "interpolation": "smoothstep"},
-        "positional_encoding": {"degree": 6, "used": True, "two_pi": False},
-        "contraction": "none",
-    }
+    grid = {"levels": 16, "features_per_level": 2, "log2_table_size": 19, "base_resolution": 16, "top_resolution": 2048}
+    for theirs, trainer, encoding, contraction in (
+        (True, "nerfstudio", {"degree": 6, "two_pi": True}, "linf_grid"),
+        (False, "sdfstudio", {"degree": 6, "used": True, "two_pi": False}, "none"),
+    ):
+        found = translated({"config.yml": studio(theirs)})
+        assert found.trainer == trainer
+        assert found.values == {
+            "family": f"{trainer}_neus_facto",
+            "use_grid": True,
+            "hash": {**grid, "interpolation": "smoothstep"},
+            "positional_encoding": encoding,
+            "contraction": contraction,
+        }
 
 
 def test_sdfstudio_s_angelo_and_neus() -> None:
