@@ -18,7 +18,7 @@ from tests.core.importing.archives import assert_refused
 from tests.devdata import dev_data
 
 CHECKPOINTS = {".ckpt", ".pth", ".pt"}
-SAID = {
+SAID: dict[str, Any] = {
     "hash": {"levels": 16, "base_resolution": 16, "top_resolution": 2048, "interpolation": "smoothstep"},
     "use_grid": True,
     "positional_encoding": {"degree": 6},

@@ -26,17 +26,12 @@ from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_fiel
 from regnf_core.importing.gate.report import MIB, OF_THE_CIRCUMSTANCES, OF_THE_FILE
 from tests.core.importing.archives import assert_refused, saved, text, torch_zip
 from tests.core.importing.checkpoints import write_small_checkpoint
+from tests.core.importing.test_reference_checkpoints import SAID
 from tests.core.importing.test_safetensors_upload import layout
 
 InChild = Callable[..., report.ImportReport]
 ROOT = Path(__file__).resolve().parents[4]
 SHORT = ImportLimits(wall_s=100)
-SAID: dict[str, Any] = {
-    "hash": {"base_resolution": 16, "top_resolution": 2048, "features_per_level": 2, "interpolation": "smoothstep"},
-    "use_grid": True,
-    "positional_encoding": {"degree": 6},
-}
-"""The layout of such a checkpoint: nothing is tried."""
 
 
 @pytest.fixture(scope="module")
