@@ -19,6 +19,7 @@ from regnf_core.schema.safe_format import parse_description
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.test_families import ANGELO_GRID
+from tests.core.importing.test_reference_checkpoints import SAID
 from tests.core.importing.test_sdfstudio import F, convert
 
 Change = Callable[[dict[str, Any]], object]
@@ -30,9 +31,7 @@ def with_tensor(name: str, value: torch.Tensor) -> Change:
 
 CHANGES: dict[str, Change] = {
     "a part is missing": lambda pipeline: pipeline.pop(F + "clin0.weight_g"),
-    "a layer is missing": lambda pipeline: [
-        pipeline.pop(F + f"clin0.{part}") for part in ("bias", "weight_g", "weight_v")
-    ],
+    "a layer is missing": lambda state: [state.pop(F + f"clin0.{part}") for part in ("bias", "weight_g", "weight_v")],
     "other columns": with_tensor("clin0.weight_v", torch.ones(8, 130)),
     "four results": with_tensor("clin1.weight_v", torch.ones(4, 8)),
     "not finite": with_tensor("clin1.bias", torch.full((3,), torch.nan)),
@@ -40,13 +39,7 @@ CHANGES: dict[str, Change] = {
     "no tensor": lambda pipeline: pipeline.update({F + "clin0.bias": "text"}),
     "columns of no direction": with_tensor("embedding_appearance.embedding.weight", torch.ones(5, 31)),
 }
-
-
-LAYOUT: dict[str, Any] = {
-    "hash": {"base_resolution": 16, "top_resolution": 2048, "features_per_level": 2, "interpolation": "smoothstep"},
-    "use_grid": True,
-    "positional_encoding": {"degree": 6},
-}
+LAYOUT = SAID | {"hash": SAID["hash"] | {"features_per_level": 2}}
 
 
 @cache

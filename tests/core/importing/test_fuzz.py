@@ -74,9 +74,9 @@ def test_every_sound_file_is_taken(seeds: Seeds, tmp_path: Path) -> None:
 def test_a_seed_gives_the_same_cases_again_and_each_is_taken_or_refused(
     seeds: Seeds, stage: str, tmp_path: Path
 ) -> None:
-    first, second = ([make_case(Random(i), stage, seeds, []) for i in range(50)] for _ in range(2))
+    first, second = ([make_case(Random(i), stage, seeds, []) for i in range(30)] for _ in range(2))
     assert first == second
-    assert len(set(first)) > 30
+    assert len(set(first)) > 18
     outcomes = {run_stage(stage, case, tmp_path) for case in first}
     assert len(outcomes) > 1
     assert all(outcome == "taken" or outcome.isupper() for outcome in outcomes)

@@ -91,14 +91,11 @@ def test_a_value_is_let_go_of_after_its_last_use(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_last_use_is_the_last() -> None:
-    description, _ = described(
-        model("a = Neg x; b = Neg a; c = Add a b; r = ReduceL2 c axes keepdims:1; y = Sub r half", HALF)
-    )
+    body = "a = Neg x; b = Neg a; c = Add a b; r = ReduceL2 c axes keepdims:1; y = Sub r half"
+    description, _ = described(model(body, HALF))
     uses = [set(names) for names in last_uses(description.nodes, description.output)]
     first, second, third, fourth, _ = (node.outputs[0] for node in description.nodes)
-    assert uses[0] == {description.input}
-    assert uses[1] == set()
-    assert uses[2] == {first, second}
+    assert uses[:3] == [{description.input}, set(), {first, second}]
     assert third in uses[3]
     assert fourth in uses[4]
     assert description.output not in set().union(*uses)

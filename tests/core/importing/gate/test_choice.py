@@ -39,15 +39,13 @@ def converted(table: Array, *grids: HashGridConfig) -> ConvertedField:
     return converted_of("somebody's", ("keys",), grid_readings(table, grids, layers, entries))
 
 
-def test_the_doubtful_level_is_one_of_two() -> None:
-    assert (USUAL.level_strides()[2], OTHER.level_strides()[2]) == (33, 32)
-    assert USUAL.level_entries() == OTHER.level_entries()
-
-
 @pytest.mark.parametrize("truth", [USUAL, OTHER], ids=["as laid out", "otherwise"])
 def test_the_stride_it_was_trained_with_is_found(truth: HashGridConfig) -> None:
+    assert (USUAL.level_strides()[2], OTHER.level_strides()[2]) == (33, 32)
+    assert USUAL.level_entries() == OTHER.level_entries()
     chosen = settled(converted(ball_table(truth, 2), USUAL, OTHER))
     assert chosen.description["hash"]["strides"] == truth.strides
+    assert settled(converted(ball_table(truth, 2), OTHER, USUAL)).description == chosen.description
     assert chosen.warnings == ()
     assert chosen.readings == ()
     assert "2 layouts" in chosen.why[-1]
@@ -56,11 +54,6 @@ def test_the_stride_it_was_trained_with_is_found(truth: HashGridConfig) -> None:
     tensors = {name: torch.from_numpy(array) for name, array in chosen.tensors.items()}
     distance = build_field(parse_description(chosen.description), tensors).signed_distance(points)
     torch.testing.assert_close(distance, points.norm(dim=-1) - 0.5, rtol=0, atol=5e-3)
-
-
-def test_the_order_does_not_matter_where_the_evidence_is_clear() -> None:
-    chosen = settled(converted(ball_table(OTHER, 2), OTHER, USUAL))
-    assert chosen.description["hash"]["strides"] == OTHER.strides
 
 
 def test_layouts_that_are_one_function_are_not_asked_about() -> None:
@@ -81,11 +74,8 @@ def test_layouts_that_differ_and_fit_alike_are_asked_about() -> None:
 def test_where_none_has_a_surface_the_most_usual_one_stays_and_plausibility_decides() -> None:
     chosen = settled(converted(ball_table(USUAL, 2, radius=-1.0), USUAL, OTHER))
     assert chosen.description["hash"]["strides"] is None
-
-
-def test_without_doubt_nothing_is_tried() -> None:
     plain = converted(ball_table(USUAL, 2), USUAL)
-    assert settled(plain) is plain
+    assert settled(plain) is plain, "without doubt nothing is tried"
 
 
 def test_whoever_is_asked_for_the_interpolation_says_the_layout_too(monkeypatch: pytest.MonkeyPatch) -> None:

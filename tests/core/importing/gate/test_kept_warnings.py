@@ -36,14 +36,10 @@ def test_a_field_file_keeps_the_warnings_of_its_import(tmp_path: Path) -> None:
     with pytest.warns(FieldWarning, match="GRADIENT_NOT_UNIT"):
         open_field(kept)
     assert tuple(convert(kept, tmp_path / "again")["warnings"]) == warned
+    convert(ball(tmp_path, 1.0, "true.npz"), tmp_path / "true")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        open_field(_imported(tmp_path))
-
-
-def _imported(folder: Path) -> Path:
-    convert(ball(folder, 1.0, "true.npz"), folder / "true")
-    return folder / "true" / FIELD_NAME
+        open_field(tmp_path / "true" / FIELD_NAME)
 
 
 def test_notes_are_added_in_place(tmp_path: Path) -> None:

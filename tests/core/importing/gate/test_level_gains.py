@@ -34,30 +34,18 @@ def in_errors(gains: LevelGains) -> list[float]:
     return [math.copysign(math.sqrt(2.0 * abs(one)), one) for one in told]
 
 
-def test_a_level_that_corrects_the_others_gains() -> None:
+def test_a_level_gains_where_it_corrects_the_others() -> None:
+    """Not where it is read from the wrong rows; and a fine level's noise does not hide what a coarse one does."""
     unit, error = unit_and_noise(0)
-    (gain,) = in_errors(gains_of(unit - error, error[None]))
-    assert gain > 20.0
-
-
-def test_a_level_that_is_read_from_the_wrong_rows_gains_nothing() -> None:
-    unit, error = unit_and_noise(1)
     elsewhere = error[torch.randperm(POINTS, generator=torch.Generator().manual_seed(2))]
-    (gain,) = in_errors(gains_of(unit - error, elsewhere[None]))
-    assert abs(gain) < 4.0
-
-
-def test_a_fine_levels_noise_does_not_hide_what_a_coarse_one_does() -> None:
-    unit, error = unit_and_noise(3)
-    noise = 10.0 * unit_and_noise(4)[1]
-    coarse, fine = in_errors(gains_of(unit - error, torch.stack((error, noise))))
-    assert coarse > 20.0
-    assert abs(fine) < 4.0
-
-
-def test_a_level_that_hardly_counts_says_nothing() -> None:
-    unit, _ = unit_and_noise(5)
-    assert level_gains(unit, 1e-5 * unit[None]).abs().max() == 0.0
+    corrects, wrong, noise = (
+        in_errors(gains_of(unit - error, levels))
+        for levels in (error[None], elsewhere[None], torch.stack((error, 10.0 * unit_and_noise(4)[1])))
+    )
+    assert corrects[0] > 20.0
+    assert noise[0] > 20.0
+    assert max(abs(wrong[0]), abs(noise[1])) < 4.0
+    assert level_gains(unit, 1e-5 * unit[None]).abs().max() == 0.0, "a level that hardly counts says nothing"
 
 
 def test_a_level_of_few_cells_says_little_however_many_points_there_are() -> None:
