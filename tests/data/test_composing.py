@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from benchmarks.make_fields import UNITS_PER_METER
+from benchmarks.worlds.composing import RenderOptions, render_object, render_room
+from benchmarks.worlds.layouts import read_layout
 from regnf_core.errors import DatasetError
 from regnf_core.importing.mesh_file import load_mesh
-from regnf_data.composing import RenderOptions, render_object, render_room
-from regnf_data.layouts import read_layout
 from regnf_data.posed_images import PosedImages
 from scripts import make_demo_fields as demo
 from tests.data.rooms import CHEST, room, write_chest, write_room

@@ -12,8 +12,7 @@ import trimesh
 from PIL import Image
 
 from benchmarks.simple_meshes import revolved
-from regnf_core.fields.mesh import MeshField
-from regnf_data.mesh_scene import (
+from benchmarks.worlds.mesh_scene import (
     MeshScene,
     PaintedMesh,
     Thing,
@@ -25,8 +24,9 @@ from regnf_data.mesh_scene import (
     to_srgb,
     vertex_paint,
 )
-from regnf_data.rendering import intrinsics_of, light, render
-from regnf_data.trajectories import look_at
+from benchmarks.worlds.rendering import intrinsics_of, light, render
+from benchmarks.worlds.trajectories import look_at
+from regnf_core.fields.mesh import MeshField
 
 SIZE = (120, 160)
 WHITE = tile_paint((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), 1.0)

@@ -256,6 +256,10 @@ def test_frames_of_lost_cameras_are_left_out(folder: Path) -> None:
     rest = load_dataset(folder)
     assert len(rest) == len(whole) - 1
     np.testing.assert_array_equal(rest.T_world_camera, np.delete(whole.T_world_camera, 1, axis=0))
+    change(folder, lambda metadata: [frame.update(camtoworld=LOST) for frame in metadata["frames"]])
+    with pytest.raises(DatasetError) as refused:
+        load_dataset(folder)
+    assert refused.value.reason == "DATASET_POSE_NOT_RIGID"
 
 
 @pytest.mark.parametrize(
