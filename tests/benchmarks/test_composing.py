@@ -17,7 +17,7 @@ from regnf_core.errors import DatasetError
 from regnf_core.importing.mesh_file import load_mesh
 from regnf_data.posed_images import PosedImages
 from scripts import make_demo_fields as demo
-from tests.data.rooms import CHEST, room, write_chest, write_room
+from tests.benchmarks.rooms import CHEST, room, write_chest, write_room
 from tests.devdata import dev_data
 
 SMALL = {"size": (48, 64), "sensor": None}
