@@ -120,7 +120,7 @@ def test_halves_without_drift_lie_on_each_other(work, thing):
 
 
 def test_a_map_keeps_its_voxel_and_its_truncation(recording, tmp_path):
-    for voxel_m in (0.02, 0.04):
+    for voxel_m in (0.01, 0.02):
         path = tmp_path / f"{voxel_m}.npz"
         fuse(recording, range(0, 16, 4), voxel_m, path)
         assert voxel_of(path) == pytest.approx(voxel_m)
