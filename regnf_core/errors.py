@@ -5,7 +5,7 @@
     │   ├── InvalidOptionsError      INVALID_OPTIONS, PRESET_UNSUITABLE
     │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
     │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
-    │   └── DatasetError             DATASET_...: a folder of posed images, or what one is rendered from, cannot be used
+    │   └── DatasetError             DATASET_...: a folder of posed images cannot be used
     ├── NoSurfaceError               NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT
     ├── InitializationError          NO_INITIAL_TRANSFORM
     ├── FitDivergedError             FIT_DIVERGED

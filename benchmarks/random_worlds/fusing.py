@@ -15,9 +15,9 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from benchmarks.random_worlds.mesh import Array, ExactScene, ExactView
+from benchmarks.worlds.rendering import Size, intrinsics_of, jumps
 from regnf_data.fusing import BlockGrid, fuse_blocks, import_own, open3d
 from regnf_data.posed_images import PosedImages
-from regnf_data.rendering import Size, intrinsics_of, jumps
 
 # Errors of the camera's estimated poses, and where they carry what was measured.
 
@@ -188,7 +188,7 @@ def draw_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSen
 
 
 def rendered_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSensor:
-    """The camera of a simulated dataset: exact, or with the errors of ``regnf_data.rendering.DepthSensor``.
+    """The camera of a simulated dataset: exact, or with the errors of ``benchmarks.worlds.rendering.DepthSensor``.
 
     It misses no matter. size: instead of a random one.
     """

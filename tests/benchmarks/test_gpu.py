@@ -46,11 +46,11 @@ def test_without_a_gpu_it_says_so_in_a_line(
 @pytest.mark.timeout(900)
 def test_everything_runs_on_the_cpu(one_pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "gpu.md"
-    arguments = ["--device", "cpu", "--seeds", "1", "--repeats", "1", "--batches", "2", "--output", str(output)]
+    arguments = ["--device", "cpu", "--seeds", "1", "--repeats", "1", "--batches", "1", "--output", str(output)]
     assert command.main(arguments) == 0
     text = output.read_text(encoding="utf-8")
     assert capsys.readouterr().out == text
-    assert f"python -m benchmarks.gpu --device cpu --seeds 1 --repeats 1 --batches 2 --output {output}" in text
+    assert f"python -m benchmarks.gpu --device cpu --seeds 1 --repeats 1 --batches 1 --output {output}" in text
     titles = [line.removeprefix("## ") for line in text.splitlines() if line.startswith("## ")]
     assert titles == ["Evaluator", "One registration", "Batches", "Pairs in another company", "Beside the CPU"]
     assert "| 3 | 3 | 0.0e+00 |" in text

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from benchmarks.random_worlds.mesh import Mesh, block, together
 from benchmarks.robust.cases import Case
@@ -26,10 +27,14 @@ SEAT, CUSHION = block([0.0, 0.0, 0.2], [0.5, 0.5, 0.4]), block([0.0, 0.0, 0.55],
 def known(folder: Path, mesh: Mesh) -> WorldCase:
     np.savez(folder / "object-0.npz", vertices=mesh.vertices, faces=mesh.faces)
     (folder / WORLD).write_text(json.dumps({"cases": [{"T_object_model": T_OBJECT_MODEL.tolist()}]}))
-    field = MeshField(mesh.vertices, mesh.faces).transformed(T_OBJECT_MODEL)
+    return first_case(mesh, "seat", T_OBJECT_MODEL)
+
+
+def first_case(mesh: Mesh, name: str, T_object_model: NDArray[np.float64]) -> WorldCase:
+    field = MeshField(mesh.vertices, mesh.faces).transformed(T_object_model)
     box = OrientedBox(torch.zeros(3).double(), torch.ones(3).double(), torch.eye(3).double())
-    case = Case("a seat", field, field, box, Sim3.identity())
-    return WorldCase(case, {"case": 0, "object": "seat"}, torch.zeros(0, 3), Symmetries())
+    case = Case(f"a {name}", field, field, box, Sim3.identity())
+    return WorldCase(case, {"case": 0, "object": name}, torch.zeros(0, 3), Symmetries())
 
 
 def differing(one: WorldCase, other: WorldCase) -> torch.Tensor:
@@ -68,13 +73,6 @@ def world(folder: Path, **objects: Mesh) -> Path:
     return folder
 
 
-def first_case(mesh: Mesh) -> WorldCase:
-    field = MeshField(mesh.vertices, mesh.faces)
-    box = OrientedBox(torch.zeros(3).double(), torch.ones(3).double(), torch.eye(3).double())
-    case = Case("a bracket", field, field, box, Sim3.identity())
-    return WorldCase(case, {"case": 0, "object": "bracket"}, torch.zeros(0, 3), Symmetries())
-
-
 def ratios(points: torch.Tensor) -> torch.Tensor:
     """(3,) standard deviations along the principal axes, of the largest; the same at any pose and scale."""
     sizes = torch.linalg.svdvals(points - points.mean(0))
@@ -91,7 +89,7 @@ def test_the_most_similar_object_of_another_name_is_taken(tmp_path: Path) -> Non
     right = world(tmp_path / "right", bracket=BRACKET)
     wider = turned_and_wider(BRACKET, 2.0, 3.0)
     other = world(tmp_path / "other", bracket_02=BRACKET, wide=wider, block=LEG, bracket=BRACKET)
-    found = similar_object(right, first_case(BRACKET), [other], np.random.default_rng(0))
+    found = similar_object(right, first_case(BRACKET, "bracket", np.eye(4)), [other], np.random.default_rng(0))
     assert found.facts["object"] == SIMILAR
     sampled = torch.from_numpy(wider.sample(4000, np.random.default_rng(1))[0])
     torch.testing.assert_close(ratios(found.points), ratios(sampled), rtol=0, atol=0.02)

@@ -71,7 +71,7 @@ def test_the_made_pages_are_there_and_load_nothing_from_elsewhere(site: Path) ->
     for sheet in site.rglob("*.css"):
         assert "url(http" not in sheet.read_text(encoding="utf-8")
     commands = (site / "reference" / "command-line.html").read_text(encoding="utf-8")
-    assert all(f"regnf {name}" in commands for name in ("register", "search", "serve", "render-dataset"))
+    assert all(f"regnf {name}" in commands for name in ("register", "search", "serve", "fuse"))
     assert "worker-timeout" in commands
     assert "/register" in (site / "reference" / "http.html").read_text(encoding="utf-8")
     assert "T_object_scene" in (site / "reference" / "python.html").read_text(encoding="utf-8")

@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.worlds.trajectories import look_at
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
 from regnf_data.sdfstudio import load_dataset, write_dataset
-from regnf_data.trajectories import look_at
 from regnf_fit.images.checks import check_agreement
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.fusion import fuse_images
@@ -87,12 +87,16 @@ WRONG: dict[str, tuple[Callable[[PosedImages], PosedImages], str]] = {
     "a robot's body": (with_poses(lambda T: T @ BODY), "columns are the camera's right, down and forward"),
     "along rays": (with_depths(lambda depths: depths * LENGTHS), "divide each by the length of its ray"),
     "millimeters": (with_depths(lambda depths: 1000.0 * depths), "by 0.001"),
+    "5000 for 1000": (with_depths(lambda depths: 5.0 * depths), "by 0.2"),
+    "feet": (with_depths(lambda depths: depths / 0.3048), "by 0.30"),
     "another scale": (with_depths(lambda depths: 1.7 * depths), "by 0.5"),
     "disparity": (with_depths(lambda depths: 20.0 / depths), "Write depths"),
     "half the size": (lambda images: replace(images, intrinsics=images.intrinsics * [[0.5], [0.5], [1.0]]), "pixels"),
     "turned": (lambda images: replace(images, intrinsics=images.intrinsics[:, [1, 0, 2]][:, :, [1, 0, 2]]), "pixels"),
     "reversed": (with_poses(lambda T: T[::-1]), "each frame's own camtoworld"),
+    "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each frame's own camtoworld"),
     "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions anew"),
+    "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions anew"),
     "mirrored": (with_depths(lambda depths: depths[:, :, ::-1]), "Mirror the depth images"),
     "far from the origin": (with_poses(lambda T: T @ OPENGL + FAR), "opengl"),
 }  # fmt: skip
@@ -113,17 +117,18 @@ def test_good_recordings_pass(count: int, noise: float) -> None:
     assert check_agreement(recording(count, noise)) is None
 
 
-def test_one_image_or_a_flat_wall_tells_nothing() -> None:
+def test_one_image_a_flat_wall_and_images_that_share_nothing_tell_nothing() -> None:
     one = recording()
     assert one.depths is not None
     single = replace(one, depths=one.depths[:1], T_world_camera=np.linalg.inv(one.T_world_camera[:1]),
                      intrinsics=one.intrinsics[:1], colors=one.colors[:1])  # fmt: skip
     assert check_agreement(single) is None
-    wall = np.tile(np.eye(4), (6, 1, 1))
-    wall[:, 0, 3] = np.arange(6) * 0.1
-    flat = replace(one, depths=np.full((6, *SIZE), 2.0, np.float32), T_world_camera=wall, intrinsics=one.intrinsics[:6],
-                   colors=one.colors[:6])  # fmt: skip
-    assert check_agreement(flat) is None
+    for count, apart in ((6, 0.1), (2, 6.0)):
+        wall = np.tile(np.eye(4), (count, 1, 1))
+        wall[:, 0, 3] = np.arange(count) * apart
+        flat = replace(one, depths=np.full((count, *SIZE), 2.0, np.float32), T_world_camera=wall,
+                       intrinsics=one.intrinsics[:count], colors=one.colors[:count])  # fmt: skip
+        assert check_agreement(flat) is None
 
 
 def test_poses_of_nowhere_are_warned_of() -> None:
@@ -172,6 +177,7 @@ def fit(images: PosedImages, path: Path) -> object:
         (fit, 1000.0, 1.0, "depths in millimeters? Divided by 1000, 100 %"),
         (fuse_images, 1000.0, 1000.0, "depths and poses in millimeters? Divided by 1000"),
         (fuse_images, 1.0, 1000.0, "poses in millimeters? Divided by 1000"),
+        (fuse_images, 100.0, 1.0, "depths in centimeters? Divided by 100"),
         (fuse_images, 5000.0, 1.0, "depths in steps of 1/5000? Divided by 5000"),
     ],
 )

@@ -14,7 +14,7 @@ from tests.fit.images import scenes
 from tests.fit.images.test_reconstruct import SMALL, surface_errors
 
 SHIFT, TURN = 0.025, 0.015
-OPTIONS = replace(SMALL, iterations=400, refine_poses=True)
+OPTIONS = replace(SMALL, refine_poses=True)
 
 
 def astray(images, seed=0):

@@ -262,3 +262,9 @@ def test_without_overlap_nothing_is_known(wall, count):
     )
     found = depth_spread(images, np.ones(images.depths.shape, np.float32))
     assert (found.at(np.array([1.0, 2.0], np.float32)) == 0.0).all()
+
+
+def test_cameras_that_see_different_things_tell_nothing(wall):
+    poses = wall.T_world_camera.copy()
+    poses[:, 0, 3] = 100.0 * np.arange(COUNT)
+    assert len(measured(replace(wall, T_world_camera=poses)).depths) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from regnf_data.rendering import DepthSensor, intrinsics_of, jumps
+from benchmarks.worlds.rendering import DepthSensor, intrinsics_of, jumps
 
 SIZE = (200, 300)
 FACING = np.ones(SIZE)

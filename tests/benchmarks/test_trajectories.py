@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.worlds.composing import bad_view, half_view, seen_points
+from benchmarks.worlds.mesh_scene import MeshScene, Thing, box_thing, tile_paint
+from benchmarks.worlds.rendering import intrinsics_of
+from benchmarks.worlds.trajectories import WalkingGround, check_free, long_walk, look_at, orbit, pass_by, short_walk
 from regnf_core.errors import DatasetError
 from regnf_core.fields.composite import SurfaceSource
-from regnf_data.composing import bad_view, half_view, seen_points
-from regnf_data.mesh_scene import MeshScene, Thing, box_thing, tile_paint
-from regnf_data.rendering import intrinsics_of
-from regnf_data.trajectories import WalkingGround, check_free, long_walk, look_at, orbit, pass_by, short_walk
 
 SIZE = (60, 80)
 INTRINSICS = intrinsics_of(SIZE, 60.0)
@@ -51,10 +51,14 @@ def seen_share(poses: NDArray[np.float64], thing: Thing) -> float:
     return float(seen.mean())
 
 
-def test_look_at_by_hand() -> None:
+def test_look_at_by_hand_and_straight_down() -> None:
     pose = look_at(np.array([[1.0, 2.0, 3.0]]), np.array([[1.0, 5.0, 3.0]]))[0]
     np.testing.assert_allclose(pose[:3, :3], [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
     np.testing.assert_array_equal(pose[:, 3], [1, 2, 3, 1])
+    down = look_at(np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 3)))[0, :3, :3]
+    np.testing.assert_allclose(down.T @ down, np.eye(3), atol=1e-12)
+    assert np.linalg.det(down) == pytest.approx(1.0)
+    np.testing.assert_allclose(down[:, 2], [0, 0, -1], atol=1e-12)
 
 
 @pytest.mark.parametrize("walk", [long_walk, short_walk])

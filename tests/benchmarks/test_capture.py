@@ -24,9 +24,9 @@ from benchmarks.random_worlds.fusing import (
 from benchmarks.random_worlds.mesh import Array, ExactScene, ExactView, ball, box, turned
 from benchmarks.random_worlds.models import Model
 from benchmarks.random_worlds.symmetries import measure_symmetries
+from benchmarks.worlds.rendering import DepthSensor
+from benchmarks.worlds.trajectories import look_at
 from regnf_core.fields.build import open_field
-from regnf_data.rendering import DepthSensor
-from regnf_data.trajectories import look_at
 
 SIZE = (60, 80)
 EXACT = RandomSensor(
@@ -71,7 +71,7 @@ def test_readings_err_as_much_as_the_sensor_says(depth: float) -> None:
         assert abs(errors.mean()) < 0.3 * errors.std()
 
 
-def test_a_simulated_datasets_camera_is_exact_or_errs_as_that_of_render_dataset() -> None:
+def test_a_simulated_datasets_camera_is_exact_or_errs_as_its_depth_sensor() -> None:
     drawn = [rendered_sensor(np.random.default_rng(seed)) for seed in range(12)]
     depth = np.linspace(0.4, 4.0, 10)
     exact = [sensor for sensor in drawn if not sensor.deviation_m(depth).any()]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from benchmarks.worlds.mesh_scene import MeshScene
 from regnf_core.errors import DatasetError
-from regnf_data.mesh_scene import MeshScene
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_data.mesh_scene import MeshScene, to_srgb
+from benchmarks.worlds.mesh_scene import MeshScene, to_srgb
 
 Size = tuple[int, int]
 """Height and width, pixels."""

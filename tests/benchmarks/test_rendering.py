@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from PIL import Image
 
-from benchmarks.simple_meshes import revolved
-from regnf_core.fields.mesh import MeshField
-from regnf_data.mesh_scene import (
+from benchmarks.worlds.mesh_scene import (
     MeshScene,
     PaintedMesh,
     Thing,
     box_thing,
-    load_thing,
     paint_of,
     tile_paint,
     to_linear,
     to_srgb,
-    vertex_paint,
 )
-from regnf_data.rendering import intrinsics_of, light, render
-from regnf_data.trajectories import look_at
+from benchmarks.worlds.rendering import intrinsics_of, light, render
+from regnf_core.fields.mesh import MeshField
 
 SIZE = (120, 160)
 WHITE = tile_paint((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), 1.0)
@@ -51,21 +45,6 @@ def test_depth_and_corners_of_a_box() -> None:
     assert (view.thing[outside] == -1).all()
     # The middle of pixel (60, 80) is off the axis by half a pixel both ways.
     assert view.cosine[60, 80] == pytest.approx(138.5641 / np.sqrt(138.5641**2 + 0.5), abs=1e-6)
-
-
-def test_depth_carried_back_lies_on_the_surface() -> None:
-    vase = revolved([(0.0, -0.3), (0.25, -0.3), (0.1, 0.0), (0.3, 0.3), (0.0, 0.3)])
-    paint = vertex_paint(np.ones((len(vase.vertices), 3)))
-    scene = MeshScene([Thing((PaintedMesh(vase.vertices, vase.faces, paint),), vase, "vase")])
-    intrinsics = intrinsics_of(SIZE, 50.0)
-    for position in ([1.0, 0.4, 0.5], [-0.3, -0.9, -0.4]):
-        pose = look_at(np.array([position]), np.zeros((1, 3)))[0]
-        view = render(scene, SIZE, intrinsics, pose)
-        rows, columns = np.nonzero(view.depth)
-        assert len(rows) > 3000
-        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-        points = (np.linalg.inv(intrinsics) @ pixels * view.depth[rows, columns]).T @ pose[:3, :3].T + pose[:3, 3]
-        assert vase.signed_distance(torch.from_numpy(points)).abs().max() < 1e-6
 
 
 def test_light_follows_lamberts_law() -> None:
@@ -108,15 +87,3 @@ def test_srgb_there_and_back() -> None:
     every = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(to_srgb(to_linear(every)), every)
     assert to_linear(np.array([188]))[0] == pytest.approx(0.503, abs=1e-3)  # the well-known middle gray of light
-
-
-def test_a_thing_that_is_inside_out_and_holds_another_is_no_room(tmp_path: Path) -> None:
-    """A refrigerator with its faces turned round: free space is outside of it, so cameras may stand there."""
-    parts = [trimesh.creation.box(extents=[size] * 3) for size in (1.0, 0.4)]
-    parts[1].invert()
-    mesh = trimesh.util.concatenate(parts)
-    mesh.invert()
-    mesh.export(tmp_path / "refrigerator.ply")
-    thing = load_thing(tmp_path / "refrigerator.ply")
-    distance = thing.solid.signed_distance(torch.tensor([[0.7, 0.0, 0.0], [0.35, 0.0, 0.0]]))
-    np.testing.assert_allclose(distance, [0.2, -0.15], atol=1e-6)

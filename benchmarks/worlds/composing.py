@@ -12,14 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.errors import DatasetError
-from regnf_core.fields.composite import SurfaceSource
-from regnf_core.geometry.box import OrientedBox
-from regnf_data.layouts import Furnishing, Layout
-from regnf_data.mesh_scene import MeshScene, Thing, box_thing, load_thing, tile_paint
-from regnf_data.posed_images import Instance, PosedImages
-from regnf_data.rendering import DepthSensor, Size, View, intrinsics_of, render
-from regnf_data.trajectories import (
+from benchmarks.worlds.layouts import Furnishing, Layout
+from benchmarks.worlds.mesh_scene import MeshScene, Thing, box_thing, load_thing, tile_paint
+from benchmarks.worlds.rendering import DepthSensor, Size, View, intrinsics_of, render
+from benchmarks.worlds.trajectories import (
     CLEARANCE_M,
     WalkingGround,
     check_free,
@@ -30,6 +26,10 @@ from regnf_data.trajectories import (
     pass_by,
     short_walk,
 )
+from regnf_core.errors import DatasetError
+from regnf_core.fields.composite import SurfaceSource
+from regnf_core.geometry.box import OrientedBox
+from regnf_data.posed_images import Instance, PosedImages
 
 Array = NDArray[np.float64]
 

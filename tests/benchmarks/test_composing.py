@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from benchmarks.make_fields import UNITS_PER_METER
+from benchmarks.worlds.composing import RenderOptions, render_object, render_room
+from benchmarks.worlds.layouts import read_layout
 from regnf_core.errors import DatasetError
 from regnf_core.importing.mesh_file import load_mesh
-from regnf_data.composing import RenderOptions, render_object, render_room
-from regnf_data.layouts import read_layout
 from regnf_data.posed_images import PosedImages
 from scripts import make_demo_fields as demo
-from tests.data.rooms import CHEST, room, write_chest, write_room
+from tests.benchmarks.rooms import CHEST, room, write_chest, write_room
 from tests.devdata import dev_data
 
 SMALL = {"size": (48, 64), "sensor": None}
@@ -126,39 +126,3 @@ def test_refused_requests(tmp_path: Path) -> None:
         with pytest.raises(DatasetError) as refused:
             render_room(layout, options, **given)  # type: ignore[arg-type]
         assert refused.value.reason == reason
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"floor": None}, "DATASET_LAYOUT_INVALID"),
-        ({"floor": {"box_min": [0, 0, 0], "box_max": [1, 1, 0]}}, "DATASET_LAYOUT_INVALID"),
-        ({"walls": 3}, "DATASET_LAYOUT_INVALID"),
-        ({"walls": [{}]}, "DATASET_LAYOUT_INVALID"),
-        ({"instances": []}, "DATASET_LAYOUT_INVALID"),
-        ({"instances": [{"id": "a"}]}, "DATASET_LAYOUT_INVALID"),
-        ({"instances": [{"id": "a\n", "mesh": "chest.ply"}]}, "DATASET_LAYOUT_INVALID"),
-        ({"instances": [{"id": "a", "mesh": "\ud800"}]}, "DATASET_MESH_MISSING"),
-        ({"instances": [{"id": "a", "mesh": "absent.glb"}]}, "DATASET_MESH_MISSING"),
-        ({"instances": [{"id": "a", "mesh": "../../etc/passwd"}]}, "DATASET_MESH_MISSING"),
-        ({"instances": [{"id": "a", "mesh": "a\0b"}]}, "DATASET_MESH_MISSING"),
-        ({"instances": [{"id": "a", "mesh": 300 * "a"}]}, "DATASET_MESH_MISSING"),
-        ({"instances": [{"id": "a", "mesh": "chest.ply", "T_room_from_object": [1]}]}, "DATASET_LAYOUT_INVALID"),
-        ({"scene_units_per_meter": 0}, "DATASET_LAYOUT_INVALID"),
-        ({"scene_origin_m": "here"}, "DATASET_LAYOUT_INVALID"),
-    ],
-)
-def test_refused_layouts(change: dict[str, Any], reason: str, tmp_path: Path) -> None:
-    path = write_room(tmp_path)
-    path.write_text(json.dumps({**room(), **change}))
-    with pytest.raises(DatasetError) as refused:
-        read_layout(path, tmp_path)
-    assert refused.value.reason == reason
-
-
-@pytest.mark.parametrize("content", [b"", b"[]", b"\xff", b"[" * 100_000])
-def test_layouts_that_are_none(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "room.json").write_bytes(content)
-    with pytest.raises(DatasetError) as refused:
-        read_layout(tmp_path / "room.json", tmp_path)
-    assert refused.value.reason == "DATASET_LAYOUT_INVALID"
