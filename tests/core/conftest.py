@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import pytest
 import torch
 
-import regnf
 from regnf_core.document import RegistrationResult
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
-from tests.cli.conftest import DATA
-from tests.core.analytic import chair, chair_box, chair_pose, room, table
-from tests.core.robust.shapes import ONE_SEARCH, ROBUST, detection, run
+from tests.core.analytic import chair, chair_box, chair_pose, room
 
 QUICK = {
     "preset": "paper",
@@ -48,23 +44,3 @@ def chair_run() -> ChairRun:
     finally:
         torch.set_num_threads(threads)
     return ChairRun(truth, detection, result)
-
-
-@pytest.fixture(scope="session")
-def plain() -> RegistrationResult:
-    """The chair in its room by the preset robust, seed 0, without clouds."""
-    return run(room(chair_pose()), chair(), detection(), ROBUST)
-
-
-@pytest.fixture(scope="session")
-def wrong() -> RegistrationResult:
-    """A table in the chair's place, searched for once."""
-    return run(room(chair_pose()), table(), detection(), ONE_SEARCH)
-
-
-@pytest.fixture(scope="session")
-def demo_run() -> regnf.Registered:
-    """The demo's armchair in its room, by the paths of their files."""
-    box = json.loads((DATA / "detection.json").read_text()) | {"label": "armchair"}
-    room, obj = DATA / "mix-room.safetensors", DATA / "armchair.safetensors"
-    return regnf.register(room, str(obj), box, {"up_axis": "z"}, seed=3)

@@ -17,7 +17,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import model_object, register
 from regnf_core.options import OptimizationOptions, RegistrationOptions
 from regnf_core.processes import in_processes
-from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere
+from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere, table
 from tests.core.conftest import QUICK, ChairRun
 
 OPTIONS = RegistrationOptions.from_dict(QUICK)
@@ -111,6 +111,13 @@ def test_what_only_robust_takes_is_refused_before_any_work(known: dict[str, Any]
     assert scene.evaluations == 0
 
 
+def test_a_wrong_object_is_never_registered() -> None:
+    T = chair_pose()
+    result = register(room(T), table(), chair_box(T), OPTIONS, clouds=False)
+    assert result.verdict == "rejected"
+    assert result.verdict_reason in {"LOW_OVERLAP", "LARGE_RESIDUAL"}
+
+
 def test_a_ball_offers_no_features_to_match() -> None:
     T = chair_pose()
     with pytest.raises(InitializationError):
@@ -162,7 +169,6 @@ def test_a_field_that_breaks_down_on_the_way_is_reported() -> None:
     assert caught.value.reason == "FIELD_NOT_FINITE"
 
 
-@pytest.mark.long
 def test_golden_chair_with_published_options() -> None:
     T = chair_pose(0.8)
     result = register(room(T), chair(), chair_box(T), RegistrationOptions(preset="paper"), seed=2, clouds=False)

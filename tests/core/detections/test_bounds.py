@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import random
-from typing import Any
 
 import pytest
 
@@ -94,34 +93,51 @@ def test_the_distance_of_upright_boxes_is_exact(center: Vector, apart: float) ->
     assert distance(Detection(center, (1, 1, 1)), CUBE) == pytest.approx(apart)
 
 
-MILLIMETERS = ((3500.0, 3000.0, 4400.0), (6500.0, 7000.0, 7000.0))
-SMALL = ((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
-
-
 @pytest.mark.parametrize(
-    ("center", "size", "bounds", "said", "hint"),
+    ("box", "said", "hint"),
     [
-        ((-562, -283, 200), (546, 598, 511), [ROOM], "units from the scene's bounds", "millimeters? Divided by 1000"),
-        ((-56.2, -28.3, 20.0), (54.6, 59.8, 51.1), [ROOM], "units from", "centimeters or inches? Divided by 100 or"),
-        ((39.37, 39.37, 39.37), (20, 20, 20), [ROOM], "units from", "or inches?"),
-        ((20, 20, 20), (1, 1, 1), [ROOM], "the size [1, 1, 1], the scene reaches from [-1.5, -2, -0.6]", "own frame"),
-        ((5.2, 5.1, 5.3), (0.5, 0.5, 0.5), [MILLIMETERS], "units from", "Is the scene in millimeters?"),
-        ((1.0, 1.5, 1.0), (0.5, 0.5, 0.5), [SMALL, ROOM], "units from", "swapped"),
-        ((100, 80, 120), (550, 600, 520), [ROOM], "many times larger", "millimeters"),
+        (
+            Detection((-562, -283, 200), (546, 598, 511)),
+            "units from the scene's bounds",
+            "in millimeters? Divided by 1000",
+        ),
+        (Detection((-56.2, -28.3, 20.0), (54.6, 59.8, 51.1)), "units from", "centimeters or inches? Divided by 100 or"),
+        (Detection((39.37, 39.37, 39.37), (20, 20, 20)), "units from", "or inches?"),
+        (
+            Detection((20, 20, 20), (1, 1, 1)),
+            "the size [1, 1, 1], the scene reaches from [-1.5, -2, -0.6]",
+            "own frame",
+        ),
     ],
 )
-def test_a_box_outside_tells_how_far_and_what_may_be_wrong(
-    center: Vector, size: Vector, bounds: list[Any], said: str, hint: str
-) -> None:
+def test_a_box_outside_tells_how_far_and_what_may_be_wrong(box: Detection, said: str, hint: str) -> None:
     with pytest.raises(InvalidDetectionError) as caught:
-        require_in_scene(Detection(center, size), *bounds)
-    assert caught.value.reason == ("INVALID_DETECTION" if "larger" in said else "DETECTION_OUTSIDE_SCENE")
+        require_in_scene(box, ROOM)
+    assert caught.value.reason == "DETECTION_OUTSIDE_SCENE"
     assert said in str(caught.value)
     assert hint in (caught.value.hint or "")
 
 
-def test_a_box_thirty_times_as_large_as_a_room_is_none_too_large() -> None:
+def test_a_scene_of_another_unit_is_named_too() -> None:
+    room = tuple(tuple(1000 * value + 5000 for value in corner) for corner in ROOM)
+    with pytest.raises(InvalidDetectionError) as caught:
+        require_in_scene(Detection((5.2, 5.1, 5.3), (0.5, 0.5, 0.5)), (room[0], room[1]))
+    assert "Is the scene in millimeters?" in (caught.value.hint or "")
+
+
+def test_a_box_many_times_the_scene_is_refused_too() -> None:
+    with pytest.raises(InvalidDetectionError, match="many times larger") as caught:
+        require_in_scene(Detection((100, 80, 120), (550, 600, 520)), ROOM)
+    assert caught.value.reason == "INVALID_DETECTION"
+    assert "millimeters" in (caught.value.hint or "")
     require_in_scene(Detection((0, 0, 0), (30, 30, 30)), ROOM)
+
+
+def test_swapped_scene_and_object_are_noticed() -> None:
+    box = Detection((1.0, 1.5, 1.0), (0.5, 0.5, 0.5))
+    with pytest.raises(InvalidDetectionError) as caught:
+        require_in_scene(box, ((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), ROOM)
+    assert "swapped" in (caught.value.hint or "")
 
 
 def test_a_scene_without_bounds_refuses_nothing() -> None:

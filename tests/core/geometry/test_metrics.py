@@ -6,12 +6,14 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.geometry.metrics import (
     ContinuousSymmetry,
     Symmetries,
     add_s,
+    diameter,
     errors_against_truth,
     mssd,
     paper_errors,
@@ -61,33 +63,28 @@ def test_rotation_error_modulo_symmetry(angle: float, symmetries: Symmetries | N
     assert rotation_error(turn_z(angle), Sim3.identity(), symmetries) == pytest.approx(expected, abs=1e-9)
 
 
-TILT = Sim3.from_quaternion(1.0, [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)], [0.0, 0.0, 0.0])
-STEP = 2 * math.pi / 315  # of the turns about an axis
+def test_mssd_by_hand() -> None:
+    # Half a turn carries each corner of the square to the opposite one, a diagonal (2 sqrt 2) away.
+    assert mssd(turn_z(math.pi), Sim3.identity(), SQUARE) == pytest.approx(2 * math.sqrt(2))
+    assert mssd(turn_z(math.pi), Sim3.identity(), SQUARE, HALF_TURN) == pytest.approx(0.0, abs=1e-12)
+    # A scale too large by a quarter puts the corners, sqrt 2 from the center, at 1 / 1.25 of that.
+    assert mssd(turn_z(0, 1.25), Sim3.identity(), SQUARE) == pytest.approx(0.2 * math.sqrt(2))
 
 
-@pytest.mark.parametrize(
-    ("estimate", "truth", "symmetries", "expected"),
-    [
-        # Half a turn carries each corner of the square to the opposite one, a diagonal (2 sqrt 2) away.
-        (turn_z(math.pi), turn_z(0), None, 2 * math.sqrt(2)),
-        (turn_z(math.pi), turn_z(0), HALF_TURN, 0.0),
-        # A scale too large by a quarter puts the corners, sqrt 2 from the center, at 1 / 1.25 of that.
-        (turn_z(0, 1.25), turn_z(0), None, 0.2 * math.sqrt(2)),
-        # In the scene the object is ten times smaller; a shift of 0.1 scene units is 1 object unit.
-        (turn_z(0, 10.0, (1.0, 0.0, 0.0)), turn_z(0, 10.0), None, 1.0),
-        # Any turn of a round thing is forgiven, but for half a step of the turns; no tilt is.
-        (turn_z(17 * STEP), turn_z(0), ROUND, 0.0),
-        (turn_z(17.5 * STEP), turn_z(0), ROUND, 2 * math.sqrt(2) * math.sin(STEP / 4)),
-    ],
-)
-def test_mssd_by_hand(estimate: Sim3, truth: Sim3, symmetries: Symmetries | None, expected: float) -> None:
-    assert mssd(estimate, truth, SQUARE, symmetries) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+def test_mssd_is_in_object_units_whatever_the_scale() -> None:
+    # In the scene the object is ten times smaller; a shift of 0.1 scene units is 1 object unit.
+    truth = turn_z(0.0, 10.0)
+    estimate = truth @ Sim3.from_translation(torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
+    assert mssd(estimate, truth, SQUARE) == pytest.approx(1.0)
 
 
-def test_what_only_one_of_the_errors_forgives() -> None:
-    assert mssd(TILT, turn_z(0), SQUARE, ROUND) > 0.5
-    assert add_s(turn_z(math.pi), turn_z(0), SQUARE) == pytest.approx(0.0, abs=1e-12)
-    assert add_s(turn_z(0, 1.0, (0.0, 0.0, 0.5)), turn_z(0), SQUARE) == pytest.approx(0.5)
+def test_mssd_forgives_any_turn_of_a_round_thing_but_no_tilt() -> None:
+    step = 2 * math.pi / 315
+    assert mssd(turn_z(17 * step), Sim3.identity(), SQUARE, ROUND) == pytest.approx(0.0, abs=1e-9)
+    between = mssd(turn_z(17.5 * step), Sim3.identity(), SQUARE, ROUND)
+    assert between == pytest.approx(2 * math.sqrt(2) * math.sin(step / 4), rel=1e-6)
+    tilt = Sim3.from_quaternion(1.0, [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)], [0.0, 0.0, 0.0])
+    assert mssd(tilt, Sim3.identity(), SQUARE, ROUND) > 0.5
 
 
 def test_symmetry_about_an_axis_off_the_origin() -> None:
@@ -96,6 +93,12 @@ def test_symmetry_about_an_axis_off_the_origin() -> None:
     moved = turned.apply(torch.zeros(1, 3, dtype=torch.float64))[:, 0]
     expected = torch.tensor([[0, 0, 0], [1, -1, 0], [2, 0, 0], [1, 1, 0]], dtype=torch.float64)
     torch.testing.assert_close(moved, expected, rtol=0, atol=1e-12)
+
+
+def test_add_s_forgives_what_mssd_does_not() -> None:
+    assert add_s(turn_z(math.pi), Sim3.identity(), SQUARE) == pytest.approx(0.0, abs=1e-12)
+    lifted = Sim3.from_translation(torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64))
+    assert add_s(lifted, Sim3.identity(), SQUARE) == pytest.approx(0.5)
 
 
 def test_all_errors_vanish_for_the_truth_and_have_the_promised_names() -> None:
@@ -135,6 +138,19 @@ def test_the_centers_error_is_in_scene_units_and_over_the_symmetries() -> None:
         0.0, abs=1e-9
     )
     assert errors_against_truth(turned, truth, SQUARE, None, center)["center_error"] == pytest.approx(2.0 / 2.0)
+
+
+@pytest.mark.parametrize(
+    ("points", "expected"),
+    [
+        (SQUARE, math.sqrt(8)),  # flat: no hull in space
+        (torch.cat([SQUARE, SQUARE + torch.tensor([0.0, 0.0, 1.0])]), 3.0),
+        (torch.zeros(1, 3), 0.0),
+        (torch.tensor([[0.0, 0, 0], [1, 0, 0], [4, 0, 0]]), 4.0),
+    ],
+)
+def test_diameter(points: Tensor, expected: float) -> None:
+    assert diameter(points) == pytest.approx(expected)
 
 
 def test_symmetries_in_bops_words() -> None:

@@ -25,7 +25,7 @@ def _about(axis: int, angle: float) -> torch.Tensor:
     return Sim3.exp(tangent).rotation
 
 
-@settings(max_examples=20)
+@settings(max_examples=30)
 @given(_angle, st.floats(-1.55, 1.55), _angle)
 def test_order_and_round_trip(roll: float, pitch: float, yaw: float) -> None:
     angles = torch.tensor([roll, pitch, yaw], dtype=torch.float64)

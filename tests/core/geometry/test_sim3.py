@@ -41,7 +41,7 @@ def generator_matrix(tangent: Tensor) -> Tensor:
     return M
 
 
-@settings(max_examples=30)
+@settings(max_examples=60)
 @given(tangents())
 def test_exp_is_the_matrix_exponential(tangent: Tensor) -> None:
     # torch's own matrix exponential is off by 2e-11 for a turn of 1/32 about z, scipy's is not
@@ -49,14 +49,14 @@ def test_exp_is_the_matrix_exponential(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(tangent).matrix(), expected, rtol=1e-11, atol=1e-11)
 
 
-@settings(max_examples=30)
+@settings(max_examples=60)
 @given(tangents())
 @example(torch.tensor([math.pi - 1e-9, 0.0, 0.0, 0.3, -0.2, 0.9, 0.7], dtype=torch.float64))
 def test_log_undoes_exp(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(tangent).log(), tangent, rtol=1e-7, atol=1e-7)
 
 
-@settings(max_examples=25)
+@settings(max_examples=40)
 @given(tangents())
 def test_exp_undoes_log_even_at_half_a_turn(tangent: Tensor) -> None:
     half_turn = tangent.clone()
@@ -65,7 +65,7 @@ def test_exp_undoes_log_even_at_half_a_turn(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(T.log()).matrix(), T.matrix(), rtol=1e-9, atol=1e-9)
 
 
-@settings(max_examples=12)
+@settings(max_examples=25)
 @given(tangents(), tangents(), tangents())
 def test_group_laws(a: Tensor, b: Tensor, c: Tensor) -> None:
     A, B, C = Sim3.exp(a), Sim3.exp(b), Sim3.exp(c)
@@ -123,14 +123,22 @@ PARTS = {"scale": 1.0, "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": 
 @pytest.mark.parametrize(
     "values",
     [
-        {"matrix": [[1, 2], [3]]},
-        {"matrix": GOOD * torch.tensor([1.0, 1.01, 1.0, 1.0])},
+        *(
+            {"matrix": matrix}
+            for matrix in ("abc", [[1, 2], [3]], [["a"] * 4] * 4, {"x": 1}, None, [[10**400] * 4] * 4)
+        ),
+        {"matrix": GOOD[:3]},
+        {"matrix": GOOD * torch.tensor([1.0, 1.0, float("nan"), 1.0])},
+        {"matrix": GOOD * torch.tensor([[1.0], [1.0], [1.0], [2.0]])},  # its last row
+        {"matrix": GOOD * torch.tensor([1.0, 1.01, 1.0, 1.0])},  # stretched
+        {"matrix": GOOD * torch.tensor([1.0, -1.0, 1.0, 1.0])},  # mirrored
+        {"matrix": GOOD * torch.tensor([0.0, 0.0, 0.0, 1.0])},
         {"scale": 1.0, "translation": [0, 0, 0]},
         *(PARTS | {"scale": scale} for scale in ("large", 0.0, float("inf"))),
         *(PARTS | {"rotation_quaternion_xyzw": q} for q in ([0, 0, 0, 0], [0, 0, 1])),
     ],
 )
-def test_what_is_no_similarity_is_refused_as_tensor_and_in_parts(values: dict[str, Any]) -> None:
+def test_what_is_no_similarity_is_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError) as caught:
         Sim3.from_dict(values)
     assert caught.value.reason == "INVALID_TRANSFORM"
@@ -177,7 +185,8 @@ def test_perturbing_the_identity_is_exp_to_first_order(k: int) -> None:
 
 
 def test_perturb_pivots_on_the_translation() -> None:
-    T, step = Sim3.from_matrix(GOOD), torch.tensor([0.3, -0.1, 0.2, 1.0, 2.0, 3.0, 0.5], dtype=torch.float64)
+    T = Sim3.from_matrix(GOOD)
+    step = torch.tensor([0.3, -0.1, 0.2, 1.0, 2.0, 3.0, 0.5], dtype=torch.float64)
     moved = T.perturb(step)
     torch.testing.assert_close(moved.translation, T.translation + step[3:6])
     torch.testing.assert_close(moved.rotation, Sim3.identity().perturb(step).rotation @ T.rotation)

@@ -35,16 +35,21 @@ def rows(**changes: Any) -> list[list[Any]]:
         (rows(m33=2), "last row"),
         (rows(m30=1e-3), "last row"),
         ([[0, 0, 0, 1], [0, 0, 0, 2], [0, 0, 0, 3], [0, 0, 0, 1]], "scale vanishes"),
-        *((rows(m00=value), "four rows") for value in ("0", True, None)),
-        *((value, "four rows") for value in (rows()[:3], [row[:3] for row in rows()], "abcd", ["abcd"] * 4, 7, None)),
+        (rows(m00="0"), "four rows"),
+        (rows(m00=True), "four rows"),
+        (rows(m00=None), "four rows"),
+        (rows()[:3], "four rows"),
+        ([row[:3] for row in rows()], "four rows"),
+        ("abcd", "four rows"),
+        (["abcd"] * 4, "four rows"),
         ({"matrix": rows()}, "four rows"),
+        (7, "four rows"),
     ],
 )
 def test_what_is_no_similarity(value: Any, said: str) -> None:
-    assert said in (similarity_fault(value) or "")
-    with pytest.raises(InvalidInputError) as caught:
-        Sim3.from_dict({"matrix": value})
-    assert caught.value.reason == "INVALID_TRANSFORM"
+    fault = similarity_fault(value)
+    assert fault is not None
+    assert said in fault
 
 
 def test_exact_transforms_pass_in_the_spelling_of_documents() -> None:

@@ -1,4 +1,4 @@
-"""Rooms and chairs of which all was observed but one part."""
+"""A room with a chair, of which all was observed but one part of the chair."""
 
 from __future__ import annotations
 
@@ -20,15 +20,12 @@ def over_closed(part: tuple[list[float], list[float]]) -> AnalyticField:
 
 def observed(scene: AnalyticField, part: tuple[list[float], list[float]]) -> ObservedField:
     """Of ``scene`` everything was seen but ``part`` of the chair, its frame."""
-    return seen_but_for(scene, scene, seen_from(boxes([part]), chair_pose()))
-
-
-def seen_but_for(field: AnalyticField, true: AnalyticField, hidden: AnalyticField) -> ObservedField:
-    """``field``, of whose ``true`` surface everything was seen but what lies in or at ``hidden``."""
-    low, high = field.bounds
+    low, high = scene.bounds
     counts = ((high - low) / _VOXEL).round().long().tolist()
-    centers = torch.cartesian_prod(*(low[k] + (torch.arange(counts[k]) + 0.5) * _VOXEL for k in range(3)))
-    value = true.signed_distance(centers)
+    axes = [low[k] + (torch.arange(counts[k]) + 0.5) * _VOXEL for k in range(3)]
+    centers = torch.cartesian_prod(*axes)
+    value = scene.signed_distance(centers)
     states = torch.where(value.abs() < 0.9 * _VOXEL, SURFACE, torch.where(value > 0, FREE, UNSEEN))
-    states[hidden.signed_distance(centers) < 0.9 * _VOXEL] = UNSEEN
-    return ObservedField(field, Observation(states.to(torch.uint8).view(counts), low, _VOXEL))
+    hidden = seen_from(boxes([part]), chair_pose()).signed_distance(centers) < 0.9 * _VOXEL
+    states[hidden] = UNSEEN
+    return ObservedField(scene, Observation(states.to(torch.uint8).view(counts), low, _VOXEL))

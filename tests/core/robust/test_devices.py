@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from regnf_core import OrientedBox, open_field
-from regnf_core.document import RegistrationResult
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.metrics import NearestNeighbors, nearest_of_all
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust import working_frame
 from regnf_core.robust.model import model_object
@@ -34,7 +34,7 @@ from regnf_core.robust.verdict.evidence import SPEAKS_FOR, gather_evidence, pose
 from regnf_core.robust.working_frame import Samples, WorkingField, WorkingFrame
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
 from tests.core.robust.elsewhere import ELSEWHERE, Border
-from tests.core.robust.shapes import detection, run
+from tests.core.robust.shapes import ROBUST, detection
 from tests.golden.cases import EXAMPLES
 
 OPTIONS = RegistrationOptions().robust
@@ -65,7 +65,7 @@ def observed(pair: SurfacePair) -> SurfacePair:
 
 
 @pytest.fixture
-def cpu_as_elsewhere(plain: RegistrationResult, monkeypatch: pytest.MonkeyPatch) -> None:
+def cpu_as_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """The CPU's tensors are treated as those of another device."""
     for module in BRANCHING:
         monkeypatch.setattr(module, "on_host", lambda values: False)
@@ -159,8 +159,10 @@ def test_a_tree_and_all_distances_find_the_same_neighbors() -> None:
 
 
 @pytest.mark.usefixtures("cpu_as_elsewhere")
-def test_the_other_devices_branches_give_the_same_registration(plain: RegistrationResult) -> None:
-    found = run(room(chair_pose()), chair(), detection())
+def test_the_other_devices_branches_give_the_same_registration(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = register(room(chair_pose()), chair(), detection(), ROBUST, seed=5, clouds=False)
+    monkeypatch.undo()
+    plain = register(room(chair_pose()), chair(), detection(), ROBUST, seed=5, clouds=False)
     assert found.verdict == plain.verdict == "registered"
     assert found.metrics["field_evaluations"] == plain.metrics["field_evaluations"]
     torch.testing.assert_close(found.T_object_scene.matrix(), plain.T_object_scene.matrix(), rtol=0, atol=1e-9)

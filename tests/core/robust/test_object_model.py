@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from regnf_core.document import RegistrationResult
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.composite import TransformedField
 from regnf_core.library import register
 from regnf_core.robust.model import (
     MODEL_VERSION,
     SIGNATURE_LENGTH,
-    Hull,
     model_object,
     read_object_model,
     signature,
@@ -24,8 +21,6 @@ from regnf_core.robust.model import (
 )
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, table
 from tests.core.robust.shapes import ROBUST, can, detection, random_pose, slab_table
-
-Z = (0.0, 0.0, 1.0)
 
 
 def square_table() -> AnalyticField:
@@ -40,13 +35,24 @@ def brick() -> AnalyticField:
 
 @pytest.mark.parametrize(
     ("shape", "order", "axis"),
-    [(chair, 1, None), (slab_table, 2, Z), (table, 2, Z), (square_table, 4, Z), (brick, 4, None), (can, 1, Z)],
+    [(chair, 1, None), (slab_table, 2, "z"), (table, 2, "z"), (square_table, 4, "z"), (brick, 4, None)],
 )
-def test_the_symmetry_group_is_found(shape: object, order: int, axis: tuple[float, float, float] | None) -> None:
+def test_the_symmetry_group_is_found(shape: object, order: int, axis: str | None) -> None:
     found = model_object(shape()).symmetry.group()  # type: ignore[operator]
-    assert (found.order, found.continuous) == (order, shape is can)
-    assert found.axis == (None if axis is None else pytest.approx(axis, abs=0.05))
-    assert axis is None or (found.axis is not None and found.axis[2] == pytest.approx(1.0, abs=1e-3))
+    assert (found.order, found.continuous) == (order, False)
+    if axis is None:
+        assert found.axis is None
+    else:
+        assert found.axis is not None
+        assert found.axis["xyz".index(axis)] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_can_turns_freely_about_its_axis() -> None:
+    found = model_object(can()).symmetry.group()
+    assert found.continuous
+    assert found.order == 1
+    assert found.axis is not None
+    assert found.axis[2] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_the_axis_turns_with_the_object_frame() -> None:
@@ -90,66 +96,39 @@ def test_the_signature_of_two_points_is_what_the_bins_say() -> None:
     torch.testing.assert_close(found[found > 0], torch.ones(2))
 
 
-def test_a_stored_model_is_as_good_as_a_new_one(tmp_path: Path, plain: RegistrationResult) -> None:
-    write_object_model(tmp_path / "chair.model", model_object(chair()))
+def test_a_stored_model_is_as_good_as_a_new_one(tmp_path: Path) -> None:
+    model = model_object(chair())
+    write_object_model(tmp_path / "chair.model", model)
     stored = read_object_model(tmp_path / "chair.model")
-    reused = register(room(chair_pose()), chair(), detection(), ROBUST, object_model=stored, clouds=False)
-    assert torch.equal(reused.T_object_scene.matrix(), plain.T_object_scene.matrix())
-    assert reused.metrics["field_evaluations"] < plain.metrics["field_evaluations"]
+    scene, obj = room(chair_pose()), chair()
+    fresh = register(scene, obj, detection(), ROBUST, seed=2, clouds=False)
+    reused = register(scene, obj, detection(), ROBUST, seed=2, object_model=stored, clouds=False)
+    torch.testing.assert_close(reused.T_object_scene.matrix(), fresh.T_object_scene.matrix(), rtol=0, atol=0)
+    assert reused.metrics["field_evaluations"] < fresh.metrics["field_evaluations"]
     assert [path.name for path in tmp_path.iterdir()] == ["chair.model"]
 
 
-@pytest.fixture(scope="module")
-def stored_table(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("model") / "table.model"
-    write_object_model(path, model_object(slab_table()))
-    return path
-
-
-FAULTS: dict[str, Callable[[dict[str, torch.Tensor]], object]] = {
-    "version": lambda tensors: None,
-    "name": lambda tensors: tensors.update(other=tensors.pop("center")),
-    "shape": lambda tensors: tensors.update(normals=tensors["normals"][:, :2].contiguous()),
-    "count": lambda tensors: tensors.update(values=tensors["values"][1:].contiguous()),
-    "nan": lambda tensors: tensors["points"][3, 1].fill_(torch.nan),
-    "length": lambda tensors: tensors["lengths"][0].fill_(-1.0),
-}
-
-
-@pytest.mark.parametrize("fault", ["not safetensors", "missing", *FAULTS])
-def test_a_faulty_model_file_is_refused(tmp_path: Path, fault: str, stored_table: Path) -> None:
+@pytest.mark.parametrize("fault", ["not safetensors", "missing", "version", "name", "shape", "count", "nan", "length"])
+def test_a_faulty_model_file_is_refused(tmp_path: Path, fault: str) -> None:
     path = tmp_path / "chair.model"
-    if fault in FAULTS:
-        tensors = load_file(stored_table)
-        FAULTS[fault](tensors)
-        save_file(tensors, path, {"regnf_object_model": "1" if fault == "version" else MODEL_VERSION})
-    elif fault == "not safetensors":
+    write_object_model(path, model_object(slab_table()))
+    tensors = load_file(path)
+    metadata = {"regnf_object_model": "1" if fault == "version" else MODEL_VERSION}
+    if fault == "name":
+        tensors["other"] = tensors.pop("center")
+    if fault == "shape":
+        tensors["normals"] = tensors["normals"][:, :2].contiguous()
+    if fault == "count":
+        tensors["values"] = tensors["values"][1:]
+    if fault == "nan":
+        tensors["points"][3, 1] = float("nan")
+    if fault == "length":
+        tensors["lengths"][0] = -1.0
+    save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path, metadata)
+    if fault == "not safetensors":
         path.write_bytes(b"PK\x03\x04")
+    if fault == "missing":
+        path.unlink()
     with pytest.raises(FieldFormatError) as raised:
         read_object_model(path)
     assert raised.value.reason == "OBJECT_MODEL_INVALID"
-
-
-# Convex hulls of surfaces: a box by hand, and shapes that have none.
-
-CORNERS = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3) * torch.tensor([1.0, 2.0, 3.0])
-
-
-@pytest.mark.parametrize(
-    ("point", "margin", "within"),
-    [
-        ([0.5, 1.0, 1.5], 0.0, True),
-        ([0.5, 1.0, 1.5], 0.49, True),
-        ([0.5, 1.0, 1.5], 0.51, False),  # half a unit from the nearest faces
-        ([0.5, 1.0, 2.95], 0.1, False),
-        ([1.2, 1.0, 1.5], 0.0, False),
-        ([1.2, 1.0, 1.5], -0.3, True),
-    ],
-)
-def test_a_box(point: list[float], margin: float, within: bool) -> None:
-    assert bool(Hull.of(CORNERS).contains(torch.tensor(point), margin)) is within
-
-
-def test_nothing_is_within_a_flat_surface() -> None:
-    flat = CORNERS * torch.tensor([1.0, 1.0, 0.0])
-    assert not bool(Hull.of(flat).contains(flat.mean(0), -1.0))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from regnf_core.fields.observation import Observation, ObservedField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.scene import SingleView, occlusion_boundary, view_scene
+from regnf_core.robust.scene import SingleView, view_scene
 from regnf_core.robust.working_frame import Samples, WorkingFrame, WorkingObservation, sample_object_surface
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from tests.core.analytic import AnalyticField
@@ -155,27 +154,3 @@ def test_an_objects_model_has_no_surface_that_nobody_saw_from_its_front() -> Non
     assert int((whole.normals[:, 2] < -0.9).sum()) > 300
     assert len(seen) > 300
     assert bool((seen.normals[:, 2] > 0.9).all())
-
-
-# A scene observed from one side: its occlusion boundary is found.
-
-
-def test_edge_on_surface_is_told_from_surface_that_faces_the_viewpoint() -> None:
-    generator = torch.Generator().manual_seed(0)
-    viewpoint = torch.tensor([1.5, -0.4, 0.8])
-    edges = torch.rand(300, 3, generator=generator) - 0.5
-    across = normalize(torch.linalg.cross(viewpoint - edges, torch.randn(300, 3, generator=generator)), dim=-1)
-    points = torch.rand(400, 3, generator=generator) - 0.5
-    sight = normalize(viewpoint - points, dim=-1)
-    normals = normalize(sight + 0.4 * torch.randn(400, 3, generator=generator), dim=-1)
-    facing = (normals * sight).sum(-1) > 0.2
-    places, along = torch.cat([edges, points[facing]]), torch.cat([across, normals[facing]])
-    found = occlusion_boundary(Samples(places, torch.zeros(len(places)), along), generator)[0]
-    assert found[:300].float().mean() > 0.98
-    assert found[300:].float().mean() < 0.02
-
-
-def test_what_was_observed_from_all_sides_has_no_occlusion_boundary() -> None:
-    generator = torch.Generator().manual_seed(0)
-    normals = normalize(torch.randn(800, 3, generator=generator), dim=-1)
-    assert not occlusion_boundary(Samples(0.4 * normals, torch.zeros(800), normals), generator)[0].any()

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from regnf_core.robust.constants import VERDICT
@@ -90,7 +90,6 @@ OBSERVED = pytest.mark.parametrize("observed", [True, False])
 
 
 @OBSERVED
-@settings(max_examples=40)
 @given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
 def test_the_shipped_models_are_monotone(observed: bool, name: str, low: float, step: float) -> None:
     others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}

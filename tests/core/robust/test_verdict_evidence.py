@@ -215,7 +215,7 @@ def test_stiffness_by_finite_differences(problem: RegistrationProblem) -> None:
     points = problem.held_out.object_samples.points.double()
     step = 1e-3
     least = float("inf")
-    for motion in torch.randn(200, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64):
+    for motion in torch.randn(300, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64):
         moved = T.perturb(step * motion)
         back = T.inverse().apply(points)
         length = (moved.apply(back) - points).square().sum(-1).mean().sqrt()

@@ -114,7 +114,7 @@ def test_surface_that_a_line_of_sight_leads_to_is_observed(observation: Observat
     points = 2.0 * torch.rand(40_000, 3, generator=generator) - 1.0
     distance, gradient = field.signed_distance_and_gradient(points)
     points = (points - distance[:, None] * gradient)[distance.abs() < 0.2]
-    points = points[field.signed_distance(points).abs() < 1e-4][:300]
+    points = points[field.signed_distance(points).abs() < 1e-4][:400]
     seen = slowly_free(field, walk(9), points, 0.02)
     states = observation.at(points)
     assert int(seen.sum()) > 100

@@ -1,0 +1,77 @@
+"""Objects that know what was seen of them: a scan's invented surface is no part of the object's model."""
+
+from __future__ import annotations
+
+import torch
+
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.library import register
+from regnf_core.robust.model import model_object
+from regnf_core.robust.working_frame import sample_object_surface
+from regnf_core.schema.description import FREE, SURFACE, UNSEEN
+from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, union
+from tests.core.robust.shapes import ROBUST, detection, placement_error, random_pose
+
+_VOXEL = 0.02
+_BLOCK = ([-0.24, -0.26, -0.75], [0.24, 0.24, -0.44])
+"""Beneath the chair: what a scan shows that was never seen from below."""
+
+
+def scanned() -> AnalyticField:
+    """The chair, closed over beneath."""
+    return union([chair(), boxes([_BLOCK])])
+
+
+def observed(unseen: bool = True) -> ObservedField:
+    """The scan: everything about the chair was seen, its block was not; or nothing was, ``unseen`` being False."""
+    scan = scanned()
+    low, high = scan.bounds
+    counts = ((high - low) / _VOXEL).round().long().tolist()
+    axes = [low[k] + (torch.arange(counts[k]) + 0.5) * _VOXEL for k in range(3)]
+    centers = torch.cartesian_prod(*axes)
+    value = chair().signed_distance(centers)
+    states = torch.where(value.abs() < 0.9 * _VOXEL, SURFACE, torch.where(value > 0, FREE, UNSEEN))
+    states[boxes([_BLOCK]).signed_distance(centers) < 0.9 * _VOXEL] = UNSEEN
+    if not unseen:
+        states[:] = UNSEEN
+    return ObservedField(scan, Observation(states.to(torch.uint8).view(counts), low, _VOXEL))
+
+
+def surface_of(field: AnalyticField | ObservedField) -> torch.Tensor:
+    found = sample_object_surface(field, 4000, torch.Generator().manual_seed(0))
+    return found.frame.out_of(found.samples.on_surface())
+
+
+def on_block(points: torch.Tensor) -> float:
+    return float((boxes([_BLOCK]).signed_distance(points).abs() < 0.01).float().mean())
+
+
+def test_surface_that_nobody_measured_is_no_part_of_the_model() -> None:
+    assert on_block(surface_of(scanned())) > 0.2
+    points = surface_of(observed())
+    assert on_block(points) < 0.01
+    assert chair().signed_distance(points).abs().max() < 0.01
+    plain = sample_object_surface(chair(), 4000, torch.Generator().manual_seed(0))
+    seen = sample_object_surface(observed(), 4000, torch.Generator().manual_seed(0))
+    assert abs(seen.frame.length / plain.frame.length - 1.0) < 0.03
+
+
+def test_an_observation_that_shows_nothing_leaves_the_object_as_it_is() -> None:
+    torch.testing.assert_close(surface_of(observed(unseen=False)), surface_of(scanned()), rtol=0, atol=0)
+
+
+def test_a_scan_is_found_by_what_was_measured_of_it() -> None:
+    T = random_pose(5, 3.0)
+    scene, box = room(chair_pose()), detection()
+    believed = register(scene, scanned(), box, ROBUST, clouds=False)
+    result = register(scene, TransformedField(observed(), T.inverse()), box, ROBUST, clouds=False)
+    assert result.verdict == "registered"
+    assert placement_error(result, T @ chair_pose()) < 0.01
+    assert believed.metrics["probability"] < result.metrics["probability"]
+
+
+def test_the_model_of_a_scan_in_any_frame_has_the_same_size() -> None:
+    T = random_pose(6, 0.05)
+    here, there = model_object(observed()), model_object(TransformedField(observed(), T.inverse()))
+    assert abs(there.frame.length / (0.05 * here.frame.length) - 1.0) < 0.03
