@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 import regnf
 from regnf_core.document import Considered, ConsideredPose
-from regnf_core.errors import MissingExtraError
 from regnf_core.viewing.recording import write_recording
 from tests.cli.conftest import DATA
 from tests.core.conftest import ChairRun
@@ -175,16 +174,6 @@ def test_a_recording_of_the_callers_own_goes_on(found: regnf.Registered, tmp_pat
         (tmp_path / "mine.rrd").write_bytes(memory.drain_as_bytes())
     assert {"/mine"} == set(rows_of(tmp_path / "mine.rrd")) - {"/__properties"}
     assert rr.get_global_data_recording() is None
-
-
-def test_without_the_extra_it_says_what_to_install(
-    found: regnf.Registered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(MissingExtraError, match=r"not installed: rerun; pip install 'regnf\[rerun\]'") as refused:
-        found.save_recording(tmp_path / "chair.rrd")
-    assert refused.value.reason == "EXTRA_MISSING"
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_recorded_is_refused(
