@@ -13,14 +13,7 @@ import pytest
 
 _TESTS = Path(__file__).parent
 _TOGETHER = ("faults", "serve", "ui")
-_APART = (
-    "core/fields/test_onnx.py",
-    "core/robust/test_covariance.py",
-    "core/robust/test_observed_scene.py",
-    "core/robust/test_register.py",
-    "core/test_batch.py",
-    "core/test_library.py",
-)
+_APART = ("core/fields/test_onnx.py",)
 _FIRST = ("faults", "ui", "live", "serve", "packaging", "contract/test_fuzz.py")
 """The longest groups, longest first: whoever began with one of them last would keep the others waiting."""
 

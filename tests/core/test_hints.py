@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from regnf_cli.commands import app_of
-from regnf_core.errors import _FAMILIES, HINTS, InvalidOptionsError, hint_of, verdict_hint
+from regnf_core.errors import _FAMILIES, HINTS, VERDICT_REASONS, InvalidOptionsError, hint_of, verdict_hint
 from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.options import RegistrationOptions, _names
 from regnf_core.rendering.request import RenderOptions
@@ -32,7 +32,6 @@ HAVE_IT_IN_THEIR_MESSAGE = {"EXTRA_MISSING", "USAGE", "CANCELLED"}
 
 @cache
 def trees() -> list[tuple[Path, ast.Module]]:
-    """Every module of the code."""
     paths = [path for top in (*PACKAGES, "service") for path in sorted((ROOT / top).rglob("*.py"))]
     return [(path, ast.parse(path.read_text(encoding="utf-8"))) for path in paths]
 
@@ -188,3 +187,17 @@ def test_a_file_of_another_program_is_to_be_exported() -> None:
 def test_the_scripts_of_the_setup_are_sound() -> None:
     for script in ("setup.sh", "run-tests.sh"):
         assert subprocess.run(["bash", "-n", ROOT / "scripts" / script], check=False).returncode == 0
+
+
+# Every reason that an engine can give for its verdict is told in words.
+
+
+CORE = Path(__file__).resolve().parents[2] / "regnf_core"
+
+
+def test_the_table_holds_the_reasons_of_both_presets_and_no_others() -> None:
+    given: set[str] = set()
+    for source in (CORE / "paper" / "pipeline.py", *sorted((CORE / "robust" / "verdict").glob("*.py"))):
+        text = source.read_text(encoding="utf-8")
+        given |= set(re.findall(r'(?:"(?:registered|ambiguous|rejected)", |return |_Limit\()"([A-Z_]+)"', text))
+    assert given == set(VERDICT_REASONS)

@@ -12,8 +12,15 @@ from typing import Any
 from regnf_core import OrientedBox, RegistrationOptions, RegistrationResult, Sim3, open_field, register
 from regnf_core.library import LibraryObject, model_object, search_library
 from tests.core.analytic import chair, chair_box, chair_pose, room, sphere, table
-from tests.core.robust.seen_in_part import UNDER_THE_SEAT, observed, over_closed
-from tests.core.robust.shapes import random_pose, reframed, slab_table, table_room
+from tests.core.robust.shapes import (
+    UNDER_THE_SEAT,
+    observed,
+    over_closed,
+    random_pose,
+    reframed,
+    slab_table,
+    table_room,
+)
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "data"
 PAPER = {

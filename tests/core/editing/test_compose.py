@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.schema.description import SURFACE
 from tests.core.analytic import AnalyticField, boxes, sphere, union
 
+BALL = sphere(0.2)
 BOUNDS = [[-1.0, -1.0, -0.1], [1.0, 1.0, 1.0]]
 FLOOR = ([-1.0, -1.0, -0.1], [1.0, 1.0, 0.0])
 WALL = ([-1.0, -1.0, -0.1], [-0.9, 1.0, 1.0])
@@ -113,7 +115,6 @@ def test_a_thing_at_a_wall_leaves_floor_and_wall() -> None:
 
 
 def test_what_reaches_in_from_outside_stays() -> None:
-    """A table's top over the stool is no part of it."""
     top = ([-0.9, -0.5, 0.5], [0.8, 0.1, 0.56])
     T = turned()
     tall = [*STOOL, ([-0.2, -0.2, 0.36], [-0.15, -0.15, 0.48])]  # its box reaches the table's top
@@ -214,7 +215,7 @@ def test_an_edited_scene_is_edited_again() -> None:
 
 def test_what_objects_say_outside_of_their_bounds_counts_for_nothing() -> None:
     """Trained fields mean nothing there: this one has a second ball beyond them."""
-    ghost = union([sphere(0.2), sphere(0.2, (0.0, 0.0, 0.9))], [[-0.3] * 3, [0.3] * 3])
+    ghost = union([BALL, sphere(0.2, (0.0, 0.0, 0.9))], [[-0.3] * 3, [0.3] * 3])
     T = Sim3.from_translation(torch.tensor([0.0, 0.0, -0.2], dtype=torch.float64))
     edited = compose(room(), [Insertion(ghost, T)])
     points = free_points()
@@ -222,7 +223,6 @@ def test_what_objects_say_outside_of_their_bounds_counts_for_nothing() -> None:
     assert ((edited.signed_distance(points) > 0) == (exact > 0))[exact.abs() > 2e-3].all()
 
 
-BALL = sphere(0.2)
 SHEARED = [[1.0, 0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 FAR = Sim3.from_translation(torch.tensor([50.0, 0.0, 0.0], dtype=torch.float64))
 
@@ -230,28 +230,27 @@ FAR = Sim3.from_translation(torch.tensor([50.0, 0.0, 0.0], dtype=torch.float64))
 @pytest.mark.parametrize(
     ("reason", "make"),
     [
-        ("INVALID_TRANSFORM", lambda: Substitution(sphere(0.2), Sim3.from_matrix(SHEARED))),
-        ("INVALID_TRANSFORM", lambda: Insertion(sphere(0.2), Sim3.identity()[None].expand(2))),
+        ("INVALID_TRANSFORM", lambda: Substitution(BALL, Sim3.from_matrix(SHEARED))),
+        ("INVALID_TRANSFORM", lambda: Insertion(BALL, Sim3.identity()[None].expand(2))),
         (
             "INVALID_TRANSFORM",
             lambda: Insertion(
-                sphere(0.2), Sim3(torch.tensor(torch.nan).double(), torch.eye(3).double(), torch.zeros(3).double())
+                BALL, Sim3(torch.tensor(torch.nan).double(), torch.eye(3).double(), torch.zeros(3).double())
             ),
         ),
         ("EDIT_INVALID", lambda: Removal()),
-        ("EDIT_INVALID", lambda: Removal(obj=sphere(0.2))),
-        ("EDIT_INVALID", lambda: Substitution(sphere(0.2), Sim3.identity(), residual=-1.0)),
+        ("EDIT_INVALID", lambda: Removal(obj=BALL)),
+        ("EDIT_INVALID", lambda: Substitution(BALL, Sim3.identity(), residual=-1.0)),
         (
             "EDIT_INVALID",
-            lambda: compose(room(), [Replacement(sphere(0.2), Sim3.identity(), sphere(0.2), up_object="up")]),
+            lambda: compose(room(), [Replacement(BALL, Sim3.identity(), BALL, up_object="up")]),
         ),
-        ("EDIT_INVALID", lambda: compose(room(), [Insertion(sphere(0.2), FAR)])),
+        ("EDIT_INVALID", lambda: compose(room(), [Insertion(BALL, FAR)])),
         ("EDIT_INVALID", lambda: compose(room(*STOOL), [Removal(obj=stool(turned()), T_object_scene=turned())] * 2)),
         ("EDIT_INVALID", lambda: compose(room(), [Insertion(stool(turned()), turned())] * 2)),
     ],
 )
-def test_bad_edits_have_reasons(reason: str, make: object) -> None:
-    assert callable(make)
+def test_bad_edits_have_reasons(reason: str, make: Callable[[], object]) -> None:
     with pytest.raises(RegnfError) as caught:
         make()
     assert caught.value.reason == reason
@@ -376,7 +375,6 @@ def on_the_ball(count: int = 500) -> Tensor:
 
 @pytest.mark.parametrize("edited", [False, True])
 def test_a_field_keeps_its_colors(edited: bool, tmp_path: Path) -> None:
-    """Also those of what was put in, at another scale and place."""
     field, at = ball(), on_the_ball()
     if edited:
         T = Sim3.exp(torch.tensor([0.4, 0.0, 0.0, 0.1, -0.05, 0.02, 0.3], dtype=torch.float64))

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from regnf_core import Camera, RegnfError, RenderOptions, render
-from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError
+from regnf_core.errors import CancelledError, InvalidInputError
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.processes import can_fork
 from regnf_core.rendering.camera import NOTHING, orbit_cameras
-from regnf_core.rendering.render import render_frames
+from regnf_core.rendering.render import free_start, render_frames
 from regnf_core.rendering.request import OrbitRequest
+from regnf_core.rendering.tracing import DistanceGrid, Region, Start
+from regnf_core.surface.sphere_tracing import Rays
 from tests.core.analytic import AnalyticField, boxes, sphere
 
 SIZE = (48, 36)
@@ -162,20 +167,17 @@ def test_a_camera_in_matter() -> None:
         ("CAMERA_INVALID", lambda: Camera(torch.zeros(3), 2 * torch.eye(3), 4, 4, (4.0, 4.0), (2.0, 2.0))),
         ("CAMERA_INVALID", lambda: Camera.look_at([1, 0, 0], [0, 0, 0], (0, 4))),
         ("COLORS_MISSING", lambda: render(sphere(0.3), CAMERA, RenderOptions(coloring="field"))),
+        (
+            "NO_SURFACE_IN_SCENE",
+            lambda: render(sphere(-5.0), CAMERA),
+        ),
         ("FIELD_NOT_FINITE", lambda: render(AnalyticField(lambda p: p[:, 0] * math.nan, [[-1] * 3, [1] * 3]), CAMERA)),
     ],
 )
-def test_bad_requests_have_reasons(reason: str, make: object) -> None:
-    assert callable(make)
+def test_bad_requests_have_reasons(reason: str, make: Callable[[], object]) -> None:
     with pytest.raises(RegnfError) as caught:
         make()
     assert caught.value.reason == reason
-
-
-def test_a_field_without_surface() -> None:
-    with pytest.raises(NoSurfaceError) as caught:
-        render(AnalyticField(lambda p: p.norm(dim=-1) + 5.0, [[-1] * 3, [1] * 3]), CAMERA)
-    assert caught.value.reason == "NO_SURFACE_IN_SCENE"
 
 
 def test_an_orbit_sees_its_box() -> None:
@@ -186,3 +188,61 @@ def test_an_orbit_sees_its_box() -> None:
         assert (local[:, 2] > 0).all()
         assert ((places > 0) & (places < torch.tensor([64, 48]))).all()
         assert torch.allclose(camera.axes[2, 1].sign(), torch.tensor(-1.0, dtype=torch.float64))  # upright
+
+
+# Bundles of rays: nothing is passed over, and few evaluations are spent. Truth: dense samples of exact distances.
+
+
+BEAMS = (64, 48)
+ROD = ([0.11, -0.4, 0.0], [0.122, 0.4, 0.012])
+"""Thinner than a pixel of the bundles, and than a cell of the grid."""
+FIELDS = {
+    "ball": sphere(0.35, [0.05, 0.0, 0.02]),
+    "rod before a slab": boxes([ROD, ([-0.7, -0.9, -0.9], [-0.2, 0.9, 0.9])]),
+}
+CAMERAS = {
+    "within": Camera.look_at([0.45, -0.1, 0.1], [-0.2, 0.0, 0.0], BEAMS, 60.0),
+    "outside": Camera.look_at([1.9, -0.7, 0.6], [0.0, 0.0, 0.0], BEAMS, 40.0),
+}
+
+
+def begun(field: SdfField, camera: Camera, margin: float = 0.0) -> tuple[Region, Rays, Start]:
+    pixels = torch.arange(BEAMS[0] * BEAMS[1])
+    rays, _ = camera.rays(pixels)
+    region = Region.along(rays, field, DistanceGrid.of(field), 4e-4)
+    return region, rays, free_start(region, rays, pixels // BEAMS[0], pixels % BEAMS[0], margin)
+
+
+def sampled(field: SdfField, region: Region, rays: Rays, lengths: Tensor) -> Tensor:
+    """(N, K) distances between each ray's entry and its length (N,)."""
+    share = torch.linspace(0.0, 1.0, 400)
+    t = region.entry[:, None] + share * (lengths - region.entry)[:, None]
+    points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+    return field.signed_distance(points.view(-1, 3)).view(len(lengths), -1)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+@pytest.mark.parametrize("field", FIELDS.values(), ids=FIELDS.keys())
+def test_no_ray_is_moved_past_a_surface(field: AnalyticField, camera: Camera) -> None:
+    region, rays, start = begun(field, camera)
+    ahead = start.free & (region.exit > region.entry)
+    assert bool(ahead.any())
+    passed = sampled(field, region, rays, torch.minimum(start.length, region.exit))[ahead]
+    assert float(passed.min()) > 0.0
+    assert bool((start.length >= region.entry).all())
+
+
+def test_a_margin_is_kept() -> None:
+    field, margin = FIELDS["ball"], 0.01
+    _, rays, start = begun(field, CAMERAS["within"], margin)
+    ends = rays.origins + start.length[:, None] * rays.directions
+    assert float(field.signed_distance(ends[start.free]).min()) > margin
+
+
+def test_a_pixel_takes_few_evaluations() -> None:
+    field = CountingField(sphere(0.35, [0.05, 0.0, 0.02]))
+    DistanceGrid.of(field)
+    prepared = field.evaluations
+    render(field, CAMERAS["within"], RenderOptions())
+    asked = field.evaluations - 2 * prepared
+    assert asked / (BEAMS[0] * BEAMS[1]) < 6.0

@@ -18,7 +18,7 @@ from regnf_core.robust.model import model_object
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.search import bounds
 from regnf_core.robust.search.bounds import PoseBound, super_fibonacci
-from regnf_core.robust.search.distance_grid import feature_seeds
+from regnf_core.robust.search.distance_grid import DistanceGrid, feature_seeds, nearest_sample_distance
 from regnf_core.robust.working_frame import Samples
 from tests.core.analytic import AnalyticField, sphere, union
 from tests.core.robust.shapes import random_pose, reframed
@@ -29,7 +29,7 @@ from tests.core.robust.shapes import random_pose, reframed
 def poses(points: torch.Tensor) -> torch.Tensor:
     scales = torch.tensor([0.85, 1.0, 1.18])
     axes, size = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    return bounds.seed_poses(points, 2.0 * points, axes, size, super_fibonacci(301), scales).matrix()
+    return bounds.seed_poses(points, 2.0 * points, axes, size, super_fibonacci(61), scales).matrix()
 
 
 def test_turned_in_parts_objects_have_the_same_extents(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,3 +178,46 @@ def test_too_small_a_cloud_gives_no_seed() -> None:
     few = Samples(torch.randn(20, 3), torch.zeros(20), torch.tensor([[0.0, 0.0, 1.0]]).expand(20, 3))
     assert feature_seeds(few, model_object(blob()).samples, 2, seed=0).scale.numel() == 0
     assert feature_seeds(few, few, 0, seed=0).scale.numel() == 0
+
+
+# Distance grids against the samples they are made of.
+
+
+def unit_directions(count: int = 1500) -> torch.Tensor:
+    draw = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    return draw / draw.norm(dim=1, keepdim=True)
+
+
+def made() -> tuple[torch.Tensor, DistanceGrid]:
+    normals = unit_directions()
+    return normals, DistanceGrid.of(0.5 * normals, normals, 0.05, SEARCH.grid_margin)
+
+
+def test_holds_the_samples_distance_at_the_cells_centers() -> None:
+    normals, grid = made()
+    numbers = torch.randint(SEARCH.grid_cells, (200, 3), generator=torch.Generator().manual_seed(1))
+    centers = grid.low[:, 0] + (numbers + 0.5) * grid.edge[:, 0]
+    value, gradient = grid.value_and_gradient(centers)
+    expected, slope = nearest_sample_distance(0.5 * normals, normals, 0.05, centers)
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(gradient, slope, rtol=0, atol=1e-6)
+
+
+def test_goes_on_from_the_center_along_the_gradient() -> None:
+    _, grid = made()
+    center = grid.low[:, 0] + 10.5 * grid.edge[:, 0]
+    value, gradient = grid.value_and_gradient(center[None])
+    step = 0.4 * grid.edge[:, 0] * torch.tensor([1.0, -1.0, 0.5])
+    moved, same = grid.value_and_gradient((center + step)[None])
+    torch.testing.assert_close(same, gradient)
+    torch.testing.assert_close(moved, value + (gradient[0] @ step)[None], rtol=0, atol=1e-6)
+
+
+def test_adds_the_distance_to_the_grid_beyond_it() -> None:
+    _, grid = made()
+    border = torch.stack([grid.high[:, 0], torch.tensor([0.0, 0.0, float(grid.low[2, 0])])])
+    outside = border + torch.tensor([[0.3, 0.4, 0.0], [0.0, 0.0, -2.0]])
+    value, gradient = grid.value_and_gradient(outside)
+    at_border, _ = grid.value_and_gradient(border)
+    torch.testing.assert_close(value - at_border, torch.tensor([0.5, 2.0]))
+    torch.testing.assert_close(gradient, torch.tensor([[0.6, 0.8, 0.0], [0.0, 0.0, -1.0]]))

@@ -147,7 +147,6 @@ NO_OFFSET = torch.zeros(1, dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def problem() -> RegistrationProblem:
-    """A chair in a room, both exact."""
     scene, obj = room(chair_pose()), chair()
     view = view_scene(scene, detection(), OPTIONS)
     return make_problem(view, model_object(obj, OPTIONS), scene, obj, OPTIONS)
@@ -174,7 +173,6 @@ def test_the_right_pose_agrees_in_all_respects(problem: RegistrationProblem) -> 
 
 
 def test_every_feature_gets_worse_far_away(problem: RegistrationProblem) -> None:
-    """The object a third of its diameter beside its place."""
     right, T = features_at(problem, truth(problem)), truth(problem)
     wrong = features_at(problem, replace(T, translation=T.translation + torch.tensor([0.33, 0.0, 0.0]).double()))
     for name in ("object_agrees", "scene_agrees", "confirmed", "confirmed_patches", "free", "seen_through", "noise"):
@@ -203,7 +201,6 @@ def test_an_offset_counts_either_way(problem: RegistrationProblem) -> None:
 
 
 def test_stiffness_by_finite_differences(problem: RegistrationProblem) -> None:
-    """No small motion of unit length on the object's surface changes the agreeing residuals by less than it says."""
     T = truth(problem)
     found = features_at(problem, T)
     r = residuals(problem.held_out, T[None], NO_OFFSET)
@@ -257,7 +254,6 @@ def answer(
 
 
 def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> None:
-    """Two poses an eighth of the diameter apart fit alike; a third, elsewhere, fits worse than the margin allows."""
     found = answer([0.0, 0.12, 0.6], [0.2, 0.21, 0.5])
     single = answer([0.0, 0.6], [0.2, 0.5])
     assert (found.winner, found.rivals) == (0, [1])
@@ -272,7 +268,6 @@ def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> No
 def test_poses_that_place_other_surface_compete_though_both_are_listed(
     shifts: list[float], scores: list[float], rivals: list[int]
 ) -> None:
-    """And without rivals both probabilities are the same too."""
     found = answer(shifts, scores)
     assert (found.winner, found.rivals) == (0, rivals)
     assert torch.equal(found.probability, found.probability_alone)
@@ -283,20 +278,11 @@ def test_what_fits_by_its_score_and_is_much_less_likely_is_no_rival() -> None:
     assert (found.winner, found.rivals) == (0, [])
 
 
-def test_what_is_known_of_the_scene_decides_on_the_model() -> None:
-    """The same numbers mean another probability where nobody says what was seen."""
-    told, silent = (answer([0.0, 0.6], [0.2, 0.5], one, noise=[0.01, 0.01]) for one in (OBSERVED, None))
-    assert float(told.probability[0]) != float(silent.probability[0])
-    assert float(told.probability[0]) == pytest.approx(float(_said(True)), abs=1e-9)
-    assert float(silent.probability[0]) == pytest.approx(float(_said(False)), abs=1e-9)
-
-
-def _said(observed: bool) -> torch.Tensor:
-    features = {name: torch.full((2,), value).double() for name, value in GOOD.items()} | {
-        "noise": torch.tensor([0.01, 0.01]).double()
-    }
-    return (
-        pose_odds(observed)
-        .log_odds(features, torch.tensor([0.2, 0.5]).double(), ~torch.eye(2, dtype=torch.bool))
-        .sigmoid()[0]
-    )
+@pytest.mark.parametrize("observation", [OBSERVED, None])
+def test_what_is_known_of_the_scene_decides_on_the_model(observation: object | None) -> None:
+    found = answer([0.0, 0.6], [0.2, 0.5], observation, noise=[0.01, 0.01])
+    features = {name: torch.full((2,), value).double() for name, value in (GOOD | {"noise": 0.01}).items()}
+    scores, apart = torch.tensor([0.2, 0.5]).double(), ~torch.eye(2, dtype=torch.bool)
+    said, other = (pose_odds(known).log_odds(features, scores, apart).sigmoid()[0] for known in (True, False))
+    assert said != other
+    assert float(found.probability[0]) == pytest.approx(float(said if observation else other), abs=1e-9)

@@ -18,7 +18,7 @@ from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.picture import PICTURE_NAME, is_sound_picture
 from regnf_core.viewing.field_picture import PANEL, field_picture
 from tests.core.importing.archives import saved
-from tests.core.surface.test_isosurface import Formula, ball
+from tests.core.surface.test_isosurface import ball, field_of
 
 
 def png(mode: str = "RGB", size: tuple[int, int] = (8, 4)) -> bytes:
@@ -28,7 +28,7 @@ def png(mode: str = "RGB", size: tuple[int, int] = (8, 4)) -> bytes:
 
 
 def test_a_ball_looks_like_a_ball() -> None:
-    sheet = np.asarray(field_picture(Formula(ball)))
+    sheet = np.asarray(field_picture(field_of(ball)))
     assert sheet.shape == (PANEL, 3 * PANEL, 3)
     left, right, section = (sheet[:, PANEL * i : PANEL * (i + 1)].astype(int) for i in range(3))
     for view in (left, right):

@@ -5,19 +5,21 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from regnf_core.fields.observation import Observation, ObservedField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
+from regnf_core.robust.constants import OCCLUSION
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.scene import SingleView, view_scene
-from regnf_core.robust.working_frame import Samples, WorkingFrame, WorkingObservation, sample_object_surface
+from regnf_core.robust.scene import SingleView, occlusion_boundary, view_scene
+from regnf_core.robust.working_frame import Samples, WorkingFrame, WorkingObservation, clearance, sample_object_surface
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
-from tests.core.analytic import AnalyticField
+from tests.core.analytic import AnalyticField, boxes
 
-COUNT, VOXEL = 20, 0.1
-MIDDLE = COUNT // 2
+CELLS, VOXEL = 20, 0.1
+MIDDLE = CELLS // 2
 
 
 def wall_seen_from_above(margin: int = 0) -> Observation:
@@ -25,7 +27,7 @@ def wall_seen_from_above(margin: int = 0) -> Observation:
 
     margin: so many layers above the surface count as unobserved.
     """
-    states = torch.full((COUNT, COUNT, COUNT), UNSEEN, dtype=torch.uint8)
+    states = torch.full((CELLS, CELLS, CELLS), UNSEEN, dtype=torch.uint8)
     states[:, :, MIDDLE] = SURFACE
     states[:, :, MIDDLE + 1 + margin :] = FREE
     return Observation(states, torch.full((3,), -MIDDLE * VOXEL, dtype=torch.float64), VOXEL)
@@ -39,7 +41,6 @@ def in_frame(observation: Observation, T_frame_new: Sim3) -> WorkingObservation:
 
 
 def turned(T: Sim3, vectors: Tensor) -> Tensor:
-    """Directions (N, 3) of the grid in the new frame."""
     return (vectors.double() @ T.rotation).float()
 
 
@@ -71,7 +72,7 @@ def test_states_in_a_working_frame_are_those_of_the_observation(T: Sim3) -> None
     observation = wall_seen_from_above()
     seen = in_frame(observation, T)
     generator = torch.Generator().manual_seed(0)
-    cells = torch.randint(-2, COUNT + 2, (500, 3), generator=generator)
+    cells = torch.randint(-2, CELLS + 2, (500, 3), generator=generator)
     points = (cells + 0.2 + 0.6 * torch.rand(500, 3, generator=generator) - MIDDLE) * VOXEL
     states = observation.at(points)
     assert (seen.on_surface(placed(T, points)) == (states == SURFACE)).all()
@@ -96,8 +97,6 @@ def test_a_single_view_sees_what_faces_it() -> None:
 
 
 class Slab:
-    """Matter below z = 0."""
-
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """z and its gradient."""
         return points[:, 2], torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
@@ -154,3 +153,84 @@ def test_an_objects_model_has_no_surface_that_nobody_saw_from_its_front() -> Non
     assert int((whole.normals[:, 2] < -0.9).sum()) > 300
     assert len(seen) > 300
     assert bool((seen.normals[:, 2] > 0.9).all())
+
+
+# How far from measured surface space begins to be known free, by layers of voxels; and what that decides.
+
+
+COUNT, EDGE, SURFACE_LAYER = 40, 0.05, 20
+TOP = SURFACE_LAYER * EDGE
+
+
+def layers(measured: int, margin: int) -> Observation:
+    """A surface in so many layers below z = 0, so many unseen ones above it, free space above those."""
+    states = torch.full((COUNT, COUNT, COUNT), UNSEEN, dtype=torch.uint8)
+    states[:, :, SURFACE_LAYER - measured : SURFACE_LAYER] = SURFACE
+    states[:, :, SURFACE_LAYER + margin :] = FREE
+    return Observation(states, torch.full((3,), -TOP, dtype=torch.float64), EDGE)
+
+
+@pytest.mark.parametrize(
+    ("measured", "margin", "expected"),
+    [(1, 0, 2.0), (1, 1, 2.0), (1, 3, 4.0), (4, 2, 6.0), (1, 20, OCCLUSION.max_clearance)],
+)
+def test_the_deepest_measured_layer_tells(measured: int, margin: int, expected: float) -> None:
+    """The nearest free voxel lies as many layers above the deepest measured one."""
+    assert clearance(layers(measured, margin)) == expected
+
+
+def test_a_quantile_of_the_layers() -> None:
+    """A tenth of the measured voxels lie deeper than the others, 7 layers from free space instead of 3."""
+    observation = layers(1, 2)
+    observation.states[: COUNT // 20, :, SURFACE_LAYER - 5 : SURFACE_LAYER - 1] = UNSEEN
+    observation.states[: COUNT // 20, :, SURFACE_LAYER - 5] = SURFACE
+    assert clearance(observation) == 3.0
+
+
+def test_without_a_measured_surface_it_is_the_least() -> None:
+    observation = layers(1, 2)
+    observation.states[observation.states == SURFACE] = UNSEEN
+    assert clearance(observation) == OCCLUSION.min_clearance
+
+
+def test_surface_within_a_noisy_layer_was_seen_from_above_and_not_from_below() -> None:
+    seen = WorkingObservation(layers(4, 2), WorkingFrame(torch.zeros(3, dtype=torch.float64), 2.0))
+    points = torch.tensor([[0.0, 0.0, -2.0 * EDGE]]).expand(2, 3) / 2.0
+    normals = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    assert seen.faces_unobserved(points, normals).tolist() == [False, True]
+
+
+def test_the_model_of_a_noisy_scan_keeps_the_surface_that_was_seen() -> None:
+    """A plate seen from above, half of it by noisy depths: all of its upper side is the model, and its lower side,
+    which nobody saw, is no part of it."""
+    observation = layers(4, 2)
+    observation.states[SURFACE_LAYER:] = layers(2, 0).states[SURFACE_LAYER:]
+    plate = ObservedField(boxes([([-0.5, -0.5, -6.0 * EDGE], [0.5, 0.5, -1.5 * EDGE])]), observation)
+    found = sample_object_surface(plate, 4000, torch.Generator().manual_seed(0))
+    points = found.frame.out_of(found.samples.on_surface())
+    assert (points[:, 2] > -2.0 * EDGE).float().mean() > 0.9
+    assert 0.4 < (points[:, 0] < 0.0).float().mean() < 0.6
+
+
+# A scene observed from one side: its occlusion boundary is found, and unobserved places weigh little.
+
+
+def test_edge_on_surface_is_told_from_surface_that_faces_the_viewpoint() -> None:
+    generator = torch.Generator().manual_seed(0)
+    viewpoint = torch.tensor([1.5, -0.4, 0.8])
+    edges = torch.rand(300, 3, generator=generator) - 0.5
+    across = normalize(torch.linalg.cross(viewpoint - edges, torch.randn(300, 3, generator=generator)), dim=-1)
+    points = torch.rand(400, 3, generator=generator) - 0.5
+    sight = normalize(viewpoint - points, dim=-1)
+    normals = normalize(sight + 0.4 * torch.randn(400, 3, generator=generator), dim=-1)
+    facing = (normals * sight).sum(-1) > 0.2
+    places, along = torch.cat([edges, points[facing]]), torch.cat([across, normals[facing]])
+    found = occlusion_boundary(Samples(places, torch.zeros(len(places)), along), generator)[0]
+    assert found[:300].float().mean() > 0.98
+    assert found[300:].float().mean() < 0.02
+
+
+def test_what_was_observed_from_all_sides_has_no_occlusion_boundary() -> None:
+    generator = torch.Generator().manual_seed(0)
+    normals = normalize(torch.randn(800, 3, generator=generator), dim=-1)
+    assert not occlusion_boundary(Samples(0.4 * normals, torch.zeros(800), normals), generator)[0].any()
