@@ -110,13 +110,13 @@ def test_pages_of_large_records_are_short_and_read_a_few_at_a_time(
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many records each look into Redis has read, from now on."""
     seen: list[int] = []
-    fetch = RedisDocuments._fetch
+    fetch = RedisDocuments._fetch_now
 
     def counted(self: RedisDocuments, kind: Any, names: Any) -> Any:
         seen.append(len(names))
         return fetch(self, kind, names)
 
-    monkeypatch.setattr(RedisDocuments, "_fetch", counted)
+    monkeypatch.setattr(RedisDocuments, "_fetch_now", counted)
     return seen
 
 

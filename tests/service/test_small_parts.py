@@ -22,7 +22,6 @@ from regnf_service.http.routes.registrations import preferred_wait
 from regnf_service.http.strict_json import parse_json
 from regnf_service.jobs import submit
 from regnf_service.jobs.submit import check_fields, job_id_of
-from regnf_service.library import seconds_until_free
 from regnf_service.problem import Problem
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.ownership import ANONYMOUS
@@ -108,20 +107,6 @@ def test_what_was_deleted_in_the_meantime_is_no_outage(error: OSError, reason: s
 
 
 # how long a caller waits whose work of the last hour has used up the budget
-
-
-NOW = 100 * 60.0
-
-
-@pytest.mark.parametrize(
-    ("spent", "wait_s"),
-    [
-        ({}, 0), ({99: 59.9}, 0), ({99: 60.0}, 59 * 60), ({41: 30.0, 99: 59.0}, 60),
-        ({41: 0.5, 50: 1.0, 99: 59.0}, 10 * 60), ({99: 6000.0}, 59 * 60), ({40: 1.0, 99: 59.5}, 1),
-    ],
-)  # fmt: skip
-def test_until_enough_is_an_hour_ago(spent: dict[int, float], wait_s: int) -> None:
-    assert seconds_until_free(spent, 60, NOW) == wait_s
 
 
 # from a checked request to a job: what it costs
