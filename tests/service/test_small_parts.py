@@ -106,9 +106,6 @@ def test_what_was_deleted_in_the_meantime_is_no_outage(error: OSError, reason: s
     assert problem_of(error).reason == reason
 
 
-# how long a caller waits whose work of the last hour has used up the budget
-
-
 # from a checked request to a job: what it costs
 
 
