@@ -44,6 +44,7 @@ def test_without_a_gpu_it_says_so_in_a_line(
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.long
 def test_everything_runs_on_the_cpu(one_pair: Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "gpu.md"
     arguments = ["--device", "cpu", "--seeds", "1", "--repeats", "1", "--batches", "1", "--output", str(output)]

@@ -140,6 +140,7 @@ def test_the_report_tells_how_many_true_poses_lie_in_their_ellipsoids() -> None:
 # Rows of evidence: the right object's, and those of a similar one, which are all wrong.
 
 
+@pytest.mark.long
 def test_rows_of_the_right_object_and_of_a_similar_one(world: Task) -> None:
     rows = evidence_of_world(world.home, [world.home], Gathering(cases=1, asked=("right", "similar")))
     similar = [row for row in rows if row["model"] == SIMILAR]

@@ -68,15 +68,22 @@ def test_a_drawing_that_kills_its_process_is_given_up(undrawn: Context) -> None:
     assert field(undrawn).views == "none"
 
 
-def test_a_field_deleted_while_it_is_drawn_leaves_nothing(undrawn: Context) -> None:
-    def deletes(_: Path) -> FieldViews:
+@pytest.mark.parametrize("opened", [True, False])
+def test_a_field_deleted_while_it_is_drawn_leaves_nothing(undrawn: Context, opened: bool) -> None:
+    def deletes(path: Path) -> FieldViews:
         undrawn.records.delete_field(SHA)
         undrawn.blobs.delete_prefix(f"fields/{SHA}")
-        return VIEWS
+        return VIEWS if opened else FieldViews(path.read_bytes())
 
     draw_field(undrawn, SHA, deletes)
     assert list(undrawn.blobs.list("")) == []
     assert undrawn.records.undrawn_fields() == []
+
+
+def test_a_field_whose_file_alone_is_lost_is_a_fault(undrawn: Context) -> None:
+    undrawn.blobs.delete(f"fields/{SHA}/field.safetensors")
+    with pytest.raises(FileNotFoundError):
+        draw_field(undrawn, SHA, lambda path: FieldViews(path.read_bytes()))
 
 
 def test_a_field_imported_anew_keeps_nothing_of_the_drawing_before(undrawn: Context) -> None:

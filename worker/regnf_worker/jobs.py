@@ -102,6 +102,11 @@ def draw_field(context: Context, reference: str, draw: Callable[[Path], FieldVie
         logger.warning("field %s is not drawn: %s", reference, error)
         _note(context, field, views="none")
         return
+    except FileNotFoundError:
+        now = context.records.get_field(reference)
+        if now is not None and now.attempt == field.attempt:
+            raise
+        return  # it was deleted, or is imported anew, while it was opened
     _keep(context, field, made)
 
 

@@ -49,6 +49,7 @@ def test_corrections_are_zero_in_the_mean():
     assert float(shifts.detach().norm(dim=1).min()) > 0.01, "the first image is corrected as the others are"
 
 
+@pytest.mark.long
 def test_poses_that_err_are_corrected(tmp_path):
     true = scenes.images(count=12)
     given = astray(true)

@@ -104,6 +104,7 @@ def test_a_small_thing_before_a_coarse_sensor_is_fused(tmp_path: Path) -> None:
     assert refused.value.reason == "DATASET_OF_ANOTHER_FRAME"
 
 
+@pytest.mark.long
 def test_voxels_are_no_smaller_than_half_the_deviation(tmp_path: Path) -> None:
     sharp = scenes.images(count=12, height=288, width=384)
     exact = fuse_images(sharp, tmp_path / "exact.safetensors")

@@ -90,7 +90,7 @@ def test_background_is_looked_through_and_colors_alone_tell_nothing() -> None:
 
 
 def test_a_fit_writes_what_was_seen(tmp_path: Path) -> None:
-    options = ReconstructionOptions(iterations=3, observation_voxels=24)
+    options = ReconstructionOptions(iterations=2, observation_voxels=24)
     reconstruct(images(), FitFiles(tmp_path / "field.safetensors"), options, device="cpu")
     written, made = observation_of(open_field(tmp_path / "field.safetensors")), observe(images(), 24)
     assert written is not None

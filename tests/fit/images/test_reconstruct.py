@@ -67,6 +67,7 @@ def test_a_ball_and_a_box_from_eight_depth_images(tmp_path):
     assert early > 2.0 * error
 
 
+@pytest.mark.long
 def test_colors_alone_find_the_ball(tmp_path):
     images = replace(scenes.images(count=12, ball_alone=True), depths=None)
     path = tmp_path / "field.safetensors"
@@ -79,6 +80,7 @@ def test_colors_alone_find_the_ball(tmp_path):
     assert error < 0.03
 
 
+@pytest.mark.long
 def test_an_interrupted_fit_ends_as_if_it_had_not_been(tmp_path):
     options, images = replace(SMALL, iterations=30, refine_poses=True), scenes.images(count=4)
     whole, parts = tmp_path / "whole.safetensors", tmp_path / "parts.safetensors"
