@@ -27,13 +27,13 @@ from scipy.spatial import cKDTree
 
 from benchmarks.fit_pieces import Floats, Piece, distances_to, measure_pieces, moved
 from benchmarks.make_image_fields import OBJECT_OPTIONS, ROOM_OPTIONS
+from benchmarks.worlds.composing import room_scene
+from benchmarks.worlds.layouts import read_layout
+from benchmarks.worlds.mesh_scene import MeshScene, load_thing
+from benchmarks.worlds.rendering import camera_rays
 from regnf_core.fields.build import open_field
 from regnf_core.surface.isosurface import extract_surface
-from regnf_data.composing import room_scene
-from regnf_data.layouts import read_layout
-from regnf_data.mesh_scene import MeshScene, load_thing
 from regnf_data.posed_images import PosedImages
-from regnf_data.rendering import camera_rays
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
 

@@ -15,12 +15,12 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
+from benchmarks.worlds.mesh_scene import MeshScene
 from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.surface.isosurface import extract_surface
-from regnf_data.mesh_scene import MeshScene
 from regnf_data.posed_images import PosedImages
 
 Floats = NDArray[np.float64]

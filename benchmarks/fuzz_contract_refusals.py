@@ -16,7 +16,7 @@ OF_STATE = frozenset(
         "DETECTION_OUTSIDE_SCENE",  # what a field is of
         "LIBRARY_EMPTY",  # which entries there are
         "LIBRARY_TOO_LARGE",
-        "EDIT_POSE_REJECTED",  # which jobs there are
+        "EDIT_INVALID",  # which jobs there are
         "IDEMPOTENCY_KEY_REUSED",  # what was asked before
         "WEBHOOK_NOT_ALLOWED",  # the operator's settings
         "OPTIONS_TOO_COSTLY",
@@ -33,8 +33,7 @@ OF_MEMBERS: Mapping[str, frozenset[str]] = {
             "INVALID_DETECTION",  # min below max, a quaternion that is not zero
             "INVALID_TRANSFORM",  # a matrix with a rotation in it
             "INVALID_OPTIONS",  # a least scale above the largest
-            "INITIAL_TRANSFORM_UNSUPPORTED",  # members that exclude one another
-            "LIBRARY_SEARCH_UNSUPPORTED",
+            "PRESET_UNSUITABLE",  # members that exclude one another
             "INVALID_REQUEST",
             "INVALID_DESCRIPTION",
         }
@@ -48,12 +47,12 @@ OF_MEMBERS: Mapping[str, frozenset[str]] = {
             "INVALID_REQUEST",  # members that exclude one another
         }
     ),
-    "POST /fields": frozenset({"INVALID_DESCRIPTION", "MISSING_PART"}),  # `file` and `upload` exclude one another
+    "POST /fields": frozenset({"INVALID_DESCRIPTION", "MALFORMED_MULTIPART"}),  # `file` and `upload` at once
     "PATCH /fields/{sha256}": frozenset({"INVALID_DESCRIPTION"}),  # corners of bounds, a matrix
     "POST /library": frozenset({"INVALID_REQUEST"}),  # a continuous symmetry without an axis, an axis of length 0
-    "PATCH /library/{name}": frozenset({"INVALID_REQUEST", "LIBRARY_ENTRY_INVALID"}),  # or such a one together with
+    "PATCH /library/{name}": frozenset({"INVALID_REQUEST"}),  # or such a one together with
     # what the entry has
-    "PUT /fields/{sha256}": frozenset({"INVALID_HEADER", "UPLOAD_EMPTY"}),  # Content-Range against the body, and of 0
+    "PUT /fields/{sha256}": frozenset({"INVALID_HEADER", "UPLOAD_INCOMPLETE"}),  # Content-Range against the body
 }
 """Reasons that depend on several members or on their numbers together, by operation."""
 

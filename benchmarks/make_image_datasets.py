@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.make_fields import UNITS_PER_METER
-from regnf_data.composing import RenderOptions, render_object, render_room
-from regnf_data.layouts import Layout, read_layout
+from benchmarks.worlds.composing import RenderOptions, render_object, render_room
+from benchmarks.worlds.layouts import Layout, read_layout
 from regnf_data.posed_images import PosedImages
 from regnf_data.sdfstudio import write_dataset
 

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import socket
 import sys
-from typing import Any
 
 from redis import Redis, RedisError
-from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_core.errors import InvalidInputError
-from regnf_state.queue import QUEUE_NAME
 from regnf_state.redis.client import NoRedisError, redis_address
+from regnf_state.redis.queue import JobQueue
 from regnf_state.settings import read_settings
 
 _TIMEOUT_S = 5.0
@@ -23,13 +21,7 @@ _TIMEOUT_S = 5.0
 
 def is_alive(redis: Redis, hostname: str) -> bool:
     """True when a worker of this host is registered for the queue, has not expired and has not said goodbye."""
-    names: Any = redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)
-    for name in names:
-        answer: Any = redis.hmget(name, ["hostname", "death"])
-        known, dead = answer
-        if known is not None and known.decode() == hostname and dead is None:
-            return True
-    return False
+    return hostname in JobQueue(redis).live_hosts()
 
 
 def main() -> int:

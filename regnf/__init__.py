@@ -15,40 +15,13 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from regnf_core.version import __version__
+import regnf_core
+from regnf_core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from regnf.fitting import fit
     from regnf_client import AsyncClient, Client, Pair, PairResult
-    from regnf_core import (
-        BatchOutcome,
-        Camera,
-        FieldWarning,
-        Insertion,
-        OrientedBox,
-        Registered,
-        RegistrationOptions,
-        RegistrationResult,
-        RegnfError,
-        Removal,
-        RenderOptions,
-        Replacement,
-        SdfField,
-        Search,
-        Sim3,
-        Substitution,
-        WarmStart,
-        compose,
-        from_function,
-        from_grid,
-        from_mesh,
-        from_points,
-        open_field,
-        register,
-        register_batch,
-        render,
-        search,
-    )
+    from regnf_core import *  # noqa: F403 - every name that it lists
 
 _HOMES = {
     "AsyncClient": "regnf_client",
@@ -59,41 +32,8 @@ _HOMES = {
 }
 """Every other name is regnf_core's."""
 
-__all__ = [
-    "AsyncClient",
-    "BatchOutcome",
-    "Camera",
-    "Client",
-    "FieldWarning",
-    "Insertion",
-    "OrientedBox",
-    "Pair",
-    "PairResult",
-    "Registered",
-    "RegistrationOptions",
-    "RegistrationResult",
-    "RegnfError",
-    "Removal",
-    "RenderOptions",
-    "Replacement",
-    "SdfField",
-    "Search",
-    "Sim3",
-    "Substitution",
-    "WarmStart",
-    "__version__",
-    "compose",
-    "fit",
-    "from_function",
-    "from_grid",
-    "from_mesh",
-    "from_points",
-    "open_field",
-    "register",
-    "register_batch",
-    "render",
-    "search",
-]
+__all__ = ["AsyncClient", "Client", "Pair", "PairResult", "fit"]
+__all__ += regnf_core.__all__
 
 
 def __getattr__(name: str) -> object:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 
-from regnf_service.server import GuardedServer
+from regnf_service.server import Server
 from regnf_state.logs import configure_logging
 from regnf_state.settings import Settings
 
@@ -13,7 +13,7 @@ from regnf_state.settings import Settings
 def main(descriptor: int) -> None:
     settings = Settings()
     configure_logging(settings.log_format)
-    server = GuardedServer(settings)
+    server = Server(settings)
     server.run(sockets=[socket.socket(fileno=descriptor)])
     if not server.started:
         sys.exit(3)

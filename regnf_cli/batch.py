@@ -6,12 +6,13 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import lru_cache
-from itertools import islice
+from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,17 +20,19 @@ import typer
 
 from regnf_cli.batch_file import FilePair, ResultsFile, read_pairs
 from regnf_cli.guard import require
-from regnf_cli.options import Server, Token, WorkerTimeout
-from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, phase_progress
+from regnf_cli.options import Server, Token, WorkerTimeout, client_of
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, progress, tell
+from regnf_core.detections import parse_detection, require_in_scene
 from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.field_source import find_source
+from regnf_core.options import RegistrationOptions, RobustOptions
 from regnf_core.pairs import short_result
 from regnf_core.processes import die_with_parent
 
 if TYPE_CHECKING:
-    from regnf_client import Pair, PairResult
+    from regnf_client import Client, PairResult
     from regnf_core.fields.observation import SdfField
-    from regnf_core.library import LibraryObject, ObjectModel
-    from regnf_core.options import RegistrationOptions
+    from regnf_core.library import ObjectModel
 
 
 # Registering many pairs here: processes that keep fields and object models open from one pair to the next.
@@ -51,51 +54,31 @@ def register_here(pairs: Sequence[FilePair], processes: int) -> Iterator[tuple[F
 
 
 def _in_processes(pairs: Sequence[FilePair], processes: int) -> Iterator[tuple[FilePair, dict[str, Any]]]:
-    left = iter(pairs)
-    again: list[tuple[FilePair, int]] = []
-    while True:
+    """Results until all pairs are done. When a process dies, those that were begun are begun once more."""
+    waiting = deque((pair, 1) for pair in pairs)
+    while waiting:
+        running: dict[Future[dict[str, Any]], tuple[FilePair, int]] = {}
+        lost: list[FilePair] = []
+        pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (os.getpid(),))
         try:
-            yield from _one_pool(left, again, processes)
+            while waiting or running:
+                while waiting and len(running) < 2 * processes:
+                    with _kept_from_children():
+                        future = pool.submit(register_pair, waiting[0][0])
+                    running[future] = waiting.popleft()
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    told = future.result()
+                    yield running.pop(future)[0], told
         except BrokenProcessPool:
-            for pair, tries in [one for one in again if one[1] >= _TRIES]:
-                again.remove((pair, tries))
-                error = InvalidInputError("its process died", reason="WORKER_LOST", hint="Is there enough memory?")
-                yield pair, failure(error)
-            continue
-        return
-
-
-def _one_pool(
-    left: Iterator[FilePair], again: list[tuple[FilePair, int]], processes: int
-) -> Iterator[tuple[FilePair, dict[str, Any]]]:
-    """Results until all pairs are done. When a process dies, those that were begun are put into ``again``."""
-    running: dict[Future[dict[str, Any]], tuple[FilePair, int]] = {}
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (os.getpid(),))
-    try:
-        while True:
-            while len(running) < 2 * processes and (found := _next(left, again)) is not None:
-                with _kept_from_children():
-                    running[pool.submit(register_pair, found[0])] = found
-            if not running:
-                return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                pair, _ = running[future]
-                told = future.result()
-                del running[future]
-                yield pair, told
-    except BrokenProcessPool:
-        again += [(pair, tries + 1) for pair, tries in running.values()]
-        raise
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in multiprocessing.active_children():  # those in the midst of a pair that nobody waits for any more
-            child.kill()
-
-
-def _next(left: Iterator[FilePair], again: list[tuple[FilePair, int]]) -> tuple[FilePair, int] | None:
-    if again:
-        return again.pop(0)
-    return next(((pair, 0) for pair in islice(left, 1)), None)
+            waiting.extendleft((pair, tries + 1) for pair, tries in running.values() if tries < _TRIES)
+            lost = [pair for pair, tries in running.values() if tries == _TRIES]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():  # in the midst of a pair that nobody waits for any more
+                child.kill()
+        for pair in lost:
+            error = InvalidInputError("its process died", reason="WORKER_LOST", hint="Is there enough memory?")
+            yield pair, failure(error)
 
 
 @contextmanager
@@ -137,12 +120,10 @@ def failure(error: RegnfError) -> dict[str, Any]:
 
 
 def _document(pair: FilePair) -> dict[str, Any]:
-    from regnf_core.detections import parse_detection, require_in_scene
     from regnf_core.document import ranking_document, result_document
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import WarmStart, register, search_library
-    from regnf_core.options import RegistrationOptions
+    from regnf_core.library import LibraryObject, register, search_library
 
     request = pair.request or {}
     options = RegistrationOptions.from_dict(request["options"])
@@ -152,38 +133,34 @@ def _document(pair: FilePair) -> dict[str, Any]:
     box = OrientedBox.from_detection(detection)
     start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
     if pair.is_search:
-        _require_nothing_of_one_object(start, truth)
-        library = [_candidate(one, options) for one in pair.objects]
+        _require_nothing_of_one_object(request)
+        samples = options.robust.object_samples
+        library = [LibraryObject(one, partial(_field, one, "object"), _model(one, samples)) for one in pair.objects]
         found = search_library(scene, box, library, options, request["seed"], clouds=False)
         ranking = ranking_document(found.ranking, {})
-        document: dict[str, Any] = result_document(found.result, object_name=found.ranking[0].name, candidates=ranking)
-        return document
+        return dict(result_document(found.result, object_name=found.ranking[0].name, candidates=ranking))
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
-    warm = WarmStart(None if start is None else Sim3.from_matrix(start), model)
+    initial = None if start is None else Sim3.from_matrix(start)
     # errors against a truth are those of the clouds' points
     clouds = truth is not None
-    result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=clouds)
-    told: dict[str, Any] = result_document(result, None if truth is None else Sim3.from_matrix(truth))
-    return told
+    obj = _field(name, "object")
+    result = register(scene, obj, box, options, request["seed"], None, initial, model, clouds)
+    return dict(result_document(result, None if truth is None else Sim3.from_matrix(truth)))
 
 
-def _require_nothing_of_one_object(start: object, truth: object) -> None:
+def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
     """Raises InvalidInputError, as a service refuses such a line."""
-    for name, given, reason in (
-        ("initial_transform", start, "INITIAL_TRANSFORM_UNSUPPORTED"),
-        ("ground_truth", truth, "INVALID_REQUEST"),
-    ):
-        if given is not None:
+    reasons = {"initial_transform": "PRESET_UNSUITABLE", "ground_truth": "INVALID_REQUEST"}
+    for name, reason in reasons.items():
+        if request.get(name) is not None:
             hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
-            raise InvalidInputError(
-                f"`{name}` applies to one object, not to several candidates", reason=reason, hint=hint
-            )
+            message = f"`{name}` applies to one object, not to several candidates"
+            raise InvalidInputError(message, reason=reason, hint=hint)
 
 
 @lru_cache(_FIELDS_OPEN)
 def _field(path: str, role: Any) -> SdfField:
-    from regnf_core.field_source import find_source
     from regnf_core.loading import load_field
 
     return load_field(find_source(Path(path), role=role)).field
@@ -191,30 +168,11 @@ def _field(path: str, role: Any) -> SdfField:
 
 @lru_cache(_MODELS_HELD)
 def _model(path: str, samples: int) -> ObjectModel:
-    from dataclasses import replace
-
-    from regnf_core.field_source import find_source
     from regnf_core.object_models import object_model
-    from regnf_core.options import RobustOptions
 
     return object_model(find_source(Path(path), role="object"), replace(RobustOptions(), object_samples=samples))
 
 
-def _candidate(path: str, options: RegistrationOptions) -> LibraryObject:
-    from regnf_core.library import LibraryObject
-
-    return LibraryObject(path, lambda: _field(path, "object"), _model(path, options.robust.object_samples))
-
-
-PairsFile = Annotated[
-    Path,
-    typer.Argument(
-        help="JSON Lines, or CSV: scene, object, detection and more of each pair. Paths are relative to the file.",
-        exists=True,
-        dir_okay=False,
-        metavar="PAIRS",
-    ),
-]
 Results = Annotated[
     Path | None, typer.Option(help="Results, a JSON line each. By default beside the pairs: PAIRS.results.jsonl.")
 ]
@@ -223,7 +181,15 @@ _REASONS_SHOWN, _LINES_SHOWN = 8, 5
 
 
 def batch(
-    pairs: PairsFile,
+    pairs: Annotated[
+        Path,
+        typer.Argument(
+            help="JSON Lines, or CSV: scene, object, detection and more of each pair. Paths are relative to the file.",
+            exists=True,
+            dir_okay=False,
+            metavar="PAIRS",
+        ),
+    ],
     output: Results = None,
     processes: Processes = None,
     server: Server = None,
@@ -243,15 +209,16 @@ def batch(
     listed = list(read_pairs(pairs))
     results = ResultsFile(target)
     left = [pair for pair in listed if not results.is_done(pair)]
-    err.print(f"{len(listed)} pairs, {len(listed) - len(left)} done; results in {target}", markup=False, soft_wrap=True)
+    tell(f"{len(listed)} pairs, {len(listed) - len(left)} done; results in {target}")
     sound = [pair for pair in left if pair.error is None]
     for pair in left:
         if pair.error is not None:
             results.add(pair, failure(pair.error))
-    if server is None:
+    client = client_of(server, token, worker_timeout)
+    if client is None:
         ended = register_here(sound, min(processes or os.cpu_count() or 1, max(1, len(sound))))
     else:
-        ended = _at_service(sound, server, token, worker_timeout)
+        ended = _at_service(sound, client)
     if sound:
         _write(ended, results, len(sound))
     _show_failures(results.failures(listed))
@@ -273,35 +240,28 @@ def _show_failures(failures: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def _write(ended: Iterator[tuple[FilePair, dict[str, Any]]], results: ResultsFile, count: int) -> None:
-    """Append results as they come."""
     try:
-        with phase_progress() as bar:
+        with progress() as bar:
             task = bar.add_task("registering", total=count)
             for pair, told in ended:
                 results.add(pair, told)
                 bar.advance(task)
     except KeyboardInterrupt:
-        err.print("interrupted: the same command goes on from here", markup=False)
+        tell("interrupted: the same command goes on from here")
         raise
 
 
-def _at_service(
-    pairs: Sequence[FilePair], server: str, token: str | None, worker_timeout: int
-) -> Iterator[tuple[FilePair, dict[str, Any]]]:
-    from regnf_client import Client
-
-    with Client(server, token, worker_timeout_s=worker_timeout) as client:
+def _at_service(pairs: Sequence[FilePair], client: Client) -> Iterator[tuple[FilePair, dict[str, Any]]]:
+    with client:
         for one in client.batch(_request(pair) for pair in pairs):
             yield pairs[one.index], _told(one)
 
 
-def _request(pair: FilePair) -> Pair:
-    from regnf_client import Pair
-
-    asked = {"pictures": False, **(pair.request or {})}  # the command reads the numbers
-    known = {name: asked.pop(name) for name in ("detection", "options", "seed")}
-    objects: Any = list(pair.objects) if pair.is_search else pair.objects[0]
-    return Pair(pair.scene, objects, known["detection"], known["options"] or None, known["seed"], more=asked)
+def _request(pair: FilePair) -> dict[str, Any]:
+    request = dict(pair.request or {})
+    named = {"candidates": list(pair.objects)} if pair.is_search else {"object": pair.objects[0]}
+    # the command reads the numbers: no pictures, unless the line says so
+    return {"scene": pair.scene, **named, "pictures": False, **request, "options": request["options"] or None}
 
 
 def _told(one: PairResult) -> dict[str, Any]:

@@ -55,6 +55,10 @@ class FilePair:
     error: RegnfError | None = None
 
 
+def _wrong(message: str, hint: str = _HINT) -> InvalidInputError:
+    return InvalidInputError(message, reason="INVALID_REQUEST", hint=hint)
+
+
 def read_pairs(path: Path) -> Iterator[FilePair]:
     """The pairs of a JSON Lines file, or of a CSV file with the members' names in its first line.
 
@@ -86,8 +90,7 @@ def _csv_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
             if any(cell.strip() for cell in row):
                 yield rows.line_num + skipped, _row(names, row)
     except csv.Error as error:
-        message = f"{path}, line {rows.line_num + skipped}: no table: {error}"
-        raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HEADER_HINT) from error
+        raise _wrong(f"{path}, line {rows.line_num + skipped}: no table: {error}", _HEADER_HINT) from error
 
 
 def _row(names: list[str], row: list[str]) -> dict[str, Any] | RegnfError:
@@ -95,8 +98,7 @@ def _row(names: list[str], row: list[str]) -> dict[str, Any] | RegnfError:
     cells = [cell.strip() for cell in row]
     if any(cells[len(names) :]):
         message = f"the row has {len(cells)} cells, the header {len(names)}"
-        hint = "Put a cell that holds the separator into double quotes."
-        return InvalidInputError(message, reason="INVALID_REQUEST", hint=hint)
+        return _wrong(message, "Put a cell that holds the separator into double quotes.")
     try:
         return {name: _cell(name, cell) for name, cell in zip(names, cells, strict=False) if cell}
     except InvalidInputError as error:
@@ -118,7 +120,7 @@ def _check_header(path: Path, names: list[str], line: int) -> None:
     try:
         _check_names(names)
         if len(set(names)) < len(names):
-            raise InvalidInputError("a column name occurs twice", reason="INVALID_REQUEST", hint=_HEADER_HINT)
+            raise _wrong("a column name occurs twice", _HEADER_HINT)
     except InvalidInputError as error:
         hint = error.hint if error.hint and error.hint != _HINT else _HEADER_HINT
         raise InvalidInputError(f"{path}, line {line}, the header: {error}", reason=error.reason, hint=hint) from error
@@ -137,8 +139,7 @@ def _cell(name: str, text: str) -> Any:
 
 def _json_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
     if text.lstrip()[:1] == "[":
-        message = f"{path}: one list, expected an object on each line"
-        raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HINT)
+        raise _wrong(f"{path}: one list, expected an object on each line")
     for number, line in enumerate(text.split("\n"), 1):
         if line.strip():
             try:
@@ -155,48 +156,39 @@ def _pair(folder: Path, line: int, given: Any) -> FilePair:
     try:
         if isinstance(given, RegnfError):
             raise given
-        scene, objects = _fields(folder, _members(given))
+        if not isinstance(given, dict):
+            raise _wrong("the line is no object")
+        _check_names(given)
+        scene, objects = _fields(folder, given)
         return FilePair(line, name, key, scene, objects, "candidates" in given, _request(folder, given))
     except RegnfError as error:
         return FilePair(line, name, key, error=error)
-
-
-def _members(given: Any) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise InvalidInputError("the line is no object", reason="INVALID_REQUEST", hint=_HINT)
-    _check_names(given)
-    return given
 
 
 def _check_names(given: Collection[str]) -> None:
     """Raises InvalidInputError (INVALID_REQUEST) for members that are unknown, or too few."""
     unknown = next((name for name in given if name not in _KNOWN), None)
     if unknown is not None:
-        hint = suggestion(unknown, _KNOWN) or _HINT
-        raise InvalidInputError(f"no member `{unknown}` is known", reason="INVALID_REQUEST", hint=hint)
+        raise _wrong(f"no member `{unknown}` is known", suggestion(unknown, _KNOWN) or _HINT)
     missing = [name for name in ("scene", "detection") if name not in given]
     if missing or not {"object", "candidates"} & set(given):
         what = f"`{missing[0]}`" if missing else "`object` or `candidates`"
-        raise InvalidInputError(f"{what} is missing", reason="INVALID_REQUEST", hint=_HINT)
+        raise _wrong(f"{what} is missing")
 
 
 def _fields(folder: Path, given: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    """Scene and objects: files beside the list, or SHA-256s of fields that a service has."""
     if "candidates" in given and "object" in given:
-        message = "`object` and `candidates` are both given, expected one of them"
-        raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HINT)
+        raise _wrong("`object` and `candidates` are both given, expected one of them")
     several = given["candidates"] if "candidates" in given else [given["object"]]
     if not (isinstance(several, list) and several):
-        raise InvalidInputError("`candidates` is no list of files", reason="INVALID_REQUEST", hint=_HINT)
-    named = [_field(folder, one) for one in (given["scene"], *several)]
+        raise _wrong("`candidates` is no list of files")
+    names = (given["scene"], *several)
+    if not all(isinstance(name, str) for name in names):
+        raise _wrong("a field is named by something else than a text")
+    paths = [(name, folder / name) for name in names]
+    named = [name if _SHA256.fullmatch(name) and not path.exists() else str(path) for name, path in paths]
     return named[0], tuple(named[1:])
-
-
-def _field(folder: Path, name: Any) -> str:
-    """A file beside the list, or the SHA-256 of a field that a service has."""
-    if not isinstance(name, str):
-        raise InvalidInputError("a field is named by something else than a text", reason="INVALID_REQUEST", hint=_HINT)
-    path = folder / name
-    return name if _SHA256.fullmatch(name) and not path.exists() else str(path)
 
 
 def _request(folder: Path, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,16 +198,15 @@ def _request(folder: Path, given: Mapping[str, Any]) -> dict[str, Any]:
         raise InvalidInputError("`options` is no object", reason="INVALID_OPTIONS", hint=_HINT)
     RegistrationOptions.from_dict(options)
     if not (isinstance(seed, int) and 0 <= seed < 2**32):
-        raise InvalidInputError("`seed` is no number from 0 to 2^32 - 1", reason="INVALID_REQUEST", hint=_HINT)
+        raise _wrong("`seed` is no number from 0 to 2^32 - 1")
     if not isinstance(given.get("pictures", True), bool):
-        raise InvalidInputError("`pictures` is neither true nor false", reason="INVALID_REQUEST", hint=_HINT)
+        raise _wrong("`pictures` is neither true nor false")
     detection = parse_detection(box, given.get("detection_index")).canonical()
     more = {name: given[name] for name in _MORE if given.get(name) is not None}
-    if "initial_transform" in more:
-        more["initial_transform"] = as_transform(_value(folder, more["initial_transform"]), "`initial_transform`")
+    for name in {"initial_transform", "ground_truth"} & more.keys():
+        more[name] = as_transform(_value(folder, more[name]), f"`{name}`")
     if "ground_truth" in more:
-        truth = as_transform(_value(folder, more["ground_truth"]), "`ground_truth`")
-        more["ground_truth"] = {"T_object_scene": truth}
+        more["ground_truth"] = {"T_object_scene": more["ground_truth"]}
     return {"detection": detection, "options": options, "seed": seed, **more}
 
 

@@ -14,11 +14,11 @@ from regnf_cli.report import EXIT_BAD_INPUT, err, fail
 from regnf_core import __version__
 
 COMMANDS = {
-    "demo": "demo", "register": "register", "search": "search", "batch": "batch", "serve": "serve", "worker": "serve",
+    "demo": "demo", "register": "register", "search": "register", "batch": "batch", "serve": "serve", "worker": "serve",
     "inspect": "inspect", "convert": "convert", "fit": "fit", "fuse": "fit", "render": "render", "edit": "render",
-    "doctor": "doctor", "render-dataset": "render_dataset", "manual": "manual",
+    "doctor": "doctor", "manual": "manual",
 }  # fmt: skip
-"""In the order of the help, each with its module. Its function has its name, with underscores."""
+"""In the order of the help, each with its module. Its function has its name."""
 GROUPS = ("library",)
 """Each is the ``app`` of the module of its name, with sub-commands of its own."""
 
@@ -39,7 +39,7 @@ def app_of(names: Iterable[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
         if name in GROUPS:
             app.add_typer(module.app, name=name)
         else:
-            app.command(name)(getattr(module, name.replace("-", "_")))
+            app.command(name)(getattr(module, name))
     return app
 
 

@@ -4,56 +4,25 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from enum import StrEnum
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from regnf_cli.guard import require
 from regnf_cli.options import Config, Description, Field, NoConfig, check_output, choice_of, existing, folder, source_of
-from regnf_cli.report import err, out
+from regnf_cli.report import err, progress, say, tell, warn
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.field_source import FieldSource
 
 # What is said of cameras at the command line: the options, and the entries of a description that they become.
 
 
-class Axes(StrEnum):
-    """Conventions of a camera's axes."""
-
-    OPENCV = "opencv"
-    OPENGL = "opengl"
-
-
-Images = Annotated[
-    Path | None,
-    typer.Option(
-        help="The posed depth images that the field was fitted to: the safe field then records which parts the "
-        "cameras observed.",
-        parser=folder,
-        metavar="FOLDER",
-    ),
-]
-Cameras = Annotated[
-    Path | None,
-    typer.Option(
-        help="Where the cameras stood whose images the field was made from: transforms.json, meta_data.json, "
-        "poses of TUM, or a folder with a pose a file. The safe field then records which parts they observed; no "
-        "image is needed.",
-        parser=existing,
-        metavar="PATH",
-    ),
-]
-Intrinsics = Annotated[
-    str | None,
-    typer.Option(help="Of the cameras, in pixels, where their file does not say.", metavar="FX,FY,CX,CY[,W,H]"),
-]
 CameraAxes = Annotated[
-    Axes | None,
+    Literal["opencv", "opengl"] | None,
     typer.Option(
         "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
     ),
@@ -89,23 +58,41 @@ _GRID_MOST = 1024
 _IMPORTING = "importing"
 _FOLLOWING = "importing, and following the rays of the cameras: a minute for some hundred images"
 
-Resolution = Annotated[
-    int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
-]
-
 
 def convert(
     field: Field,
     output: Annotated[
         Path, typer.Argument(metavar="OUT", help="The file to write: *.safetensors, .glb, .ply or .npz.")
     ],
-    resolution: Resolution = 128,
+    resolution: Annotated[
+        int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
+    ] = 128,
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
-    images: Images = None,
-    cameras: Cameras = None,
-    intrinsics: Intrinsics = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="The posed depth images that the field was fitted to: the safe field then records which parts the "
+            "cameras observed.",
+            parser=folder,
+            metavar="FOLDER",
+        ),
+    ] = None,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where the cameras stood whose images the field was made from: transforms.json, meta_data.json, "
+            "poses of TUM, or a folder with a pose a file. The safe field then records which parts they observed; no "
+            "image is needed.",
+            parser=existing,
+            metavar="PATH",
+        ),
+    ] = None,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(help="Of the cameras, in pixels, where their file does not say.", metavar="FX,FY,CX,CY[,W,H]"),
+    ] = None,
     axes: CameraAxes = None,
 ) -> None:
     """Write a field as a safe field (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid (.npz).
@@ -113,36 +100,32 @@ def convert(
     Example: **regnf convert step-000030000.ckpt chair.glb --resolution 256**
     """
     require("engine")
-    _check(output, images, cameras)
-    said = with_cameras(description, intrinsics, None if axes is None or cameras is None else axes.value)
-    if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
-        raise InvalidOptionsError("--intrinsics goes with --cameras, --camera-axes with --cameras or --images")
-    source = source_of(field, said, choice_of(config, no_config))
-    check_output(output, _SUFFIXES, (source.file, *source.settings))
-    if output.suffix.lower() == ".safetensors":
-        _to_safe_field(source, output, images, cameras, opengl=axes == Axes.OPENGL)
-    else:
-        _evaluated(source, output, resolution)
-
-
-def _check(output: Path, images: Path | None, cameras: Path | None) -> None:
-    """Refuse before the work what would fail after it."""
     check_output(output, _SUFFIXES, (cameras,))
     if (images or cameras) is not None and output.suffix.lower() != ".safetensors":
         raise InvalidOptionsError("--images and --cameras go with a safe field (.safetensors)")
     if images is not None and cameras is not None:
         raise InvalidOptionsError("--images and --cameras: images tell more, give them alone")
+    said = with_cameras(description, intrinsics, None if cameras is None else axes)
+    if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
+        raise InvalidOptionsError("--intrinsics goes with --cameras, --camera-axes with --cameras or --images")
+    source = source_of(field, said, choice_of(config, no_config))
+    check_output(output, _SUFFIXES, (source.file, *source.settings))
+    if output.suffix.lower() == ".safetensors":
+        _to_safe_field(source, output, images, cameras, opengl=axes == "opengl")
+    else:
+        _evaluated(source, output, resolution)
 
 
 def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None, opengl: bool) -> None:
     from regnf_core.importing.gate.gate import FIELD_NAME, import_field
+    from regnf_core.importing.run.folder import packed_cameras
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
         with (
             err.status(_IMPORTING if cameras is None else _FOLLOWING),
             source.naming(),
             source.packed_settings() as settings,
-            _packed(cameras) as stood,
+            nullcontext() if cameras is None else packed_cameras(cameras) as stood,
         ):
             said = source.description or None
             report = import_field(source.file, Path(scratch), said, settings=settings, cameras=stood)
@@ -150,29 +133,22 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
             with err.status("recording which parts the cameras observed"):
                 _keep_what_was_seen(Path(scratch) / FIELD_NAME, images, opengl)
         os.replace(Path(scratch) / FIELD_NAME, output)
-    _say(output, f"{report.family}, {report.parameters:,} parameters")
+    _told(output, f"{report.family}, {report.parameters:,} parameters")
     for why in report.why:
         if why.startswith("observed"):
-            err.print(why, markup=False, soft_wrap=True)
-    _warn(report.warnings)
-
-
-def _packed(cameras: Path | None) -> AbstractContextManager[Path | None]:
-    """The file of cameras that the gate gets."""
-    from regnf_core.importing.run.folder import packed_cameras
-
-    return nullcontext() if cameras is None else packed_cameras(cameras)
+            tell(why)
+    warn(report.warnings)
 
 
 def _keep_what_was_seen(field: Path, images: Path, opengl: bool) -> None:
     from regnf_data.sdfstudio import load_dataset
-    from regnf_fit.images.agreement import check_agreement
+    from regnf_fit.images.checks import check_agreement
     from regnf_fit.images.observing import attach_observation
 
     given = load_dataset(images, opengl=opengl)
     warning = check_agreement(given)
     attach_observation(field, given)
-    _warn([] if warning is None else [warning])
+    warn([] if warning is None else [warning])
 
 
 def _evaluated(source: FieldSource, output: Path, resolution: int) -> None:
@@ -181,13 +157,7 @@ def _evaluated(source: FieldSource, output: Path, resolution: int) -> None:
         from regnf_core.surface.exporting import write_grid, write_mesh
 
         loaded = load_field(source)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:,.0f} points"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=err) as bar:
+    with progress("{task.completed:,.0f} points", TimeElapsedColumn()) as bar:
         task = bar.add_task("evaluating", total=None)
 
         def report(points: int) -> None:
@@ -198,14 +168,9 @@ def _evaluated(source: FieldSource, output: Path, resolution: int) -> None:
             told = f"{' x '.join(map(str, shape))} nodes"
         else:
             told = f"{write_mesh(loaded.field, output, resolution, report):,} triangles"
-    _say(output, told)
-    _warn(loaded.notes.warnings)
+    _told(output, told)
+    warn(loaded.notes.warnings)
 
 
-def _warn(warnings: Sequence[str]) -> None:
-    for warning in warnings:
-        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
-
-
-def _say(output: Path, what: str) -> None:
-    out.print(f"{output}: {what}, {output.stat().st_size / 1e6:.1f} MB", markup=False, soft_wrap=True)
+def _told(output: Path, what: str) -> None:
+    say(f"{output}: {what}, {output.stat().st_size / 1e6:.1f} MB")

@@ -24,7 +24,7 @@ from typing import Annotated
 import typer
 
 from regnf_cli.guard import require
-from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, reporting, show_pose
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, fail, out, reporting, show_pose, tell
 from regnf_cli.serve import demo_folder
 from regnf_client import Client, Result
 
@@ -110,9 +110,11 @@ def demo(
                     out.print(f"page         [bold]{address}/jobs/{result.job}/view[/]", soft_wrap=True)
                 out.print(f"total        {time.monotonic() - started:.1f} s")
                 if waits:
-                    _wait_for_enter()
+                    out.print("\nOpen the page; press Enter here to stop the service.")
+                    with contextlib.suppress(EOFError):
+                        input()
         except RuntimeError as error:  # the service did not start
-            err.print((folder / "serve.log").read_text(errors="replace")[-2000:], markup=False, soft_wrap=True)
+            tell((folder / "serve.log").read_text(errors="replace")[-2000:])
             raise typer.Exit(fail("SERVICE_NOT_STARTED", str(error), EXIT_UNAVAILABLE)) from error
     if not good:
         raise typer.Exit(EXIT_NOT_REGISTERED)
@@ -160,9 +162,3 @@ def _show(found: Result) -> bool:
         color = "green" if value <= bound else "red"
         out.print(f"   {name:<12} [{color}]{value:.4f}[/] {unit} (at most {bound:g})")
     return result["verdict"] == "registered" and all(value <= bound for _, value, bound, _ in errors)
-
-
-def _wait_for_enter() -> None:
-    out.print("\nOpen the page; press Enter here to stop the service.")
-    with contextlib.suppress(EOFError):
-        input()

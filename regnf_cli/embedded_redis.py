@@ -7,6 +7,7 @@ import ipaddress
 import logging
 import shutil
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 from redis import Redis
@@ -84,13 +85,27 @@ def answers(url: str) -> bool:
 # The socket that the service listens on: opened by the supervisor, so that it outlives an API process that dies.
 
 _BACKLOG = 2048
-_TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list, or one a line in a file: @/its/path."
-_SECRETS_HINT = "Write REGNF_WEBHOOK_SECRETS as a JSON list of CALLER:whsec_BASE64, or one a line in a file: @/path."
-_WEBHOOK_HOSTS_HINT = 'Write REGNF_WEBHOOK_HOSTS as a JSON list, for example ["hooks.example.org", "10.0.0.5:9000"].'
 _HOSTS_HINT = (
     'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"], and'
     ' REGNF_CORS_ORIGINS likewise: ["https://app.example.org"].'
 )
+_READ: tuple[tuple[Callable[[Settings], object], str], ...] = (
+    (
+        lambda settings: read_callers(settings.api_tokens),
+        "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list, or one a line in a file: @/its/path.",
+    ),
+    (
+        lambda settings: read_secrets(settings.webhook_secrets),
+        "Write REGNF_WEBHOOK_SECRETS as a JSON list of CALLER:whsec_BASE64, or one a line in a file: @/path.",
+    ),
+    (
+        lambda settings: AllowList(settings.webhook_hosts),
+        'Write REGNF_WEBHOOK_HOSTS as a JSON list, for example ["hooks.example.org", "10.0.0.5:9000"].',
+    ),
+    (allowed_hosts, _HOSTS_HINT),
+    (cors_origins, _HOSTS_HINT),
+)
+"""What reads the settings on access, each with what to do where that fails."""
 logger = logging.getLogger(__name__)
 
 
@@ -114,23 +129,11 @@ def check_access(settings: Settings) -> None:
             hint="Listen on 127.0.0.1 with a proxy before it (deploy/helm/regnf/proxy), or, where one keeps others from"
             " this address, set REGNF_BEHIND_PROXY=true.",
         )
-    try:
-        read_callers(settings.api_tokens)
-    except TokensError as error:
-        raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
-    try:
-        read_secrets(settings.webhook_secrets)
-    except TokensError as error:
-        raise StartError(str(error), reason=error.reason, hint=_SECRETS_HINT) from error
-    try:
-        AllowList(settings.webhook_hosts)
-    except TokensError as error:
-        raise StartError(str(error), reason=error.reason, hint=_WEBHOOK_HOSTS_HINT) from error
-    try:
-        allowed_hosts(settings)
-        cors_origins(settings)
-    except HostsError as error:
-        raise StartError(str(error), reason=error.reason, hint=_HOSTS_HINT) from error
+    for read, hint in _READ:
+        try:
+            read(settings)
+        except (TokensError, HostsError) as error:
+            raise StartError(str(error), reason=error.reason, hint=hint) from error
     if not settings.is_private and not settings.allowed_hosts:
         logger.warning(
             "REGNF_ALLOWED_HOSTS is empty: who calls by a name, or through a port of another host, is refused"

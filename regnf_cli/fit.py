@@ -7,87 +7,23 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import MofNCompleteColumn
 
-from regnf_cli.convert import Axes, CameraAxes
+from regnf_cli.convert import CameraAxes
 from regnf_cli.guard import require
 from regnf_cli.options import Seed, check_output
-from regnf_cli.report import err, out
+from regnf_cli.report import out, progress, tell, warn
 from regnf_core.errors import InvalidOptionsError
-
-# The options of ``regnf fit``, some of ``regnf fuse`` too.
 
 _LONGEST_LABEL = 200  # of the safe format
 
 
-class StartChoice(StrEnum):
-    """A ball, a hollow ball round the bounds, or what the images suggest."""
-
-    auto = "auto"
-    object = "object"
-    room = "room"
-
-
-class DeviceChoice(StrEnum):
-    """Where to compute; auto: a GPU if there is one."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-
-
-# of both kinds of sources
-
-Source = Annotated[
-    Path,
-    typer.Argument(help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True),
-]
 SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
-Iterations = Annotated[
-    int | None,
-    typer.Option(min=1, help="Training steps; more is finer. Without it 3000."),
-]
-TableLog2 = Annotated[
-    int | None,
-    typer.Option(
-        min=8, max=22, help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show."
-    ),
-]
 Label = Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")]
-HiddenWidth = Annotated[
-    int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
-]
-
-# of meshes
-
-Extent = Annotated[
-    float | None,
-    typer.Option(
-        help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
-        "Else its own frame."
-    ),
-]
-
-# of images
-
-Snapshots = Annotated[
-    str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
-]
-Sdfstudio = Annotated[
-    Path | None,
-    typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt)."),
-]
-Pictures = Annotated[bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")]
-Start = Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")]
-RefinePoses = Annotated[
-    bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
-]
-Device = Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")]
 
 
 def check_field_to_write(output: Path, label: str | None) -> None:
@@ -102,28 +38,57 @@ def print_report(figures: dict[str, Any]) -> None:
     warnings = figures.pop("warnings", ())
     for name, value in figures.items():
         out.print(f"{name:<24} {'none' if value is None else format(value, '.6g')}")
-    for warning in warnings:
-        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    warn(warnings)
 
 
-_OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto, None)
+_OF_IMAGES_UNSAID = (None, None, False, "auto", False, "auto", None)
 
 
 def fit(
-    source: Source,
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True
+        ),
+    ],
     output: SafeField,
-    iterations: Iterations = None,
-    table_log2: TableLog2 = None,
-    extent: Extent = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Training steps; more is finer. Without it 3000.")
+    ] = None,
+    table_log2: Annotated[
+        int | None,
+        typer.Option(
+            min=8,
+            max=22,
+            help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show.",
+        ),
+    ] = None,
+    extent: Annotated[
+        float | None,
+        typer.Option(
+            help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
+            "Else its own frame."
+        ),
+    ] = None,
     label: Label = None,
     seed: Seed = 0,
-    hidden_width: HiddenWidth = None,
-    snapshots: Snapshots = None,
-    sdfstudio: Sdfstudio = None,
-    pictures: Pictures = False,
-    start: Start = StartChoice.auto,
-    refine_poses: RefinePoses = False,
-    device: Device = DeviceChoice.auto,
+    hidden_width: Annotated[
+        int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
+    ] = None,
+    snapshots: Annotated[
+        str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
+    ] = None,
+    sdfstudio: Annotated[
+        Path | None, typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt).")
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")
+    ] = False,
+    start: Annotated[Literal["auto", "object", "room"], typer.Option(help="Images: the shape to start from.")] = "auto",
+    refine_poses: Annotated[
+        bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
+    ] = False,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Images: where to compute.")] = "auto",
     axes: CameraAxes = None,
 ) -> None:
     """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
@@ -147,13 +112,13 @@ def fit(
     if source.is_dir():
         if extent is not None:
             raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
-        wanted = ReconstructionOptions(**settings, table_log2=table_log2, start=start.value, refine_poses=refine_poses)
+        wanted = ReconstructionOptions(**settings, table_log2=table_log2, start=start, refine_poses=refine_poses)
         checkpoint = output.with_suffix(".checkpoint")
         files = FitFiles(output, checkpoint, shares(snapshots), pictures=pictures, sdfstudio=sdfstudio)
-        rest |= {"device": device.value, "source": {"dataset": source.resolve().name}}
+        rest |= {"device": device, "source": {"dataset": source.resolve().name}}
         with _fitting() as (say, report):
             say("reading the images")
-            images = load_dataset(source, opengl=axes == Axes.OPENGL)
+            images = load_dataset(source, opengl=axes == "opengl")
             say("laying out the rays")
             fitted = reconstruct(images, files, wanted, progress=report, **rest)
         print_report(asdict(fitted))
@@ -166,7 +131,7 @@ def fit(
         options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
     target = mesh_target(source, extent)
     for done in target.source.get("mesh_faces", ()):
-        err.print(f"{source.name}: {done}", markup=False, soft_wrap=True)
+        tell(f"{source.name}: {done}")
     with _fitting() as (say, report):
         say("sampling exact distances")
         figures = fit_field(target.field, output, options, progress=report, source=target.source, **rest)
@@ -176,8 +141,7 @@ def fit(
 @contextmanager
 def _fitting() -> Iterator[tuple[Callable[[str], None], Callable[[int, float, float], None]]]:
     """A bar: what says a state, and what takes a fit's progress, which is the share of the seconds since then."""
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
-    with Progress(*columns, console=err) as bar:
+    with progress("{task.fields[state]}") as bar:
         task = bar.add_task("fitting", total=1.0, state="")
         started = time.monotonic()
 
@@ -207,28 +171,23 @@ def shares(percents: str | None) -> tuple[float, ...]:
     return values
 
 
-# ``regnf fuse``.
-
-Images = Annotated[
-    Path, typer.Argument(help="A folder of posed RGB-D images with meta_data.json.", exists=True, file_okay=False)
-]
-Voxel = Annotated[
-    float | None,
-    typer.Option(help="From node to node, the dataset's units; without it as wide as a pixel is at its surface."),
-]
-Truncation = Annotated[
-    float | None,
-    typer.Option(
-        min=1.0, max=1000.0, help="Voxels; without it 4, or 6 standard deviations of the depths from image to image."
-    ),
-]
-
-
 def fuse(
-    images: Images,
+    images: Annotated[
+        Path, typer.Argument(help="A folder of posed RGB-D images with meta_data.json.", exists=True, file_okay=False)
+    ],
     output: SafeField,
-    voxel: Voxel = None,
-    truncation: Truncation = None,
+    voxel: Annotated[
+        float | None,
+        typer.Option(help="From node to node, the dataset's units; without it as wide as a pixel is at its surface."),
+    ] = None,
+    truncation: Annotated[
+        float | None,
+        typer.Option(
+            min=1.0,
+            max=1000.0,
+            help="Voxels; without it 4, or 6 standard deviations of the depths from image to image.",
+        ),
+    ] = None,
     label: Label = None,
     axes: CameraAxes = None,
 ) -> None:
@@ -243,10 +202,9 @@ def fuse(
     from regnf_data.sdfstudio import load_dataset
     from regnf_fit.images.fusion import FusionOptions, fuse_images
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    with Progress(*columns, console=err) as bar:
+    with progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("reading the images", total=None)
-        given = load_dataset(images, opengl=axes == Axes.OPENGL)
+        given = load_dataset(images, opengl=axes == "opengl")
         bar.update(task, description="fusing", total=len(given))
         report = fuse_images(
             given,

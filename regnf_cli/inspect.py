@@ -14,20 +14,9 @@ import typer
 
 from regnf_cli.guard import require
 from regnf_cli.options import Config, Description, Field, NoConfig, choice_of, source_of
-from regnf_cli.report import out
-from regnf_cli.search import keep_pictures
-from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
+from regnf_cli.report import out, say, tell
+from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError, filled_folder
 from regnf_core.library_entries import shown_number
-
-Picture = Annotated[Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)]
-Candidates = Annotated[
-    Path | None,
-    typer.Option(
-        help="Where to write pictures of what the file may be, if nothing in it tells.",
-        file_okay=False,
-        metavar="FOLDER",
-    ),
-]
 
 
 def inspect(
@@ -35,8 +24,17 @@ def inspect(
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
-    picture: Picture = None,
-    candidates: Candidates = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
+    ] = None,
+    candidates: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where to write pictures of what the file may be, if nothing in it tells.",
+            file_okay=False,
+            metavar="FOLDER",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility.
@@ -46,7 +44,12 @@ def inspect(
     A file that may be one of several functions is refused with what to say for each; `--candidates` draws them.
     """
     require("engine")
-    _check(picture, candidates)
+    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
+        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
+        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
+    if candidates is not None and not candidates.parent.is_dir():
+        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
+        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
     from regnf_core.importing.gate.gate import import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
 
@@ -54,41 +57,31 @@ def inspect(
     drawn = picture is not None or candidates is not None
     with tempfile.TemporaryDirectory() as folder:
         with _asked(candidates), source.naming(), source.packed_settings() as settings:
-            made = import_field(source.file, Path(folder), description, None, drawn, settings)
-            report = made.to_dict()
+            report = import_field(source.file, Path(folder), description, None, drawn, settings).to_dict()
         if picture is not None:
-            _keep(Path(folder) / PICTURE_NAME, picture)
+            made = Path(folder) / PICTURE_NAME
+            if not made.exists():
+                raise InvalidInputError("no picture could be made: the field is too slow for it", reason="NO_PICTURE")
+            shutil.copyfile(made, picture)
     if as_json:
         out.print_json(json.dumps(report))
     else:
         _show(report)
 
 
-def _check(picture: Path | None, candidates: Path | None) -> None:
-    """Refuse before the work what would fail after it."""
-    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
-        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
-        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
-    if candidates is not None and not candidates.parent.is_dir():
-        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
-        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
-
-
 @contextmanager
 def _asked(folder: Path | None) -> Iterator[None]:
-    """Pictures of what a refused file may be are kept in the folder."""
+    """Pictures of what a refused file may be are kept in the folder, 1.png and so on as they are numbered."""
     try:
         yield
     except FieldFormatError as error:
         if folder is not None and error.candidates:
-            keep_pictures(error.candidates, folder)
+            with filled_folder(folder) as work:
+                for number, one in enumerate(error.candidates, 1):
+                    if one.picture is not None:
+                        (work / f"{number}.png").write_bytes(one.picture)
+                        tell(f"wrote {folder / f'{number}.png'}")
         raise
-
-
-def _keep(made: Path, picture: Path) -> None:
-    if not made.exists():
-        raise InvalidInputError("no picture could be made: the field is too slow for it", reason="NO_PICTURE")
-    shutil.copyfile(made, picture)
 
 
 def _show(values: dict[str, Any], indent: int = 0) -> None:
@@ -97,7 +90,7 @@ def _show(values: dict[str, Any], indent: int = 0) -> None:
             out.print(f"{'  ' * indent}{name}:")
             _show(value, indent + 1)
         else:
-            out.print(f"{'  ' * indent}{name:<24} {_readable(value)}", markup=False, soft_wrap=True)
+            say(f"{'  ' * indent}{name:<24} {_readable(value)}")
 
 
 def _readable(value: Any) -> str:

@@ -4,131 +4,104 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from regnf_cli.guard import require
-from regnf_cli.options import Config, Description, Field, NoConfig, Token, choice_of, file, output_folder, source_of
-from regnf_cli.report import axis_in_words, err, out
-from regnf_client import Client, Entry
+from regnf_cli.options import (
+    Config,
+    Description,
+    Field,
+    NoConfig,
+    Token,
+    choice_of,
+    client_of,
+    file,
+    output_folder,
+    source_of,
+)
+from regnf_cli.report import axis_in_words, out, say, tell
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_source import FieldSource
 from regnf_core.library_entries import EntryNotes
 from regnf_core.library_folder import FolderEntry, LibraryFolder, digest_of, open_archive, write_archive
 from regnf_core.texts import json_value
 
+if TYPE_CHECKING:
+    from regnf_client import Client, Entry
+
 # Where the commands of ``regnf library`` keep a library: in a folder, or at a service.
 
 
 @dataclass(frozen=True)
-class Shown:
+class Shown(FolderEntry):
     """An entry as the commands show it. place: of its field, a file or an address."""
 
-    notes: EntryNotes
-    field: str
-    symmetry: dict[str, Any] | None
-    place: str
-    detected: dict[str, Any] | None = None
+    place: str = ""
     state: str = "ready"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain (JSON) values."""
-        said = self.notes.symmetry is not None
-        source = "said" if said else None if self.symmetry is None else "detected"
+        source = "said" if self.notes.symmetry is not None else None if self.symmetry is None else "detected"
         values = self.notes.to_dict() | {"symmetry": self.symmetry, "symmetry_source": source}
         return values | {"field": self.field, "state": self.state, "place": self.place}
 
 
-class FolderShelf:
-    """A library in a folder. Everything may raise RegnfError."""
+class Shelf:
+    """A library: at a service, or in a folder. Everything may raise RegnfError."""
 
-    def __init__(self, folder: Path | None) -> None:
-        self.library = LibraryFolder.usual() if folder is None else LibraryFolder(folder)
-
-    def entries(self, tag: str | None = None, part: str | None = None) -> list[Shown]:
-        return [self._shown(one) for one in self.library.entries(tag, part)]
-
-    def get(self, name: str) -> Shown:
-        return self._shown(self.library.get(name))
-
-    def add(self, source: FieldSource, notes: EntryNotes) -> Shown:
-        require("engine")
-        return self._shown(self.library.add(source, notes))
-
-    def change(self, name: str, notes: EntryNotes) -> Shown:
-        return self._shown(self.library.change(name, notes))
-
-    def remove(self, name: str) -> None:
-        self.library.remove(name)
-
-    def file(self, entry: Shown, folder: Path) -> Path:  # noqa: ARG002 -- it lies there already
-        """The entry's safe field: where it lies; of a service, written into ``folder``."""
-        return Path(entry.place)
-
-    def _shown(self, entry: FolderEntry) -> Shown:
-        return Shown(entry.notes, entry.field, entry.symmetry, str(self.library.file(entry)), entry.detected)
-
-
-class ServiceShelf:
-    """A caller's library at a service, with the same methods."""
-
-    def __init__(self, client: Client) -> None:
+    def __init__(self, folder: LibraryFolder, client: Client | None) -> None:
+        self._folder = folder
         self._client = client
+        self._kept = folder if client is None else client.library
 
     def entries(self, tag: str | None = None, part: str | None = None) -> list[Shown]:
-        return [self._shown(one) for one in self._client.library.entries(tag, part)]
+        return [self._shown(one) for one in self._kept.entries(tag, part)]
 
     def get(self, name: str) -> Shown:
-        return self._shown(self._client.library.get(name))
+        return self._shown(self._kept.get(name))
 
     def add(self, source: FieldSource, notes: EntryNotes) -> Shown:
+        if self._client is None:
+            require("engine")
+            return self._shown(self._folder.add(source, notes))
         said = notes.to_dict()
         return self._shown(self._client.library.add(said.pop("name"), source, **said))
 
     def change(self, name: str, notes: EntryNotes) -> Shown:
+        if self._client is None:
+            return self._shown(self._folder.change(name, notes))
         return self._shown(self._client.library.change(name, **notes.to_dict()))
 
     def remove(self, name: str) -> None:
-        self._client.library.remove(name)
+        self._kept.remove(name)
 
     def file(self, entry: Shown, folder: Path) -> Path:
+        """The entry's safe field: where it lies; of a service, written into ``folder``."""
+        if self._client is None:
+            return Path(entry.place)
         return self._client.library.download(entry.notes.name, folder / f"{entry.field}.safetensors")
 
-    def _shown(self, entry: Entry) -> Shown:
-        said = entry.symmetry_source == "said"
-        notes = EntryNotes(entry.name, tuple(entry.tags), entry.unit, entry.note, entry.symmetry if said else None)
-        place = f"{self._client.address}/fields/{entry.field}"
-        return Shown(notes, entry.field, entry.symmetry, place, None if said else entry.symmetry, entry.state)
-
-
-Shelf = FolderShelf | ServiceShelf
+    def _shown(self, one: FolderEntry | Entry) -> Shown:
+        if isinstance(one, FolderEntry):
+            return Shown(one.notes, one.field, one.detected, str(self._folder.file(one)))
+        said = one.symmetry_source == "said"
+        notes = EntryNotes(one.name, tuple(one.tags), one.unit, one.note, one.symmetry if said else None)
+        place = f"{self._client.address if self._client else ''}/fields/{one.field}"
+        return Shown(notes, one.field, None if said else one.symmetry, place, one.state)
 
 
 @contextmanager
 def open_shelf(folder: Path | None, server: str | None, token: str | None) -> Iterator[Shelf]:
     """The library that a command means: that of a service, or of a folder."""
-    if server is None:
-        yield FolderShelf(folder)
-        return
-    with Client(server, token) as client:
-        yield ServiceShelf(client)
-
-
-@contextmanager
-def files_of(shelf: Shelf, entries: list[Shown]) -> Iterator[list[tuple[FolderEntry, Path]]]:
-    """Entries as an archive has them, with their safe fields."""
-    with TemporaryDirectory(prefix="library-") as folder:
-        files = [shelf.file(one, Path(folder)) for one in entries]
-        yield [
-            (FolderEntry(one.notes, digest_of(file), one.detected), file)
-            for one, file in zip(entries, files, strict=True)
-        ]
+    with client_of(server, token) or nullcontext() as client:
+        yield Shelf(LibraryFolder.usual() if folder is None else LibraryFolder(folder), client)
 
 
 app = typer.Typer(
@@ -161,8 +134,6 @@ Symmetry = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Archive = Annotated[Path, typer.Argument(help="The file, .zip.", metavar="ARCHIVE")]
-KnownArchive = Annotated[Path, typer.Argument(help="A file that `export` wrote.", parser=file, metavar="ARCHIVE")]
 
 
 @app.command()
@@ -251,12 +222,8 @@ def edit(
     """
     with open_shelf(library, server, token) as shelf:
         known = shelf.get(name).notes
-        said: dict[str, Any] = {
-            "name": rename,
-            "tags": None if tag is None else [] if tag == [_NONE] else tag,
-            "unit": unit,
-            "note": note,
-        }
+        tags = [] if tag == [_NONE] else tag
+        said: dict[str, Any] = {"name": rename, "tags": tags, "unit": unit, "note": note}
         changes = {member: None if value == _NONE else value for member, value in said.items() if value is not None}
         if symmetry is not None:
             changes["symmetry"] = _symmetry(symmetry)
@@ -271,12 +238,12 @@ def remove(name: Name, library: Folder = None, server: Server = None, token: Tok
     """
     with open_shelf(library, server, token) as shelf:
         shelf.remove(name)
-    err.print(f"removed {name}", markup=False, soft_wrap=True)
+    tell(f"removed {name}")
 
 
 @app.command("export")
 def export_(
-    archive: Archive,
+    archive: Annotated[Path, typer.Argument(help="The file, .zip.", metavar="ARCHIVE")],
     tag: Annotated[str | None, typer.Option(help="Only entries with this tag.")] = None,
     library: Folder = None,
     server: Server = None,
@@ -291,15 +258,18 @@ def export_(
         if not entries:
             hint = "`regnf library list` shows what there is."
             raise InvalidInputError("there is no entry to export", reason="LIBRARY_EMPTY", hint=hint)
-        with files_of(shelf, entries) as files:
-            write_archive(archive, files)
+        with TemporaryDirectory(prefix="library-") as folder:
+            files = [(one, shelf.file(one, Path(folder))) for one in entries]
+            write_archive(
+                archive, [(FolderEntry(one.notes, digest_of(file), one.detected), file) for one, file in files]
+            )
     counted = "1 entry" if len(entries) == 1 else f"{len(entries)} entries"
-    err.print(f"wrote {archive}: {counted}", markup=False, soft_wrap=True)
+    tell(f"wrote {archive}: {counted}")
 
 
 @app.command("import")
 def import_(
-    archive: KnownArchive,
+    archive: Annotated[Path, typer.Argument(help="A file that `export` wrote.", parser=file, metavar="ARCHIVE")],
     skip_taken: Annotated[bool, typer.Option("--skip-taken", help="Leave out entries whose names are taken.")] = False,
     library: Folder = None,
     server: Server = None,
@@ -321,8 +291,8 @@ def import_(
             opened.extract(one, field)
             shelf.add(FieldSource(field, field), one.notes)
             field.unlink()
-            err.print(f"added {one.notes.name}", markup=False, soft_wrap=True)
-    err.print(f"{len(wanted)} added, {len(taken)} left out", markup=False, soft_wrap=True)
+            tell(f"added {one.notes.name}")
+    tell(f"{len(wanted)} added, {len(taken)} left out")
 
 
 def _symmetry(text: str | None) -> Any:
@@ -339,7 +309,7 @@ def _show(entry: Shown) -> None:
     told = {"name": notes.name, "tags": ", ".join(notes.tags), "unit": notes.unit, "note": notes.note, **said}
     for word, value in (told | {"field": entry.place}).items():
         if value:
-            out.print(f"{word:<9} {value}", markup=False, soft_wrap=True)
+            say(f"{word:<9} {value}")
 
 
 def _words(symmetry: dict[str, Any] | None) -> str:

@@ -131,7 +131,7 @@ def _run() -> int:
     import typer
 
     from regnf_cli.commands import COMMANDS, GROUPS, app_of, usage_fault
-    from regnf_cli.report import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
+    from regnf_cli.report import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail, show_candidates
     from regnf_core.errors import HINTS, RegnfError
 
     usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # typer does not export its name
@@ -146,8 +146,6 @@ def _run() -> int:
         raise KeyboardInterrupt from error
     except RegnfError as error:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
-        from regnf_cli.search import show_candidates
-
         hint = error.hint
         if hint == HINTS["INVALID_OPTIONS"] and "options." not in str(error):  # options of the command line
             hint = f"`regnf {asked[0]} --help` shows what it takes."

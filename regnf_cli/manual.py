@@ -10,7 +10,7 @@ import typer
 from rich.markdown import Markdown
 from rich.table import Table
 
-from regnf_cli.report import out
+from regnf_cli.report import out, say
 from regnf_core.errors import InvalidInputError, suggestion
 
 _PACKAGED = Path(__file__).with_name("manual_pages")
@@ -33,7 +33,7 @@ def manual(
         return
     text = pages[_known(page, pages)].read_text(encoding="utf-8")
     if raw or not out.is_terminal:
-        out.print(text, markup=False, soft_wrap=True)
+        say(text)
     else:
         with out.pager(styles=True):
             out.print(Markdown(text))

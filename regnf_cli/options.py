@@ -5,13 +5,13 @@ The name of an option is its parameter's. Its default stands in the command's si
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from regnf_cli.report import err
+from regnf_cli.report import tell
 from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import (
     RECORDING_SUFFIX,
@@ -27,49 +27,38 @@ from regnf_core.options import Preset, RegistrationOptions
 from regnf_core.rotations import Rows, transform_rows
 from regnf_core.texts import json_value
 
+if TYPE_CHECKING:
+    from regnf_client import Client
+
 # Files named at the command line: a name that cannot be used is refused with the one that was meant.
 
 
-def field_path(text: str) -> Path:
-    """The path of a field: of a file, a training run's folder or an archive. Raises what ``find_source`` does."""
-    path = Path(text)
-    find_source(path, settings=False)
-    return path
+def _parser(check: Callable[[Path], object], folders: bool = False) -> Callable[[str], Path]:
+    """What makes a path of an argument, unless ``check`` refuses it. folders: any folder will do."""
 
-
-def file(text: str) -> Path:
-    """The path of a file that is there. Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER)."""
-    path = Path(text)
-    require_file(path)
-    return path
-
-
-def folder(text: str) -> Path:
-    """The path of a folder that is there. Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_NO_FOLDER)."""
-    path = Path(text)
-    if path.is_dir():
+    def parse(text: str) -> Path:
+        path = Path(text)
+        if not (folders and path.is_dir()):
+            check(path)
         return path
-    if path.exists():
-        hint = f"Give the folder that holds it: {path.parent}"
-        raise InvalidInputError(f"{path}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
+
+    return parse
+
+
+def _no_folder(path: Path) -> None:
+    """Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_NO_FOLDER)."""
     require_file(path)
-    return path
+    hint = f"Give the folder that holds it: {path.parent}"
+    raise InvalidInputError(f"{path}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
 
 
-def existing(text: str) -> Path:
-    """The path of a file or a folder that is there. Raises InvalidInputError (FILE_NOT_FOUND)."""
-    path = Path(text)
-    if not path.is_dir():
-        require_file(path)
-    return path
-
-
-def library_path(text: str) -> Path:
-    """A folder of fields, or a field. Raises what ``require_field_file`` does."""
-    path = Path(text)
-    if not path.is_dir():
-        require_field_file(path)
-    return path
+file = _parser(require_file)
+folder = _parser(_no_folder, folders=True)
+existing = _parser(require_file, folders=True)
+field_path = _parser(lambda path: find_source(path, config=False))
+"""Of a field: a file, a training run's folder or an archive."""
+library_path = _parser(require_field_file, folders=True)
+"""A folder of fields, or a field."""
 
 
 def output_folder(text: str) -> Path:
@@ -110,7 +99,7 @@ def recording_file(text: str) -> Path:
 
 
 FIELD: dict[str, Any] = {"parser": field_path, "metavar": "FIELD"}
-JSON_FILE: dict[str, Any] = {"parser": file, "metavar": "FILE"}
+FILE: dict[str, Any] = {"parser": file, "metavar": "FILE"}
 OUTPUT: dict[str, Any] = {"parser": output_folder, "metavar": "FOLDER"}
 RECORDING: dict[str, Any] = {"parser": recording_file, "metavar": "FILE"}
 """How options and arguments of these kinds are declared."""
@@ -134,18 +123,10 @@ def read_detection(path: Path, index: int | None = None) -> Detection:
 def read_object(path: Path, what: str) -> dict[str, Any]:
     """A JSON object from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
     value = read_json(path, what)
-    if not isinstance(value, dict):
-        hint = "Write an object: {...}."
-        raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
-    return value
-
-
-def read_list(path: Path, what: str) -> list[Any]:
-    """A JSON list from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
-    value = read_json(path, what)
-    if not isinstance(value, list):
-        raise InvalidInputError(f"{what} {path}: expected a JSON list", reason="MALFORMED_JSON", hint="Write [...].")
-    return value
+    if isinstance(value, dict):
+        return value
+    hint = "Write an object: {...}."
+    raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
 
 
 def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
@@ -224,13 +205,12 @@ def source_of(
     """What a path stands for; the settings that were found are said. Raises what ``find_source`` does."""
     source = find_source(path, said, settings, role)
     if source.file != path:
-        err.print(f"checkpoint: {source.file}", markup=False, soft_wrap=True)
+        tell(f"checkpoint: {source.file}")
     if source.settings:
-        err.print(f"settings: {', '.join(source.settings_names)}", markup=False, soft_wrap=True)
+        tell(f"settings: {', '.join(source.settings_names)}")
     return source
 
 
-CONFIG: dict[str, Any] = {"parser": file, "metavar": "FILE"}
 DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
 """How options of these kinds are declared. A description is a file, or the JSON itself."""
 
@@ -242,7 +222,7 @@ Description = Annotated[
     dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
 ]
 Config = Annotated[
-    Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **CONFIG)
+    Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **FILE)
 ]
 NoConfig = Annotated[bool, typer.Option("--no-config", help="Leave settings that lie beside the checkpoint unread.")]
 
@@ -253,13 +233,13 @@ Scene = Annotated[
     typer.Argument(help="The scene's field: a file, a run's folder or an archive.", **FIELD | {"metavar": "SCENE"}),
 ]
 DetectionFile = Annotated[
-    Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **JSON_FILE)
+    Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **FILE)
 ]
 DetectionIndex = Annotated[
     int | None, typer.Option(min=0, help="Which one, where the file holds a list of detections; 0 is the first.")
 ]
 SceneConfig = Annotated[
-    Path | None, typer.Option(help="The settings that the scene was trained with: a file or an archive.", **CONFIG)
+    Path | None, typer.Option(help="The settings that the scene was trained with: a file or an archive.", **FILE)
 ]
 NoConfigs = Annotated[bool, typer.Option("--no-config", help="Leave settings that lie beside a checkpoint unread.")]
 SceneDescription = Annotated[
@@ -277,6 +257,16 @@ Recording = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result document.")]
 
 # a service elsewhere
+
+
+def client_of(server: str | None, token: str | None, worker_timeout: int = 60) -> Client | None:
+    """The client of a service; None where the work is done here."""
+    if server is None:
+        return None
+    from regnf_client import Client
+
+    return Client(server, token, worker_timeout_s=worker_timeout)
+
 
 Server = Annotated[str | None, typer.Option(help="Address of a regnf service; without it the work is done here.")]
 WorkerTimeout = Annotated[

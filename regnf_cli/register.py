@@ -1,7 +1,11 @@
-"""``regnf register``: one registration, here or on a server."""
+"""``regnf register``: one registration; ``regnf search``: which object of a library a detection shows.
+
+Each is done here or on a server.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,28 +13,17 @@ import typer
 
 import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.report import err, exit_code, reporting, show
-from regnf_cli.search import Files, check_box_by_header, open_scene, tell_files
+from regnf_cli.registration import Files, answer, check_box
+from regnf_cli.report import tell
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.field_files import library_files, stored_bounds
 from regnf_core.field_source import FieldSource
+from regnf_core.library_folder import LibraryFolder
 from regnf_core.options import Preset, RegistrationOptions
 
 LibraryObject = Annotated[
     Path, typer.Argument(help="The library object's field, in the same forms.", **cli.FIELD | {"metavar": "OBJECT"})
-]
-ObjectConfig = Annotated[Path | None, typer.Option(help="The same of the object.", **cli.CONFIG)]
-ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of the object.", **cli.DESCRIPTION)]
-PresetChoice = Annotated[
-    Preset | None, typer.Option(help="robust (the default) needs no initial guess; paper is the published method.")
-]
-Options = Annotated[Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **cli.JSON_FILE)]
-InitialTransform = Annotated[
-    Path | None,
-    typer.Option(help="JSON: a T_object_scene to try first, as a 4x4 or in a result document.", **cli.JSON_FILE),
-]
-GroundTruth = Annotated[
-    Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **cli.JSON_FILE)
 ]
 
 
@@ -39,15 +32,26 @@ def register(
     object_: LibraryObject,
     detection: cli.DetectionFile,
     detection_index: cli.DetectionIndex = None,
-    preset: PresetChoice = None,
-    options: Options = None,
+    preset: Annotated[
+        Preset | None, typer.Option(help="robust (the default) needs no initial guess; paper is the published method.")
+    ] = None,
+    options: Annotated[
+        Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **cli.FILE)
+    ] = None,
     scene_config: cli.SceneConfig = None,
-    object_config: ObjectConfig = None,
+    object_config: Annotated[Path | None, typer.Option(help="The same of the object.", **cli.FILE)] = None,
     no_config: cli.NoConfigs = False,
     scene_description: cli.SceneDescription = None,
-    object_description: ObjectDescription = None,
-    initial_transform: InitialTransform = None,
-    ground_truth: GroundTruth = None,
+    object_description: Annotated[
+        dict[str, Any] | None, typer.Option(help="The same of the object.", **cli.DESCRIPTION)
+    ] = None,
+    initial_transform: Annotated[
+        Path | None,
+        typer.Option(help="JSON: a T_object_scene to try first, as a 4x4 or in a result document.", **cli.FILE),
+    ] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **cli.FILE)
+    ] = None,
     seed: cli.Seed = 0,
     output: cli.Output = None,
     recording: cli.Recording = None,
@@ -64,7 +68,17 @@ def register(
     Exit codes: 0 registered, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.
     """
     box = cli.read_detection(detection, detection_index)
-    request = _request(box, cli.read_options(options, preset), seed, initial_transform, ground_truth)
+    request = _request(box, cli.read_options(options, preset), seed)
+    if initial_transform and RegistrationOptions.from_dict(request["options"]).preset != "robust":
+        raise InvalidInputError(
+            "only the preset robust starts from a given transform",
+            reason="PRESET_UNSUITABLE",
+            hint="Leave --initial-transform out, or use --preset robust.",
+        )
+    if initial_transform:
+        request["initial_transform"] = cli.read_transform(initial_transform, "initial transform")
+    if ground_truth:
+        request["ground_truth"] = {"T_object_scene": cli.read_transform(ground_truth, "ground truth")}
     if server is None:
         require("engine", *(["rerun"] if recording else []))
     elif recording is not None:
@@ -73,76 +87,88 @@ def register(
     place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
     thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
     if place.file.samefile(thing.file):
-        err.print(f"warning: scene and object are the same file, {scene}", markup=False, soft_wrap=True)
-    check_box_by_header(place.file, box, thing.file)
+        tell(f"warning: scene and object are the same file, {scene}")
+    check_box(place.file, box, stored_bounds(place.file), stored_bounds(thing.file))
+    client = cli.client_of(server, token, worker_timeout)
+    answer(place, thing, request, Files(output, recording), client, None, cancel_on_interrupt, as_json)
+
+
+def _request(box: Detection, options: dict[str, Any], seed: int) -> dict[str, Any]:
+    asked = {"detection": box.canonical(), "options": options, "seed": seed}
+    return asked | {"initial_transform": None, "ground_truth": None}
+
+
+# The objects of a search: entries of libraries by their names, and fields by their files.
+
+
+def search(
+    scene: cli.Scene,
+    detection: cli.DetectionFile,
+    library: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Libraries, folders of fields, or fields: the objects. Without any, your library.",
+            parser=cli.library_path,
+            metavar="[LIBRARY]...",
+        ),
+    ] = None,
+    tag: Annotated[str | None, typer.Option(help="Of libraries, only the entries with this tag.")] = None,
+    detection_index: cli.DetectionIndex = None,
+    top: Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")] = 5,
+    options: Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **cli.FILE)] = None,
+    scene_config: cli.SceneConfig = None,
+    object_config: Annotated[Path | None, typer.Option(help="The same of every object.", **cli.FILE)] = None,
+    no_config: cli.NoConfigs = False,
+    scene_description: cli.SceneDescription = None,
+    object_description: Annotated[
+        dict[str, Any] | None, typer.Option(help="The same of every object.", **cli.DESCRIPTION)
+    ] = None,
+    seed: cli.Seed = 0,
+    output: cli.Output = None,
+    server: cli.Server = None,
+    worker_timeout: cli.WorkerTimeout = 60,
+    cancel_on_interrupt: cli.CancelOnInterrupt = False,
+    token: cli.Token = None,
+    as_json: cli.AsJson = False,
+) -> None:
+    """Find which object of a library stands in the box, and where.
+
+    Example: **regnf search room.ckpt chairs/ --detection box.json --top 3**, or of your library
+    **regnf search room.ckpt --tag seat --detection box.json**
+
+    Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
+    """
+    box = cli.read_detection(detection, detection_index)
+    request = _request(box, cli.read_options(options, None), seed)
+    if RegistrationOptions.from_dict(request["options"]).preset != "robust":
+        message = f"{options}: only the preset robust searches a library"
+        hint = "Leave the preset out of the options."
+        raise InvalidInputError(message, reason="PRESET_UNSUITABLE", hint=hint)
     if server is None:
-        document = _register_here(place, thing, box, request, Files(output, recording))
-    else:
-        from regnf_cli.remote import register_remotely
-        from regnf_client import Client
-
-        client = Client(server, token, worker_timeout_s=worker_timeout)
-        document = register_remotely(client, place, thing, request, output=output, cancel=cancel_on_interrupt)
-    show(document, as_json)
-    tell_files(output, recording)
-    raise typer.Exit(exit_code(document))
-
-
-def _request(
-    box: Detection, options: dict[str, Any], seed: int, initial_transform: Path | None, truth: Path | None
-) -> dict[str, Any]:
-    """What a service is asked, too."""
-    request: dict[str, Any] = {
-        "detection": box.canonical(),
-        "options": options,
-        "seed": seed,
-        "initial_transform": cli.read_transform(initial_transform, "initial transform") if initial_transform else None,
-        "ground_truth": {"T_object_scene": cli.read_transform(truth, "ground truth")} if truth else None,
-    }
-    if request["initial_transform"] and RegistrationOptions.from_dict(options).preset != "robust":
-        raise InvalidInputError(
-            "only the preset robust starts from a given transform",
-            reason="INITIAL_TRANSFORM_UNSUPPORTED",
-            hint="Leave --initial-transform out, or use --preset robust.",
-        )
-    return request
+        require("engine")
+    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
+    check_box(place.file, box, stored_bounds(place.file))
+    objects: list[FieldSource] = []
+    if server is None or library:
+        for one in _objects_of(library, tag):
+            chosen = cli.choice_of(object_config, no_config)
+            objects += [cli.source_of(one, object_description, chosen, "object") if isinstance(one, Path) else one]
+    client = cli.client_of(server, token, worker_timeout)
+    answer(place, objects, request, Files(output), client, tag, cancel_on_interrupt, as_json, top)
 
 
-def _register_here(
-    scene: FieldSource, object_: FieldSource, detection: Detection, request: dict[str, Any], files: Files
-) -> dict[str, Any]:
-    from regnf_core.document import result_document
-    from regnf_core.geometry.box import OrientedBox
-    from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import WarmStart
-    from regnf_core.library import register as run
-    from regnf_core.loading import import_smallest_first, load_field
+def _objects_of(named: list[Path] | None, tag: str | None) -> Iterator[FieldSource | Path]:
+    """The entries and the files that are meant; without any path, the user's own library.
 
-    options = RegistrationOptions.from_dict(request["options"])
-    box = OrientedBox.from_detection(detection)
-    start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
-    truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
-    files.check()
-    with reporting("loading") as report:
-        import_smallest_first((scene, object_))
-        obj = load_field(object_)
-        opened = open_scene(scene, detection, obj.field)
-        result = run(
-            opened.field,
-            obj.field,
-            box,
-            options,
-            request["seed"],
-            report,
-            WarmStart(T_object_scene=start),
-            clouds=files.wanted,
-        )
-        report("exporting", 1.0)
-    said: dict[str, Any] = {
-        "truth": truth,
-        "object_name": str(object_.named),
-        "fields": {"scene": opened.notes, "object": obj.notes},
-    }
-    files.write(result, box, **said)
-    document: dict[str, Any] = result_document(result, **said)
-    return document
+    Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE).
+    """
+    paths = named or [LibraryFolder.usual().folder]
+    libraries = [LibraryFolder(path) for path in paths if not named or LibraryFolder.is_one(path)]
+    entries = [(library, one) for library in libraries for one in library.entries(tag)]
+    if libraries and not entries:
+        which = "" if tag is None else f" with the tag {tag!r}"
+        hint = "`regnf library add NAME FIELD` adds one; or name a folder of fields."
+        raise InvalidInputError(f"{libraries[0].folder}: no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
+    yield from (FieldSource(Path(one.notes.name), library.file(one)) for library, one in entries)
+    files = [path for path in paths if path not in [library.folder for library in libraries]]
+    yield from library_files(files) if files else ()

@@ -3,56 +3,36 @@
 from __future__ import annotations
 
 import os
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.report import out, phase_progress
-from regnf_core.errors import InvalidOptionsError, filled_folder, require_writable
+from regnf_cli.report import progress, say
+from regnf_core.errors import InvalidInputError, InvalidOptionsError, filled_folder, require_writable
 from regnf_core.field_source import FieldSource, find_source
 from regnf_core.rendering.request import MOST_FRAMES, RenderRequest
-
-
-class Mode(StrEnum):
-    """How rays see a field."""
-
-    SURFACE = "surface"
-    VOLUME = "volume"
-
 
 Folder = Annotated[Path, typer.Option(help="The folder for the pictures.", **cli.OUTPUT)]
 Request = Annotated[
     Path | None,
-    typer.Option(help="JSON: the whole request (docs/editing.md); other options take precedence.", **cli.JSON_FILE),
+    typer.Option(help="JSON: the whole request (docs/editing.md); other options take precedence.", **cli.FILE),
 ]
 Size = Annotated[str | None, typer.Option(help="Of every picture; 480x360 by default.", metavar="WIDTHxHEIGHT")]
 ModeChoice = Annotated[
-    Mode | None,
+    Literal["surface", "volume"] | None,
     typer.Option(
         help="surface: the zero level (the default). volume: as NeuS renders; takes three to four times as long."
     ),
 ]
 Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 8 by default.")]
 Elevation = Annotated[float | None, typer.Option(help="Of the orbit above the horizon, degrees; 25 by default.")]
-Distance = Annotated[float | None, typer.Option(help="Of the orbit's cameras, scene units; by default all is in view.")]
 Around = Annotated[
-    Path | None,
-    typer.Option(help="JSON: a box to orbit round; by default the first edit's, or the scene.", **cli.JSON_FILE),
+    Path | None, typer.Option(help="JSON: a box to orbit round; by default the first edit's, or the scene.", **cli.FILE)
 ]
 UpAxis = Annotated[str | None, typer.Option(help="The scene's vertical: x, y, z, -x, -y or -z; z by default.")]
-CameraFile = Annotated[
-    Path | None,
-    typer.Option(
-        help="Take these cameras in place of an orbit: transforms.json, meta_data.json or their folder.",
-        parser=cli.existing,
-        metavar="PATH",
-    ),
-]
-Every = Annotated[int, typer.Option(min=1, help="With --cameras: take one of so many.")]
 Outputs = Annotated[
     str | None,
     typer.Option(
@@ -65,14 +45,6 @@ Processes = Annotated[int | None, typer.Option(min=1, help="Processes that share
 CutAway = Annotated[
     bool, typer.Option("--cut-away", help="Cameras may stand in matter: what is before them is cut away.")
 ]
-EditsFile = Annotated[
-    Path,
-    typer.Option(
-        help="JSON: a list of edits (docs/editing.md). Objects are named by their files, from this file's folder on; a "
-        "T_object_scene is a 4x4, or the name of a result.json that has one.",
-        **cli.JSON_FILE,
-    ),
-]
 _FILES = ("object", "replacement")
 
 
@@ -84,11 +56,20 @@ def render(
     mode: ModeChoice = None,
     frames: Frames = None,
     elevation: Elevation = None,
-    distance: Distance = None,
+    distance: Annotated[
+        float | None, typer.Option(help="Of the orbit's cameras, scene units; by default all is in view.")
+    ] = None,
     around: Around = None,
     up_axis: UpAxis = None,
-    cameras: CameraFile = None,
-    every: Every = 1,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            help="Take these cameras in place of an orbit: transforms.json, meta_data.json or their folder.",
+            parser=cli.existing,
+            metavar="PATH",
+        ),
+    ] = None,
+    every: Annotated[int, typer.Option(min=1, help="With --cameras: take one of so many.")] = 1,
     outputs: Outputs = None,
     antialias: Antialias = None,
     cut_away: CutAway = False,
@@ -102,7 +83,10 @@ def render(
     Example: **regnf render room.safetensors --around box.json --frames 8 --output pictures/**
     """
     require("engine")
-    poses = None if cameras is None else poses_of(cameras, every, None if size is None else size_of(size))
+    from regnf_core.rendering.camera_poses import poses_of_file
+
+    wide = None if size is None else size_of(size)
+    poses = None if cameras is None else poses_of_file(cameras, wide, every)
     wanted = request_of(
         request, around=around, poses=poses, size=size, mode=mode, frames=frames, elevation_deg=elevation,
         distance=distance, up=up_axis, outputs=outputs, antialias=antialias, cut_away=cut_away,
@@ -112,7 +96,14 @@ def render(
 
 def edit(
     scene: cli.Scene,
-    edits: EditsFile,
+    edits: Annotated[
+        Path,
+        typer.Option(
+            help="JSON: a list of edits (docs/editing.md). Objects are named by their files, from this file's folder "
+            "on; a T_object_scene is a 4x4, or the name of a result.json that has one.",
+            **cli.FILE,
+        ),
+    ],
     output: Folder = Path("edited"),
     request: Request = None,
     size: Size = None,
@@ -170,23 +161,6 @@ def request_of(
     return RenderRequest.from_dict(values)
 
 
-def poses_of(path: Path, every: int, size: tuple[int, int] | None) -> list[dict[str, Any]]:
-    """The cameras of a file as a request says them."""
-    from regnf_core.rendering.camera import cameras_of_file
-
-    found = []
-    for camera in cameras_of_file(path, size=size, every=every):
-        rows = [[*axes, place] for axes, place in zip(camera.axes.tolist(), camera.position.tolist(), strict=True)]
-        found.append(
-            {
-                "T_scene_camera": [*rows, [0.0, 0.0, 0.0, 1.0]],
-                "intrinsics": [*camera.focal, *camera.middle],
-                "size": [camera.width, camera.height],
-            }
-        )
-    return found
-
-
 def size_of(text: str) -> tuple[int, int]:
     """Width and height. Raises InvalidOptionsError."""
     words = text.lower().split("x")
@@ -212,7 +186,7 @@ def render_here(scene: FieldSource, request: RenderRequest, output: Path, proces
     def open_object(name: str) -> SdfField:
         return load_field(find_source(Path(name))).field
 
-    with phase_progress() as bar, filled_folder(output) as folder:
+    with progress() as bar, filled_folder(output) as folder:
         task = bar.add_task("loading", total=1.0)
         field = load_field(scene).field
         bar.update(task, description="rendering")
@@ -222,12 +196,15 @@ def render_here(scene: FieldSource, request: RenderRequest, output: Path, proces
 
         report = run_render(field, request, open_object, folder, tell, processes=processes or os.cpu_count() or 1)
     for artifact in report.artifacts:
-        out.print(str(output / artifact.name), markup=False, soft_wrap=True)
+        say(str(output / artifact.name))
 
 
 def _edits(file: Path) -> list[Any]:
     """The list in ``file``, with the names of files in it taken from its folder on, and transforms read."""
-    return [_edit(value, file.parent) if isinstance(value, dict) else value for value in cli.read_list(file, "edits")]
+    values = cli.read_json(file, "edits")
+    if not isinstance(values, list):
+        raise InvalidInputError(f"edits {file}: expected a JSON list", reason="MALFORMED_JSON", hint="Write [...].")
+    return [_edit(value, file.parent) if isinstance(value, dict) else value for value in values]
 
 
 def _edit(value: dict[str, Any], folder: Path) -> dict[str, Any]:

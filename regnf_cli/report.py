@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeElapsedColumn
 from rich.table import Table
 
-from regnf_core.errors import hint_of
+from regnf_core.errors import Candidate, RegnfError, Said, hint_of
 
 # What the commands share for talking to people and to programs.
 
@@ -31,11 +32,21 @@ _PAGE = re.compile(r"\bdocs/([a-z0-9/-]+)\.md\b")
 def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None = None) -> int:
     """Say on stderr what went wrong, and what to do next; returns the exit code."""
     err.print(f"[bold red]{reason}[/] ", end="")
-    err.print(_with_commands(message), markup=False, soft_wrap=True)
+    tell(_with_commands(message))
     if hint := hint or hint_of(reason):
         err.print("[bold]hint:[/] ", end="")
-        err.print(_with_commands(hint), markup=False, soft_wrap=True)
+        tell(_with_commands(hint))
     return code
+
+
+def show_candidates(error: RegnfError) -> None:
+    """Say on stderr what to add to the command for each function that a refused file may be, if that is why."""
+    asked: Sequence[Candidate] = getattr(error, "candidates", ())
+    said: Said = getattr(error, "said", None) or Said(None, {})
+    option = "--description" if said.use is None else f"--{said.use}-description"
+    for number, one in enumerate(asked, 1):
+        told = f"{number}  {one.name}\n   {option} {shlex.quote(json.dumps(one.added_to(said.description)))}"
+        tell(told)
 
 
 def _with_commands(text: str) -> str:
@@ -43,19 +54,34 @@ def _with_commands(text: str) -> str:
     return _PAGE.sub(r"`regnf manual \1`", text)
 
 
+def say(text: str) -> None:
+    """A line on stdout, as it is."""
+    out.print(text, markup=False, soft_wrap=True)
+
+
+def tell(text: str) -> None:
+    """The same on stderr, for people: what is on stdout may be JSON."""
+    err.print(text, markup=False, soft_wrap=True)
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Tell them, a line each."""
+    for warning in warnings:
+        tell(f"warning: {warning}")
+
+
 @contextmanager
 def reporting(phase: str) -> Iterator[Callable[[str, float], None]]:
     """A bar of phases and their shares, which begins with ``phase``."""
-    with phase_progress() as bar:
+    with progress() as bar:
         task = bar.add_task(phase, total=1.0)
         yield lambda phase, share: bar.update(task, description=phase, completed=share)
 
 
-def phase_progress() -> Progress:
-    """A bar on stderr, so that stdout stays clean for results."""
-    return Progress(
-        TextColumn("{task.description:>14}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), console=err
-    )
+def progress(*columns: str | ProgressColumn) -> Progress:
+    """A bar on stderr, so that stdout stays clean for results. columns: in place of the share and the time."""
+    rest = columns or (TaskProgressColumn(), TimeElapsedColumn())
+    return Progress("{task.description:>14}", BarColumn(), *rest, console=err)
 
 
 _EXIT_CODES = {"registered": EXIT_REGISTERED, "ambiguous": EXIT_AMBIGUOUS}
@@ -91,11 +117,17 @@ def show_result(document: dict[str, Any]) -> None:
         _line("probability", f"{100 * probability:.1f} % that {meant} is right")
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
-    _show_warnings(document.get("fields") or {})
+    for name in ("scene", "object"):
+        for warning in ((document.get("fields") or {}).get(name) or {}).get("warnings") or ():
+            _line("warning", f"{name}: {warning}")
     show_pose(document)
     if symmetry := document.get("symmetry"):
         _line("symmetry", symmetry_in_words(symmetry))
-    _show_alternatives(document.get("alternatives") or [])
+    if alternatives := document.get("alternatives"):
+        table = Table("", "score", "relation to the result", title="alternatives", title_justify="left", box=None)
+        for number, other in enumerate(alternatives, 1):
+            table.add_row(str(number), f"{other['score']:.4f}", escape(other["relation"]))
+        out.print(table)
     for name, value in (document.get("metrics") or {}).items():
         _line(f"{name:<28}", f"{value:.6g}" if isinstance(value, float) else str(value))
 
@@ -108,17 +140,14 @@ def show_pose(document: dict[str, Any]) -> None:
         out.print("   " + " ".join(f"{value: .6f}" for value in row))
     sigmas = document.get("uncertainty") or {}
     if (center := document.get("center_scene")) is not None:
-        _line("center", f"{' '.join(f'{value:.4f}' for value in center)} in the scene{_give_or_take(sigmas)}")
+        sure = f", ± {_numbers(sigmas['center_scene'])} scene units" if sigmas else ""
+        _line("center", f"{' '.join(f'{value:.4f}' for value in center)} in the scene{sure}")
     deviation = sigmas.get("scale_percent")
     give_or_take = "" if deviation is None else f", ± {deviation:.2g} %"
     _line("scale", f"{1.0 / transform['scale']:.6f} object units for each scene unit{give_or_take}")
     if sigmas:
         _line("rotation", f"± {_numbers(sigmas['rotation_deg'])} degrees about the object's x, y, z")
         _line("", "± is one standard deviation")
-
-
-def _give_or_take(sigmas: dict[str, Any]) -> str:
-    return f", ± {_numbers(sigmas['center_scene'])} scene units" if sigmas else ""
 
 
 def show_ranking(document: dict[str, Any], top: int) -> None:
@@ -153,24 +182,8 @@ def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     return "none found" if order == 1 else f"{order} rotations{about} look the same, the identity included"
 
 
-def _show_warnings(fields: dict[str, Any]) -> None:
-    """What the imports of scene and object have warned of."""
-    for name in ("scene", "object"):
-        for warning in (fields.get(name) or {}).get("warnings") or ():
-            _line("warning", f"{name}: {warning}")
-
-
-def _show_alternatives(alternatives: list[dict[str, Any]]) -> None:
-    if not alternatives:
-        return
-    table = Table("", "score", "relation to the result", title="alternatives", title_justify="left", box=None)
-    for number, other in enumerate(alternatives, 1):
-        table.add_row(str(number), f"{other['score']:.4f}", escape(other["relation"]))
-    out.print(table)
-
-
 def _line(name: str, value: str) -> None:
-    out.print(f"{name:<12} {value}", markup=False, soft_wrap=True)
+    say(f"{name:<12} {value}")
 
 
 def _numbers(values: list[float | None]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import http.client
+import itertools
 import json
 import logging
 import os
@@ -19,7 +20,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import FrameType, TracebackType
 from urllib.parse import urlsplit
 
 from redis.exceptions import RedisError
@@ -41,8 +41,8 @@ _STEADY_AFTER_S = 30.0
 class Child:
     """A command, which ends with this process and is restarted after growing pauses whenever it ends.
 
-    Start it from the main thread: the kernel ties its life to the thread that started it. ``passed``: descriptors that
-    the command inherits.
+    Made in the main thread: the kernel ties its life to the thread that started it. ``passed``: descriptors that the
+    command inherits · ``stop_s``: how long it may take to stop.
     """
 
     def __init__(
@@ -50,18 +50,19 @@ class Child:
         name: str,
         command: Sequence[str],
         environment: Mapping[str, str],
+        stop_s: float,
         passed: Sequence[int] = (),
     ) -> None:
         self.name = name
+        self.stop_s = stop_s
         self._command = [sys.executable, "-m", "regnf_cli.guard", str(os.getpid()), *command]
         self._environment = dict(environment)
         self._passed = tuple(passed)
-        self._process: subprocess.Popen[bytes] | None = None
-        self._started = 0.0
         self._pause_s = _FIRST_PAUSE_S
         self._start_at = 0.0
+        self._start()
 
-    def start(self) -> None:
+    def _start(self) -> None:
         """Start the command in a session of its own: a terminal's Ctrl+C is for the supervisor alone."""
         self._started = time.monotonic()
         self._process = subprocess.Popen(
@@ -75,13 +76,12 @@ class Child:
         logger.info("%s started, process %d", self.name, self._process.pid)
 
     @property
-    def exit_status(self) -> int | None:
-        """None while it runs, and before it has been started."""
-        return self._process.poll() if self._process is not None else None
+    def is_running(self) -> bool:
+        return self._process.poll() is None
 
     def keep_running(self) -> None:
         """Restart it when it has ended and its pause is over."""
-        if self._process is None or self._process.poll() is None:
+        if self.is_running:
             return
         now = time.monotonic()
         if not self._start_at:
@@ -92,16 +92,13 @@ class Child:
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
         elif now >= self._start_at:
             self._start_at = 0.0
-            self.start()
+            self._start()
 
     def ask_to_stop(self) -> None:
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
+        self._process.terminate()
 
     def wait(self, seconds: float) -> None:
         """Wait for its end, at most this long; then it is killed."""
-        if self._process is None:
-            return
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -141,9 +138,8 @@ class StateLock:
             with suppress(AttributeError, OSError):  # it may not have come to be
                 self._file.close()
             _take_back(made)
-            detail = f"cannot keep state in {self._state_dir}: {error.strerror}"
-            if error.filename is not None and Path(error.filename).is_relative_to(self._state_dir):
-                detail = f"cannot keep state in {error.filename}: {error.strerror}"
+            inside = error.filename is not None and Path(error.filename).is_relative_to(self._state_dir)
+            detail = f"cannot keep state in {error.filename if inside else self._state_dir}: {error.strerror}"
             hint = "Give a folder that can be written with --state-dir."
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 hint = "Make room on the disk, or give a folder on another one with --state-dir."
@@ -163,9 +159,7 @@ class StateLock:
             hint = "Use that one, or stop it, or give this one its own folder with --state-dir."
             raise StartError(detail, reason="STATE_DIR_IN_USE", hint=hint) from error
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.socket_dir is not None:
             shutil.rmtree(self.socket_dir, ignore_errors=True)
         with suppress(OSError):  # on a full disk the note stays: the lock itself is what counts
@@ -247,9 +241,8 @@ def check_storage(settings: Settings) -> None:
 
 _LOOK_EVERY_S = 0.2
 _START_DEADLINE_S = 60.0
-_STOP_API_S = 10.0
-_STOP_WORKER_MARGIN_S = 10.0
-_STOP_REDIS_S = 10.0
+_STOP_S = 10.0
+"""For the API and for Redis; for workers after their own grace."""
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 logger = logging.getLogger(__name__)
 
@@ -264,9 +257,8 @@ class Supervisor:
         self._settings = settings.model_copy(update={"state_dir": settings.state_dir.resolve()})
         self._stop = threading.Event()
         self._signals = 0
-        self._redis: Child | None = None
-        self._api: Child | None = None
-        self._workers: list[Child] = []
+        self._children: list[list[Child]] = []
+        """Those that were started together, the first ones first."""
 
     def run(self, ready: Callable[[str], None]) -> None:
         """Serve until SIGTERM, SIGINT or SIGHUP. ``ready`` is called with the address once the service answers.
@@ -277,64 +269,58 @@ class Supervisor:
             stack.enter_context(self._handled_signals())
             lock = stack.enter_context(StateLock(self._settings.state_dir))
             listener = stack.enter_context(open_socket(self._settings))
-            lock.note(address=address_of(listener))
+            address = address_of(listener)
+            lock.note(address=address)
             stack.callback(self._stop_children)
             url = self._settings.redis_url or self._start_redis(lock)
             check_storage(self._settings.model_copy(update={"redis_url": url}))
-            self._start_rest(url, listener)
-            if self._until(lambda: _api_answers(address_of(listener)), self._api, "the API"):
-                ready(address_of(listener))
+            api = self._start_rest(url, listener)
+            if self._until(lambda: _api_answers(address), api, "the API"):
+                ready(address)
             while not self._stop.wait(_LOOK_EVERY_S):
-                for child in self._children():
+                for child in itertools.chain(*self._children):
                     child.keep_running()
             logger.info("stopping")
-
-    def _children(self) -> Iterator[Child]:
-        """Those that run, in the order of their start."""
-        if self._redis is not None:
-            yield self._redis
-        yield from self._workers
-        if self._api is not None:
-            yield self._api
 
     def _start_redis(self, lock: StateLock) -> str:
         path = lock.make_socket_dir() / "redis.sock"
         command = server_command(path, self._settings.state_dir / "redis")
-        self._redis = Child("redis", command, _without_secrets(os.environ))
-        self._redis.start()
+        redis = Child("redis", command, _without_secrets(os.environ), _STOP_S)
+        self._children.append([redis])
         url = f"unix://{path}"
-        self._until(lambda: answers(url), self._redis, "Redis")
+        self._until(lambda: answers(url), redis, "Redis")
         return url
 
-    def _start_rest(self, redis_url: str, listener: socket.socket) -> None:
-        settings, port = self._settings, listener.getsockname()[1]
+    def _start_rest(self, redis_url: str, listener: socket.socket) -> Child:
+        """Start the API, which is returned, and the workers."""
+        settings = self._settings
         told = variables(
             redis_url=redis_url,
             state_dir=settings.state_dir,
             host=settings.host,
-            port=port,
+            port=listener.getsockname()[1],
             workers=settings.workers,
             **({"demo_dir": settings.demo_dir} if settings.demo_dir is not None else {}),
         )
         environment = os.environ | told
         descriptor = listener.fileno()
-        api = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
-        self._api = Child("api", api, environment, passed=[descriptor])
-        worker = [sys.executable, "-m", "regnf_worker.main"]
-        self._workers = [
-            Child(f"worker {number}", worker, _without_secrets(environment))
-            for number in range(1, self._settings.workers + 1)
-        ]
-        for child in (self._api, *self._workers):
-            child.start()
+        workers: list[Child] = []
+        self._children.append(workers)
+        command = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
+        api = Child("api", command, environment, _STOP_S, passed=[descriptor])
+        self._children.append([api])
+        command, grace_s = [sys.executable, "-m", "regnf_worker.main"], settings.shutdown_grace_s + _STOP_S
+        for number in range(1, settings.workers + 1):
+            workers.append(Child(f"worker {number}", command, _without_secrets(environment), grace_s))
+        return api
 
-    def _until(self, look: Callable[[], bool], child: Child | None, what: str) -> bool:
+    def _until(self, look: Callable[[], bool], child: Child, what: str) -> bool:
         """Wait for a child to answer; False when a signal came first. Raises StartError when it ends or is late."""
         deadline = time.monotonic() + _START_DEADLINE_S
         while not self._stop.is_set():
             if look():
                 return True
-            if child is not None and child.exit_status is not None:
+            if not child.is_running:
                 raise StartError(f"{what} ended while it was starting; the log above says why")
             if time.monotonic() > deadline:
                 raise StartError(f"{what} did not start within {_START_DEADLINE_S:.0f} s")
@@ -343,23 +329,15 @@ class Supervisor:
 
     def _stop_children(self) -> None:
         """API first, so that nothing new comes in; then the workers, which give their jobs back; then Redis."""
-        if self._api is not None:
-            self._api.ask_to_stop()
-            self._api.wait(self._patience(_STOP_API_S))
-        for child in self._workers:
-            child.ask_to_stop()
-        for child in self._workers:
-            child.wait(self._patience(self._settings.shutdown_grace_s + _STOP_WORKER_MARGIN_S))
-        if self._redis is not None:
-            self._redis.ask_to_stop()
-            self._redis.wait(self._patience(_STOP_REDIS_S))
-
-    def _patience(self, seconds: float) -> float:
-        return seconds if self._signals < 2 else 0.0
+        for together in reversed(self._children):
+            for child in together:
+                child.ask_to_stop()
+            for child in together:
+                child.wait(child.stop_s if self._signals < 2 else 0.0)
 
     @contextmanager
     def _handled_signals(self) -> Iterator[None]:
-        def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signature is given
+        def handle(*_: object) -> None:
             self._signals += 1
             self._stop.set()
 

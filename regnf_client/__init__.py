@@ -10,9 +10,8 @@
 """
 
 from regnf_client.answers import NoWorkerError, ServiceError, UnreachableError, WaitTimeoutError
-from regnf_client.async_client import AsyncClient
 from regnf_client.batches import Pair, PairResult
-from regnf_client.client import Client
+from regnf_client.client import AsyncClient, Client
 from regnf_client.models import BatchOutcome, Entry, Event, Field, Job, Rendering, Result
 
 __all__ = [

@@ -100,10 +100,9 @@ def _address_hint(address: str) -> str:
 
 
 _Model = TypeVar("_Model", bound=BaseModel)
-HINTS = {  # in place of the service's own, which are of HTTP
+_HINTS = {  # in place of the service's own, which are of HTTP
     "UNAUTHENTICATED": "Give the service's token: token=..., --token, or the environment variable REGNF_API_TOKEN.",
     "RATE_LIMITED": "Wait a moment, and try again.",
-    "TOO_MANY_WRITES": "Wait a moment, and try again.",
     "QUEUE_FULL": "Try again later.",
     "JOB_NOT_FOUND": "Look at the id: `client.jobs()` lists your jobs. Another caller's jobs are not shown.",
     "JOB_NOT_READY": "Wait for the job first: `client.wait(job)`.",
@@ -113,15 +112,12 @@ HINTS = {  # in place of the service's own, which are of HTTP
 }
 
 
-def checked(answer: httpx.Response, hints: Mapping[str, str] = HINTS) -> dict[str, Any]:
-    """The JSON object of a good answer; raises ServiceError for a refusal, and for what is no regnf service.
-
-    hints: by reason, in place of the service's.
-    """
-    document = _object_of(answer)
+def checked(answer: httpx.Response) -> dict[str, Any]:
+    """The JSON object of a good answer; raises ServiceError for a refusal, and for what is no regnf service."""
+    document = object_of(answer)
     if answer.is_success and document is not None:
         return document
-    raise refusal(answer, hints)
+    raise refusal(answer)
 
 
 def parsed(model: type[_Model], values: Mapping[str, Any]) -> _Model:
@@ -135,19 +131,22 @@ def parsed(model: type[_Model], values: Mapping[str, Any]) -> _Model:
         raise ServiceError(f"the answer is no {model.__name__}: {where}: {first['msg']}", hint=hint) from error
 
 
-def refusal(answer: httpx.Response, hints: Mapping[str, str] = HINTS) -> ServiceError:
+def refusal(answer: httpx.Response) -> ServiceError:
     """The error that an answer stands for."""
-    document = _object_of(answer)
+    document = object_of(answer)
     if document is None or not (document.keys() & {"reason", "detail", "title"}):
-        error = _no_regnf(answer)
+        url = answer.request.url
+        place = f"{url.scheme}://{url.netloc.decode()}{url.path}"
+        hint = "Check address and port: `regnf serve` prints them. A proxy in front must pass every path on."
+        error = ServiceError(f"HTTP status {answer.status_code} from {place}: no regnf service", hint=hint)
     else:
-        error = service_error(document, hints)
+        error = service_error(document)
     error.status = answer.status_code
     error.unavailable = answer.status_code in (502, 503, 504)
     return error
 
 
-def service_error(problem: Mapping[str, Any], hints: Mapping[str, str] = HINTS) -> ServiceError:
+def service_error(problem: Mapping[str, Any]) -> ServiceError:
     """The error for a problem object. Its faults are told too, where the detail alone does not name them."""
     if problem.get("reason") == "JOB_FAILED" and isinstance(problem.get("error"), dict):
         problem = problem["error"]  # why the job failed says more than that it did
@@ -157,7 +156,7 @@ def service_error(problem: Mapping[str, Any], hints: Mapping[str, str] = HINTS) 
     named = [f"{fault.get('pointer') or fault.get('parameter')}: {fault.get('detail')}" for fault in faults]
     if named and faults[0].get("detail") != detail:
         detail = f"{detail} {'; '.join(named)}"
-    hint = hints.get(reason) or problem.get("hint")
+    hint = _HINTS.get(reason) or problem.get("hint")
     error = ServiceError(detail, reason=reason, hint=None if hint is None else str(hint))
     error.candidates = tuple(_candidates(problem.get("candidates")))
     offset = problem.get("offset")
@@ -165,7 +164,8 @@ def service_error(problem: Mapping[str, Any], hints: Mapping[str, str] = HINTS) 
     return error
 
 
-def _object_of(answer: httpx.Response) -> dict[str, Any] | None:
+def object_of(answer: httpx.Response) -> dict[str, Any] | None:
+    """The JSON object of an answer; None for anything else."""
     try:
         document = answer.json()
     except ValueError:
@@ -178,10 +178,3 @@ def _candidates(values: Any) -> Iterator[Candidate]:
         match value:
             case {"name": str() as name, "description": dict() as said}:
                 yield Candidate(name, said)
-
-
-def _no_regnf(answer: httpx.Response) -> ServiceError:
-    url = answer.request.url
-    message = f"HTTP status {answer.status_code} from {url.scheme}://{url.netloc.decode()}{url.path}: no regnf service"
-    hint = "Check address and port: `regnf serve` prints them. A proxy in front must pass every path on."
-    return ServiceError(message, hint=hint)

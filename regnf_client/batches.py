@@ -9,19 +9,17 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from httpx import Response
 from pydantic import BeforeValidator, Field
 
-from regnf_client.answers import checked, refusal, service_error
-from regnf_client.calls import request_body
-from regnf_client.fields import Asking, Deadline, FieldLike, known_sha256, upload
+from regnf_client.answers import checked, object_of, refusal, service_error
+from regnf_client.fields import FieldLike, known_sha256, upload
 from regnf_client.models import Alternative, Array, Document, Matrix
-from regnf_client.steps import Flow, Pause, call, look
-from regnf_core.detections.parsing import BoxLike
+from regnf_client.steps import Asking, Deadline, Flow, Pause, retry_after_s
+from regnf_core.detections.parsing import BoxLike, detection_of
 from regnf_core.document import Verdict
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.field_source import FieldSource, Role
-from regnf_core.options import OptionsLike
+from regnf_core.options import OptionsLike, options_of
 
 PAIRS_AT_ONCE = 500
 _BYTES_AT_ONCE = 4 << 20
@@ -101,6 +99,38 @@ class PairResult(Document):
         return f"PairResult({name}: {self.verdict or (self.error.reason if self.error else self.status)})"
 
 
+def request_body(
+    detection: BoxLike,
+    options: OptionsLike = None,
+    seed: int = 0,
+    initial_transform: Any = None,
+    more: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What a registration asks for beside its fields, as it is sent. initial_transform: a T_object_scene, or
+    ``{"T_scene_object": ...}``. Raises InvalidDetectionError and InvalidOptionsError."""
+    body = {
+        "detection": detection_of(detection).canonical(),
+        "options": None if options is None else options_of(options).to_dict(),
+        "seed": seed,
+        "initial_transform": plain(initial_transform),
+        **(more or {}),
+    }
+    return {name: value for name, value in body.items() if value is not None}
+
+
+def plain(value: Any) -> Any:
+    """Arrays and tuples as lists, boxes as detections, transforms as their matrices: what JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(part) for name, part in value.items()}
+    if hasattr(value, "to_detection"):
+        return value.to_detection().canonical()
+    if callable(getattr(value, "matrix", None)):
+        return plain(value.matrix())
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+
+
 class BatchReader:
     """Any number of requests, from the first to the last result: several batches, one after the other.
 
@@ -128,18 +158,20 @@ class BatchReader:
         refused = yield from self._fill()
         if not self._lines:
             return refused or None
-        content = b"\n".join(line for _, line in self._lines)
+        lines = self._lines
         while True:
-            answer = yield from call(self._asking.patience, "POST", "/batches", content=content, headers=_HEADERS)
-            fitting = _fitting(answer)
-            if fitting is None:
+            content = b"\n".join(line for _, line in lines)
+            answer = yield from self._asking.call("POST", "/batches", content=content, headers=_HEADERS)
+            # how many of the first lines the service has room for, where it has none for all of them
+            fitting = None if answer.is_success else (object_of(answer) or {}).get("fitting_lines")
+            if not isinstance(fitting, int):
                 break
+            lines = self._lines[: fitting or None]
             if fitting == 0:
                 self._deadline.check("room for the next pairs")
-                yield from look(self._asking.watch, self._asking.patience)
-                yield Pause(_retry_after_s(answer))
-            else:
-                content = b"\n".join(line for _, line in self._lines[:fitting])
+                yield from self._asking.look()
+                after = retry_after_s(answer)
+                yield Pause(1.0 if after is None else min(_LONGEST_PAUSE_S, after))
         self._id, pairs = checked(answer)["id"], checked(answer)["pairs"]
         self._indexes = [index for index, _ in self._lines[:pairs]]
         self._lines, self._after = self._lines[pairs:], 0
@@ -169,7 +201,7 @@ class BatchReader:
         if self._after >= len(self._indexes):
             return None
         params = {"after": self._after, "wait": self._deadline.hold_s()}
-        answer = yield from call(self._asking.patience, "GET", f"/batches/{self._id}/results", params=params)
+        answer = yield from self._asking.call("GET", f"/batches/{self._id}/results", params=params)
         if not answer.is_success:
             raise refusal(answer)
         found = [self._result(json.loads(line)) for line in answer.text.splitlines()]
@@ -178,7 +210,7 @@ class BatchReader:
         self._asking.tell("registering", self._read / max(1, known))
         if not found:
             self._deadline.check(f"the batch {self._id}")
-            yield from look(self._asking.watch, self._asking.patience)
+            yield from self._asking.look()
         return found
 
     def _result(self, told: dict[str, Any]) -> PairResult:
@@ -216,20 +248,6 @@ class BatchReader:
         if isinstance(found, RegnfError):
             raise found
         return found
-
-
-def _fitting(answer: Response) -> int | None:
-    """How many of the first lines the service has room for, where it has none for all of them."""
-    try:
-        fitting = None if answer.is_success else answer.json().get("fitting_lines")
-    except (ValueError, AttributeError):
-        return None
-    return fitting if isinstance(fitting, int) else None
-
-
-def _retry_after_s(answer: Response) -> float:
-    text = answer.headers.get("retry-after", "")
-    return min(_LONGEST_PAUSE_S, float(text)) if text.isdecimal() and text.isascii() else 1.0
 
 
 def _key_of(given: PairLike) -> str | None:

@@ -2,49 +2,31 @@
 
 from __future__ import annotations
 
-import inspect
 import os
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial, update_wrapper
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote
 from uuid import uuid4
 
 import regnf_client.fields as fields
 from regnf_client.answers import ServiceError, checked, parsed, refusal
-from regnf_client.fields import Asking, Connection, FieldLike, Report, Sendable, known_sha256, smallest_first, source_of
+from regnf_client.batches import BatchReader, Pair, plain, request_body
+from regnf_client.fields import FieldLike, Sendable, known_sha256, smallest_first, source_of
 from regnf_client.models import BatchOutcome, Entry, Field, Job, Rendering, Result
-from regnf_client.steps import Download, Flow, again, call, look, work
+from regnf_client.steps import Asking, Connection, Download, Flow, Report, work
 from regnf_core.detections.parsing import BoxLike, detection_of
-from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.errors import InvalidInputError
 from regnf_core.field_source import Role, SettingsChoice
 from regnf_core.library_entries import EntryNotes, checked_name
 from regnf_core.library_folder import digest_of
 from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-_Document = TypeVar("_Document", Job, Entry)
 JobLike = str | Job | Result | Rendering
 """A job, its id, or what came of it."""
 _PAGE = 200
-_PART = ".part"
-_AT_ONCE = 16
-"""Jobs of a batch that wait or run, so that a quota of active jobs holds them."""
-
-
-def signed(flow: Callable[..., Flow[Any]]) -> Callable[[_Function], _Function]:
-    """Give a function the name, the docstring and the signature of a flow, with what the flow returns."""
-
-    def sign(function: _Function) -> _Function:
-        signature = inspect.signature(flow)
-        returned = str(signature.return_annotation).removeprefix("Flow[").removesuffix("]")
-        update_wrapper(function, flow)
-        function.__signature__ = signature.replace(return_annotation=returned)  # type: ignore[attr-defined]
-        return function
-
-    return sign
 
 
 class Calls:
@@ -99,10 +81,8 @@ class Calls:
         timeout_s: float | None = None,
     ) -> Flow[Result]:
         """Find where an object stands in a scene. initial_transform: a T_object_scene (4, 4) to look at first."""
-        asking = self._connection.asking(progress, timeout_s)
-        job = yield from _submit(asking, scene, obj, request_body(detection, options, seed, initial_transform))
-        yield from _wait(asking, job)
-        return (yield from _result(asking, job))
+        body = request_body(detection, options, seed, initial_transform)
+        return _registered(self._connection.asking(progress, timeout_s), scene, obj, body)
 
     def submit(
         self,
@@ -131,10 +111,8 @@ class Calls:
         timeout_s: float | None = None,
     ) -> Flow[Result]:
         """Which of the objects it is, and where; the result's ``candidates`` rank them all."""
-        asking = self._connection.asking(progress, timeout_s)
-        job = yield from _submit(asking, scene, _several(objects), request_body(detection, options, seed))
-        yield from _wait(asking, job)
-        return (yield from _result(asking, job))
+        body = request_body(detection, options, seed)
+        return _registered(self._connection.asking(progress, timeout_s), scene, _several(objects), body)
 
     def register_batch(
         self,
@@ -151,34 +129,23 @@ class Calls:
 
         A pair that fails does not stop the others.
         """
+        boxes, several = [detection_of(box) for box in detections], _several(objects)
+        chosen = None if options is None else options_of(options)
+        wanted = pairs_of(pairs, len(boxes), len(several))
         asking = self._connection.asking(progress, timeout_s)
-        bodies = [request_body(box, options, seed) for box in detections]
-        several = _several(objects)
-        wanted = pairs_of(pairs, len(bodies), len(several))
         place = yield from fields.upload(asking, scene, "scene")
-        things: dict[int, str | RegnfError] = {}
-        for number in sorted({o for _, o in wanted}):
-            try:
-                things[number] = (yield from fields.upload(asking, several[number], "object")).sha256
-            except RegnfError as error:
-                things[number] = error
-        jobs: list[Job | RegnfError] = []
-        outcomes: list[BatchOutcome] = []
-        for d, o in wanted:
-            thing = things[o]
-            try:
-                if isinstance(thing, RegnfError):
-                    raise thing
-                body = {"scene": place.sha256, "object": thing, **bodies[d]}
-                jobs.append((yield from _post(asking, "/register", body)))
-            except RegnfError as error:
-                jobs.append(error)
-            if len(jobs) - len(outcomes) >= _AT_ONCE:
-                outcomes.append((yield from _outcome(asking, wanted[len(outcomes)], jobs[len(outcomes)])))
-        while len(outcomes) < len(jobs):
-            outcomes.append((yield from _outcome(asking, wanted[len(outcomes)], jobs[len(outcomes)])))
-            asking.tell("registering", len(outcomes) / len(jobs))
-        return outcomes
+        listed = [Pair(place, several[o], boxes[d], chosen, seed) for d, o in wanted]
+        reader = BatchReader(asking, listed, asking.deadline())
+        outcomes: dict[int, BatchOutcome] = {}
+        while (found := (yield from reader.post())) is not None:
+            while found is not None:
+                for one in found:
+                    whole = None
+                    if one.error is None and one.job is not None:
+                        whole = yield from _result(asking, one.job, _name_of(several[wanted[one.index][1]]))
+                    outcomes[one.index] = BatchOutcome(*wanted[one.index], whole, one.error)
+                found = yield from reader.read()
+        return [outcome for _, outcome in sorted(outcomes.items())]
 
     def render(
         self,
@@ -209,7 +176,7 @@ class Calls:
 
     def job(self, job: JobLike) -> Flow[Job]:
         """A job as it is now. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
-        return _one(self._connection.asking(), Job, "GET", f"/jobs/{id_of(job)}")
+        return self._connection.asking().document(Job, "GET", f"/jobs/{id_of(job)}")
 
     def jobs(self, status: str | None = None) -> Flow[list[Job]]:
         """All jobs, newest first."""
@@ -222,7 +189,7 @@ class Calls:
 
     def cancel(self, job: JobLike) -> Flow[Job]:
         """Stop a job; no error if it was stopped before. Raises ServiceError (JOB_FINISHED)."""
-        return _one(self._connection.asking(), Job, "POST", f"/jobs/{id_of(job)}/cancel")
+        return self._connection.asking().document(Job, "POST", f"/jobs/{id_of(job)}/cancel")
 
     def result(self, job: JobLike) -> Flow[Result]:
         """What a registration found. Raises ServiceError: JOB_NOT_READY, or the job's own reason where it failed."""
@@ -235,7 +202,7 @@ class Calls:
 
     def artifact(self, job: JobLike, name: str) -> Flow[bytes]:
         """The bytes of one file of a result. Raises ServiceError (ARTIFACT_NOT_FOUND)."""
-        answer = yield from call(self._connection.asking().patience, "GET", _artifact_address(job, name))
+        answer = yield from self._connection.asking().call("GET", _artifact_address(job, name))
         if not answer.is_success:
             raise refusal(answer)
         return answer.content
@@ -279,7 +246,7 @@ class LibraryCalls:
         notes = EntryNotes.checked(name, tags, unit, note, symmetry)
         asking = self._connection.asking(progress)
         sent = yield from fields.upload(asking, field, "object")
-        return (yield from _one(asking, Entry, "POST", "/library", json=notes.to_dict() | {"field": sent.sha256}))
+        return (yield from asking.document(Entry, "POST", "/library", json=notes.to_dict() | {"field": sent.sha256}))
 
     def entries(self, tag: str | None = None, name: str | None = None) -> Flow[list[Entry]]:
         """Those with the tag, and with ``name`` in their names; the one added last first."""
@@ -288,11 +255,11 @@ class LibraryCalls:
 
     def get(self, name: str) -> Flow[Entry]:
         """Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
-        return _one(self._connection.asking(), Entry, "GET", _entry_address(name))
+        return self._connection.asking().document(Entry, "GET", _entry_address(name))
 
     def change(self, name: str, /, **changes: Any) -> Flow[Entry]:
         """Change name, tags, unit, note or symmetry; None takes one back. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
-        return _one(self._connection.asking(), Entry, "PATCH", _entry_address(name), json=changes)
+        return self._connection.asking().document(Entry, "PATCH", _entry_address(name), json=changes)
 
     def remove(self, name: str) -> Flow[None]:
         """Take an entry out; its field stays. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
@@ -314,36 +281,12 @@ def id_of(job: JobLike) -> str:
     raise InvalidInputError(f"{job!r} names no job", reason="INVALID_JOB", hint=hint)
 
 
-def request_body(
-    detection: BoxLike,
-    options: OptionsLike = None,
-    seed: int = 0,
-    initial_transform: Any = None,
-    more: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """What a registration asks for beside its fields, as it is sent. initial_transform: a T_object_scene, or
-    ``{"T_scene_object": ...}``. Raises InvalidDetectionError and InvalidOptionsError."""
-    body = {
-        "detection": detection_of(detection).canonical(),
-        "options": None if options is None else options_of(options).to_dict(),
-        "seed": seed,
-        "initial_transform": plain(initial_transform),
-        **(more or {}),
-    }
-    return {name: value for name, value in body.items() if value is not None}
-
-
-def plain(value: Any) -> Any:
-    """Arrays and tuples as lists, boxes as detections, transforms as their matrices: what JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(name): plain(part) for name, part in value.items()}
-    if hasattr(value, "to_detection"):
-        return value.to_detection().canonical()
-    if callable(getattr(value, "matrix", None)):
-        return plain(value.matrix())
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+def _registered(
+    asking: Asking, scene: FieldLike, obj: FieldLike | list[FieldLike], body: dict[str, Any]
+) -> Flow[Result]:
+    job = yield from _submit(asking, scene, obj, body)
+    yield from _wait(asking, job)
+    return (yield from _result(asking, job))
 
 
 def _submit(asking: Asking, scene: FieldLike, obj: FieldLike | list[FieldLike], body: dict[str, Any]) -> Flow[Job]:
@@ -365,7 +308,7 @@ def _submit(asking: Asking, scene: FieldLike, obj: FieldLike | list[FieldLike], 
 
 def _post(asking: Asking, address: str, body: Mapping[str, Any]) -> Flow[Job]:
     """The job of a request. One that is sent again, because an answer was lost, starts nothing anew."""
-    return _one(asking, Job, "POST", address, json=body, headers={"Idempotency-Key": uuid4().hex})
+    return asking.document(Job, "POST", address, json=body, headers={"Idempotency-Key": uuid4().hex})
 
 
 def _wait(asking: Asking, job: JobLike) -> Flow[Job]:
@@ -374,7 +317,7 @@ def _wait(asking: Asking, job: JobLike) -> Flow[Job]:
         # who wants no progress is not told of every change: one request lasts for many seconds
         headers: dict[str, str] = {} if etag is None or asking.report is None else {"If-None-Match": etag}
         params = {"wait": deadline.hold_s()}
-        answer = yield from call(asking.patience, "GET", address, params=params, headers=headers)
+        answer = yield from asking.call("GET", address, params=params, headers=headers)
         if answer.status_code != 304:
             found = parsed(Job, checked(answer))
             etag = answer.headers.get("etag")
@@ -382,18 +325,18 @@ def _wait(asking: Asking, job: JobLike) -> Flow[Job]:
             if found.finished:
                 return found.model_copy(update={"sources": _sources(job)})
         deadline.check(f"the job {id_of(job)}")
-        yield from look(asking.watch, asking.patience)
+        yield from asking.look()
 
 
 def _document(asking: Asking, job: JobLike) -> Flow[dict[str, Any]]:
-    return checked((yield from call(asking.patience, "GET", f"/jobs/{id_of(job)}/result")))
+    return checked((yield from asking.call("GET", f"/jobs/{id_of(job)}/result")))
 
 
-def _result(asking: Asking, job: JobLike) -> Flow[Result]:
+def _result(asking: Asking, job: JobLike, source: str | None = None) -> Flow[Result]:
     document, sources = (yield from _document(asking, job)), _sources(job)
     found = parsed(Result, {**document, "job": id_of(job), "document": document})
     if found.candidates is None:
-        return found.model_copy(update={"source": next(iter(sources.values()), None)})
+        return found.model_copy(update={"source": next(iter(sources.values()), source)})
     ranking = [one.model_copy(update={"source": sources.get(one.object)}) for one in found.candidates]
     return found.model_copy(update={"source": sources.get(found.object or ""), "candidates": ranking})
 
@@ -402,22 +345,8 @@ def _sources(job: JobLike) -> dict[str, str]:
     return job.sources if isinstance(job, Job) else {}
 
 
-def _outcome(asking: Asking, pair: tuple[int, int], job: Job | RegnfError) -> Flow[BatchOutcome]:
-    if isinstance(job, RegnfError):
-        return BatchOutcome(*pair, None, job)
-    try:
-        yield from _wait(asking, job)
-        return BatchOutcome(*pair, (yield from _result(asking, job)))
-    except RegnfError as error:
-        return BatchOutcome(*pair, None, error)
-
-
-def _one(asking: Asking, model: type[_Document], method: str, address: str, **how: Any) -> Flow[_Document]:
-    return parsed(model, checked((yield from call(asking.patience, method, address, **how))))
-
-
 def _done(asking: Asking, method: str, address: str) -> Flow[None]:
-    answer = yield from call(asking.patience, method, address)
+    answer = yield from asking.call(method, address)
     if not answer.is_success:
         raise refusal(answer)
 
@@ -427,7 +356,7 @@ def _pages(asking: Asking, what: str, chosen: dict[str, str | None]) -> Flow[lis
     params: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None} | {"limit": _PAGE}
     found: list[dict[str, Any]] = []
     while True:
-        page = checked((yield from call(asking.patience, "GET", f"/{what}", params=params)))
+        page = checked((yield from asking.call("GET", f"/{what}", params=params)))
         found += page[what if what in page else "entries"]
         if page["next_page_token"] is None:
             return found
@@ -437,9 +366,9 @@ def _pages(asking: Asking, what: str, chosen: dict[str, str | None]) -> Flow[lis
 def _download(asking: Asking, address: str, target: Path, sha256: str | None = None) -> Flow[Path]:
     """Raises ServiceError: ARTIFACT_NOT_FOUND, DIGEST_MISMATCH for bytes that are not those of ``sha256``."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(target.name + _PART)
+    part = target.with_name(f"{target.name}.part")
     part.unlink(missing_ok=True)
-    answer = yield from again(asking.patience, Download(address, part))
+    answer = yield from asking.again(Download(address, part))
     if not answer.is_success:
         raise refusal(answer)
     if sha256 is not None and (yield from work(partial(digest_of, part))) != sha256:

@@ -1,27 +1,30 @@
-"""The client that blocks until an answer is there."""
+"""The client that blocks until an answer is there, and the same to be awaited."""
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from functools import update_wrapper
+from types import MethodType
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, overload
 
 import httpx
 
 from regnf_client.answers import refusal, unreachable
 from regnf_client.batches import BatchReader, PairLike, PairResult
-from regnf_client.calls import Calls, JobLike, LibraryCalls, id_of, signed
-from regnf_client.fields import ADDRESS, WORKER_TIMEOUT_S, Connection, Report
+from regnf_client.calls import Calls, JobLike, LibraryCalls, id_of
 from regnf_client.models import Event, EventReader
-from regnf_client.steps import Call, Download, Flow, Patience, Pause, Step
+from regnf_client.steps import ADDRESS, WORKER_TIMEOUT_S, Call, Connection, Download, Flow, Pause, Report, Step, Tries
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
-_Calls = TypeVar("_Calls")
+_Driver = TypeVar("_Driver")
 
 
 class SyncDriver:
-    """Over one HTTP client."""
+    """Performs the steps of flows over one HTTP client."""
 
     def __init__(self, http: httpx.Client) -> None:
         self._http = http
@@ -55,12 +58,9 @@ class SyncDriver:
         return step.do()
 
     def _download(self, step: Download) -> httpx.Response:
-        """Go on behind what the file holds already."""
-        held = step.target.stat().st_size if step.target.exists() else 0
-        headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={held}-"} if held else {})
-        with self._http.stream("GET", step.path, headers=headers) as answer:
+        with self._http.stream("GET", step.path, headers=step.headers()) as answer:
             if answer.is_success:
-                with step.target.open("ab" if answer.status_code == httpx.codes.PARTIAL_CONTENT else "wb") as file:
+                with step.target.open(step.mode(answer)) as file:
                     for block in answer.iter_bytes():
                         file.write(block)
             else:
@@ -68,38 +68,129 @@ class SyncDriver:
             return answer
 
 
-class _Blocking(Generic[_Calls]):
-    """What performs flows of calls."""
+class AsyncDriver:
+    """The same, awaited; what takes time is done in threads."""
 
-    def __init__(self, calls: _Calls, driver: SyncDriver) -> None:
+    def __init__(self, http: httpx.AsyncClient) -> None:
+        self._http = http
+
+    async def run(self, flow: Flow[_T]) -> _T:
+        """What the flow returns."""
+        answer: Any = None
+        try:
+            while True:
+                answer = await self._perform(flow.send(answer))
+        except StopIteration as done:
+            value: _T = done.value
+            return value
+        finally:
+            flow.close()
+
+    async def _perform(self, step: Step) -> Any:
+        if isinstance(step, Pause):
+            return await asyncio.sleep(step.seconds)
+        try:
+            if isinstance(step, Call):
+                return await self._http.request(step.method, step.path, **step.how)
+            if isinstance(step, Download):
+                return await self._download(step)
+        except httpx.RequestError as error:
+            return error
+        return await asyncio.to_thread(step.do)
+
+    async def _download(self, step: Download) -> httpx.Response:
+        async with self._http.stream("GET", step.path, headers=step.headers()) as answer:
+            if answer.is_success:
+                with step.target.open(step.mode(answer)) as file:
+                    async for block in answer.aiter_bytes():
+                        await asyncio.to_thread(file.write, block)
+            else:
+                await answer.aread()
+            return answer
+
+
+class _Performing(Generic[_Driver]):
+    """What performs the flows of calls with a driver."""
+
+    def __init__(self, calls: Any, driver: _Driver) -> None:
         self._calls = calls
         self._driver = driver
 
 
-def blocking(
-    method: Callable[Concatenate[_Calls, _P], Flow[_T]],
-) -> Callable[Concatenate[_Blocking[_Calls], _P], _T]:
-    """A method of a client: the flow, performed. It has the flow's parameters and docstring."""
+class _Method(Generic[_P, _T]):
+    """A flow as a method of both clients, with its parameters and docstring: one returns what it returns, the other
+    something to be awaited."""
 
-    @signed(method)
-    def performed(self: _Blocking[_Calls], /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return self._driver.run(method(self._calls, *args, **kwargs))
+    def __init__(self, flow: Callable[Concatenate[Any, _P], Flow[_T]]) -> None:
+        self._flow = flow
+        signature = inspect.signature(flow)
+        returned = str(signature.return_annotation).removeprefix("Flow[").removesuffix("]")
+        self.__signature__ = signature.replace(return_annotation=returned)
+        update_wrapper(self, flow)
 
-    return performed
+    @overload
+    def __get__(self, client: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, client: _Performing[SyncDriver], owner: type) -> Callable[_P, _T]: ...
+    @overload
+    def __get__(self, client: _Performing[AsyncDriver], owner: type) -> Callable[_P, Coroutine[Any, Any, _T]]: ...
+    def __get__(self, client: _Performing[Any] | None, owner: type) -> Any:
+        return self if client is None else MethodType(self, client)
+
+    def __call__(self, client: _Performing[Any], /, *args: _P.args, **kwargs: _P.kwargs) -> Any:
+        return client._driver.run(self._flow(client._calls, *args, **kwargs))
 
 
-class Library(_Blocking[LibraryCalls]):
+class _Library(_Performing[_Driver]):
+    add = _Method(LibraryCalls.add)
+    entries = _Method(LibraryCalls.entries)
+    get = _Method(LibraryCalls.get)
+    change = _Method(LibraryCalls.change)
+    remove = _Method(LibraryCalls.remove)
+    download = _Method(LibraryCalls.download)
+
+
+class Library(_Library[SyncDriver]):
     """Objects by name. An ``Entry`` may be given wherever a field may."""
 
-    add = blocking(LibraryCalls.add)
-    entries = blocking(LibraryCalls.entries)
-    get = blocking(LibraryCalls.get)
-    change = blocking(LibraryCalls.change)
-    remove = blocking(LibraryCalls.remove)
-    download = blocking(LibraryCalls.download)
+
+class AsyncLibrary(_Library[AsyncDriver]):
+    """The same, to be awaited."""
 
 
-class Client(_Blocking[Calls]):
+class _Client(_Performing[_Driver]):
+    """What both clients have."""
+
+    def __init__(self, connection: Connection, driver: _Driver) -> None:
+        super().__init__(Calls(connection), driver)
+        self._connection = connection
+
+    @property
+    def address(self) -> str:
+        """Of the service."""
+        return self._connection.address.rstrip("/")
+
+    upload = _Method(Calls.upload)
+    field = _Method(Calls.field)
+    fields = _Method(Calls.fields)
+    delete_field = _Method(Calls.delete_field)
+    register = _Method(Calls.register)
+    submit = _Method(Calls.submit)
+    search = _Method(Calls.search)
+    register_batch = _Method(Calls.register_batch)
+    render = _Method(Calls.render)
+    job = _Method(Calls.job)
+    jobs = _Method(Calls.jobs)
+    wait = _Method(Calls.wait)
+    cancel = _Method(Calls.cancel)
+    result = _Method(Calls.result)
+    rendering = _Method(Calls.rendering)
+    artifact = _Method(Calls.artifact)
+    download = _Method(Calls.download)
+    save = _Method(Calls.save)
+
+
+class Client(_Client[SyncDriver]):
     """A regnf service.
 
     Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects. A
@@ -120,9 +211,9 @@ class Client(_Blocking[Calls]):
     ) -> None:
         """token: None takes that of the environment variable REGNF_API_TOKEN, if it is set. worker_timeout_s: how long
         to wait while the service has no worker; None: for ever. transport: of httpx, for proxies and tests."""
-        self._connection = Connection(address, token, retries, worker_timeout_s)
-        self._http = httpx.Client(transport=transport, **self._connection.http_options())
-        super().__init__(Calls(self._connection), SyncDriver(self._http))
+        connection = Connection(address, token, retries, worker_timeout_s)
+        self._http = httpx.Client(transport=transport, **connection.http_options())
+        super().__init__(connection, SyncDriver(self._http))
 
     def __enter__(self) -> Client:
         return self
@@ -135,33 +226,9 @@ class Client(_Blocking[Calls]):
         self._http.close()
 
     @property
-    def address(self) -> str:
-        """Of the service."""
-        return self._connection.address.rstrip("/")
-
-    @property
     def library(self) -> Library:
         """Objects by name, with tags."""
         return Library(LibraryCalls(self._connection), self._driver)
-
-    upload = blocking(Calls.upload)
-    field = blocking(Calls.field)
-    fields = blocking(Calls.fields)
-    delete_field = blocking(Calls.delete_field)
-    register = blocking(Calls.register)
-    submit = blocking(Calls.submit)
-    search = blocking(Calls.search)
-    register_batch = blocking(Calls.register_batch)
-    render = blocking(Calls.render)
-    job = blocking(Calls.job)
-    jobs = blocking(Calls.jobs)
-    wait = blocking(Calls.wait)
-    cancel = blocking(Calls.cancel)
-    result = blocking(Calls.result)
-    rendering = blocking(Calls.rendering)
-    artifact = blocking(Calls.artifact)
-    download = blocking(Calls.download)
-    save = blocking(Calls.save)
 
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
@@ -179,7 +246,7 @@ class Client(_Blocking[Calls]):
 
     def watch(self, job: JobLike) -> Iterator[Event]:
         """A job's events as they come, until it has finished; a broken stream goes on where it stopped."""
-        reader, tries = EventReader(), Patience(retries=self._connection.retries).tries()
+        reader, tries = EventReader(), Tries(self._connection.retries)
         while not reader.ended:
             try:
                 with self._http.stream("GET", f"/jobs/{id_of(job)}/events", headers=reader.headers()) as answer:
@@ -197,3 +264,68 @@ class Client(_Blocking[Calls]):
                 if wait_s is None:
                     raise unreachable(error) from error
                 self._driver.sleep(wait_s)
+
+
+class AsyncClient(_Client[AsyncDriver]):
+    """The same as ``Client``, to be awaited. Files are read and hashed in threads."""
+
+    def __init__(
+        self,
+        address: str = ADDRESS,
+        token: str | None = None,
+        *,
+        retries: int = 4,
+        worker_timeout_s: float | None = WORKER_TIMEOUT_S,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        connection = Connection(address, token, retries, worker_timeout_s)
+        self._http = httpx.AsyncClient(transport=transport, **connection.http_options())
+        super().__init__(connection, AsyncDriver(self._http))
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._http.aclose()
+
+    @property
+    def library(self) -> AsyncLibrary:
+        """Objects by name, with tags."""
+        return AsyncLibrary(LibraryCalls(self._connection), self._driver)
+
+    async def batch(
+        self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
+    ) -> AsyncIterator[PairResult]:
+        """As ``Client.batch``."""
+        asking = self._connection.asking(progress, timeout_s)
+        reader = BatchReader(asking, requests, asking.deadline())
+        while (found := await self._driver.run(reader.post())) is not None:
+            while found is not None:
+                for one in found:
+                    yield one
+                found = await self._driver.run(reader.read())
+
+    async def watch(self, job: JobLike) -> AsyncIterator[Event]:
+        """As ``Client.watch``."""
+        reader, tries = EventReader(), Tries(self._connection.retries)
+        while not reader.ended:
+            try:
+                async with self._http.stream("GET", f"/jobs/{id_of(job)}/events", headers=reader.headers()) as answer:
+                    if answer.status_code == httpx.codes.NO_CONTENT:
+                        return
+                    if not answer.is_success:
+                        await answer.aread()
+                        raise refusal(answer)
+                    reader.connected()
+                    async for line in answer.aiter_lines():
+                        if (event := reader.take(line)) is not None:
+                            yield event
+            except httpx.RequestError as error:
+                wait_s = tries.wait_s(error)
+                if wait_s is None:
+                    raise unreachable(error) from error
+                await asyncio.sleep(wait_s)

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import random
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -13,84 +15,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
+from pydantic import BaseModel
 
-from regnf_client.answers import NoWorkerError, unreachable
-
-# When a request is sent again, and after how long.
-
-_PASSING = frozenset(
-    {"RATE_LIMITED", "TOO_MANY_WRITES", "TOO_MANY_REQUESTS_AT_ONCE", "TOO_MANY_UPLOADS", "ARTIFACT_NOT_READY"}
+from regnf_client.answers import (
+    NoWorkerError,
+    WaitTimeoutError,
+    checked,
+    checked_address,
+    checked_token,
+    object_of,
+    parsed,
+    unreachable,
 )
-"""Refusals that time mends by itself. Quotas are told at once: they may last for hours."""
-_PASSING_STATUSES = frozenset({409, 429})
-_AWAY = frozenset({502, 503, 504})
-_SPREAD = 2.0
-"""So that many that were refused together do not ask together ever after."""
-
-
-@dataclass(frozen=True)
-class Patience:
-    """total_s: the most seconds that the service's own `Retry-After` may cost one request · retries: how often it is
-    sent again after a broken connection or a 502, 503, 504 · first_s: the pause before the first of these; each one is
-    twice as long as the one before."""
-
-    total_s: float = 120.0
-    retries: int = 4
-    first_s: float = 0.25
-
-    def tries(self) -> Tries:
-        """Of one request."""
-        return Tries(self)
-
-
-class Tries:
-    """What is left of the patience for one request."""
-
-    def __init__(self, patience: Patience) -> None:
-        self._left_s = patience.total_s
-        self._retries = patience.retries
-        self._next_s = patience.first_s
-
-    def wait_s(self, answer: httpx.Response | httpx.RequestError) -> float | None:
-        """How long to wait before the same is asked again; None if that is of no use any more."""
-        if isinstance(answer, httpx.Response):
-            after = _retry_after_s(answer)
-            if answer.status_code in _PASSING_STATUSES:
-                return None if after is None or _reason(answer) not in _PASSING else self._spend(after)
-            if answer.status_code not in _AWAY:
-                return None
-        else:
-            after = None
-            if not isinstance(answer, httpx.TransportError) or isinstance(answer, httpx.UnsupportedProtocol):
-                return None
-        if self._retries <= 0:
-            return None
-        self._retries -= 1
-        wait_s, self._next_s = self._next_s, 2 * self._next_s
-        return self._spend(max(wait_s / _SPREAD, after or 0.0))
-
-    def _spend(self, seconds: float) -> float | None:
-        wait_s = seconds * random.uniform(1.0, _SPREAD)  # noqa: S311
-        if wait_s > self._left_s:
-            return None
-        self._left_s -= wait_s
-        return wait_s
-
-
-def _retry_after_s(answer: httpx.Response) -> float | None:
-    text = answer.headers.get("retry-after", "")
-    return float(text) if text.isascii() and text.isdecimal() else None
-
-
-def _reason(answer: httpx.Response) -> str | None:
-    try:
-        problem = answer.json()
-    except ValueError:
-        return None
-    return problem.get("reason") if isinstance(problem, dict) else None
-
 
 _T = TypeVar("_T")
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 @dataclass(frozen=True)
@@ -123,31 +62,18 @@ class Download:
     path: str
     target: Path
 
+    def headers(self) -> dict[str, str]:
+        """Of the request: it goes on behind what the file holds already."""
+        held = self.target.stat().st_size if self.target.exists() else 0
+        return {"Accept-Encoding": "identity"} | ({"Range": f"bytes={held}-"} if held else {})
+
+    def mode(self, answer: httpx.Response) -> str:
+        """How the file is opened for this answer."""
+        return "ab" if answer.status_code == httpx.codes.PARTIAL_CONTENT else "wb"
+
 
 Step = Call | Pause | Work | Download
 Flow = Generator[Step, Any, _T]
-
-
-def call(patience: Patience, method: str, path: str, **how: Any) -> Flow[httpx.Response]:
-    """The answer to a request, which is sent again while that may help. Raises UnreachableError.
-
-    Every request of the interface may be sent again: the same upload is the same field, the same request the same job.
-    """
-    return (yield from again(patience, Call(method, path, how)))
-
-
-def again(patience: Patience, step: Call | Download) -> Flow[httpx.Response]:
-    """The answer to a step that asks the service, done again while that may help. Raises UnreachableError."""
-    tries = patience.tries()
-    while True:
-        answer: httpx.Response | httpx.RequestError = yield step
-        wait_s = tries.wait_s(answer)
-        if wait_s is not None:
-            yield Pause(wait_s)
-        elif isinstance(answer, httpx.RequestError):
-            raise unreachable(answer) from answer
-        else:
-            return answer
 
 
 def work(do: Callable[[], _T]) -> Flow[_T]:
@@ -156,9 +82,63 @@ def work(do: Callable[[], _T]) -> Flow[_T]:
     return done
 
 
-# Stop waiting for a service that has no worker.
+# When a request is sent again, and after how long.
+
+_PASSING = frozenset({"RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE", "ARTIFACT_NOT_READY"})
+"""Refusals that time mends by itself. Quotas are told at once: they may last for hours."""
+_PATIENCE_S = 120.0
+"""The most that the service's own `Retry-After` may cost one request."""
+_FIRST_PAUSE_S = 0.25
+"""After a broken connection; each further pause is twice as long."""
+_SPREAD = 2.0
+"""So that many that were refused together do not ask together ever after."""
+
+
+class Tries:
+    """What is left of the patience for one request, which is sent again ``retries`` times after a broken connection or
+    a 502, 503, 504."""
+
+    def __init__(self, retries: int) -> None:
+        self._left_s = _PATIENCE_S
+        self._retries = retries
+        self._next_s = _FIRST_PAUSE_S
+
+    def wait_s(self, answer: httpx.Response | httpx.RequestError) -> float | None:
+        """How long to wait before the same is asked again; None if that is of no use any more."""
+        after = None
+        if isinstance(answer, httpx.Response):
+            after = retry_after_s(answer)
+            if answer.status_code in (409, 429):
+                passing = after is not None and (object_of(answer) or {}).get("reason") in _PASSING
+                return self._spend(after or 0.0) if passing else None
+            if answer.status_code not in (502, 503, 504):
+                return None
+        elif not isinstance(answer, httpx.TransportError) or isinstance(answer, httpx.UnsupportedProtocol):
+            return None
+        if self._retries <= 0:
+            return None
+        self._retries -= 1
+        wait_s, self._next_s = self._next_s, 2 * self._next_s
+        return self._spend(max(wait_s / _SPREAD, after or 0.0))
+
+    def _spend(self, seconds: float) -> float | None:
+        wait_s = seconds * random.uniform(1.0, _SPREAD)  # noqa: S311
+        if wait_s > self._left_s:
+            return None
+        self._left_s -= wait_s
+        return wait_s
+
+
+def retry_after_s(answer: httpx.Response) -> float | None:
+    """What the service asks to wait."""
+    text = answer.headers.get("retry-after", "")
+    return float(text) if text.isascii() and text.isdecimal() else None
+
+
+# Stop waiting: for a service that has no worker, and after the time that the caller gave.
 
 _LOOK_EVERY_S = 5.0
+_HOLD_S = 20
 
 
 class WorkerWatch:
@@ -195,22 +175,105 @@ class WorkerWatch:
         self._next_look = min(self._next_look, self._missing_since + self._limit_s)
 
 
-def look(watch: WorkerWatch, patience: Patience) -> Flow[None]:
-    """Ask the service for its worker, if a look is due. Raises NoWorkerError."""
-    if not watch.due:
-        return
-    # 503 is what a service without a worker answers, and no reason to ask again
-    answer = yield from call(Patience(patience.total_s, retries=0), "GET", "/readyz")
-    try:
-        document = answer.json()
-    except ValueError:
-        document = None
-    watch.saw(worker_lives(document))
+class Deadline:
+    """When a wait ends. None: never."""
+
+    def __init__(self, timeout_s: float | None) -> None:
+        self._timeout_s = timeout_s
+        self._end = math.inf if timeout_s is None else time.monotonic() + timeout_s
+
+    def hold_s(self) -> int:
+        """For how long the service may hold one answer."""
+        left_s = self._end - time.monotonic()
+        return _HOLD_S if left_s >= _HOLD_S else max(0, math.ceil(left_s))
+
+    def check(self, what: str) -> None:
+        """Raises WaitTimeoutError once the time is over. what: is waited for."""
+        if time.monotonic() >= self._end:
+            hint = "It goes on: the same call finds it again. Give a larger timeout_s, or None."
+            raise WaitTimeoutError(f"{what} has not ended within {self._timeout_s:g} s", hint=hint)
 
 
-def worker_lives(readiness: Any) -> bool:
-    """Whether this answer of /readyz tells of a live worker; one that says nothing of it is taken to have one."""
-    try:
-        return readiness["checks"]["worker"] is not False
-    except (KeyError, TypeError):
-        return True
+# What both clients are made of.
+
+ADDRESS = "http://127.0.0.1:8080"
+WORKER_TIMEOUT_S = 60.0
+_AROUND = "\ufeff \t\r\n"
+"""What a shell keeps of a file that Windows wrote."""
+_TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+Report = Callable[[str, float], None]
+"""Called with a phase and the share of it that is done, 0..1."""
+
+
+@dataclass(frozen=True)
+class Asking:
+    """How one call of a method asks. timeout_s: the most that a wait may take; None: any time."""
+
+    retries: int
+    watch: WorkerWatch
+    report: Report | None = None
+    timeout_s: float | None = None
+
+    def tell(self, phase: str, share: float) -> None:
+        """Report to the caller, who may not want to know."""
+        if self.report is not None:
+            self.report(phase, share)
+
+    def deadline(self) -> Deadline:
+        """Of a wait that begins now."""
+        return Deadline(self.timeout_s)
+
+    def call(self, method: str, path: str, **how: Any) -> Flow[httpx.Response]:
+        """The answer to a request, which is sent again while that may help. Raises UnreachableError.
+
+        Every request of the interface may be sent again: the same upload is the same field, the same request the same
+        job.
+        """
+        return self.again(Call(method, path, how))
+
+    def again(self, step: Call | Download, retries: int | None = None) -> Flow[httpx.Response]:
+        """The answer to a step that asks the service, done again while that may help. Raises UnreachableError."""
+        tries = Tries(self.retries if retries is None else retries)
+        while True:
+            answer: httpx.Response | httpx.RequestError = yield step
+            wait_s = tries.wait_s(answer)
+            if wait_s is not None:
+                yield Pause(wait_s)
+            elif isinstance(answer, httpx.RequestError):
+                raise unreachable(answer) from answer
+            else:
+                return answer
+
+    def document(self, model: type[_Model], method: str, path: str, **how: Any) -> Flow[_Model]:
+        """The model that a good answer is. Raises ServiceError too."""
+        return parsed(model, checked((yield from self.call(method, path, **how))))
+
+    def look(self) -> Flow[None]:
+        """Ask the service for its worker, if a look is due. Raises NoWorkerError."""
+        if self.watch.due:
+            # 503 is what a service without a worker answers, and no reason to ask again
+            answer = yield from self.again(Call("GET", "/readyz"), retries=0)
+            checks = (object_of(answer) or {}).get("checks")
+            # one that says nothing of its worker is taken to have one
+            self.watch.saw(not (isinstance(checks, Mapping) and checks.get("worker") is False))
+
+
+@dataclass(frozen=True)
+class Connection:
+    """Address, token and manners of a client."""
+
+    address: str
+    token: str | None
+    retries: int
+    worker_timeout_s: float | None
+
+    def http_options(self) -> dict[str, Any]:
+        """Of httpx's clients. Raises InvalidInputError (INVALID_ADDRESS, INVALID_TOKEN)."""
+        checked_address(self.address)
+        token = self.token if self.token is not None else os.environ.get("REGNF_API_TOKEN")
+        headers = {"Authorization": f"Bearer {checked_token(token.strip(_AROUND))}"} if token else {}
+        return {"base_url": self.address.rstrip("/"), "headers": headers, "timeout": _TIMEOUT}
+
+    def asking(self, report: Report | None = None, timeout_s: float | None = None) -> Asking:
+        """For one call of a method."""
+        return Asking(self.retries, WorkerWatch(self.worker_timeout_s), report, timeout_s)

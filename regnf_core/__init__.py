@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 from regnf_core.version import __version__
 
 if TYPE_CHECKING:
-    from regnf_core.api import BatchOutcome, Registered, Search, compose, register, register_batch, render, search
+    from regnf_core.api import Registered, Search, compose, register, register_batch, render, search
+    from regnf_core.batch import BatchOutcome
     from regnf_core.document import RegistrationResult
     from regnf_core.editing.edits import Insertion, Removal, Replacement, Substitution
     from regnf_core.errors import RegnfError
@@ -29,65 +30,29 @@ if TYPE_CHECKING:
     from regnf_core.options import RegistrationOptions
     from regnf_core.rendering.camera import Camera
     from regnf_core.rendering.request import RenderOptions
-    from regnf_core.robust.pipeline import WarmStart
 
-_HOMES = {
-    "BatchOutcome": "regnf_core.api",
-    "Camera": "regnf_core.rendering.camera",
-    "FieldWarning": "regnf_core.in_memory",
-    "Insertion": "regnf_core.editing.edits",
-    "OrientedBox": "regnf_core.geometry.box",
-    "Registered": "regnf_core.api",
-    "RegistrationOptions": "regnf_core.options",
-    "RegistrationResult": "regnf_core.document",
-    "RegnfError": "regnf_core.errors",
-    "Removal": "regnf_core.editing.edits",
-    "RenderOptions": "regnf_core.rendering.request",
-    "Replacement": "regnf_core.editing.edits",
-    "SdfField": "regnf_core.fields.observation",
-    "Search": "regnf_core.api",
-    "Sim3": "regnf_core.geometry.sim3",
-    "Substitution": "regnf_core.editing.edits",
-    "WarmStart": "regnf_core.robust.pipeline",
-    "compose": "regnf_core.api",
-    **dict.fromkeys(("from_function", "from_grid", "from_mesh", "from_points"), "regnf_core.in_memory"),
-    "open_field": "regnf_core.loading",
-    "register": "regnf_core.api",
-    "register_batch": "regnf_core.api",
-    "render": "regnf_core.api",
-    "search": "regnf_core.api",
+_NAMES = {
+    "api": ("Registered", "Search", "compose", "register", "register_batch", "render", "search"),
+    "batch": ("BatchOutcome",),
+    "document": ("RegistrationResult",),
+    "editing.edits": ("Insertion", "Removal", "Replacement", "Substitution"),
+    "errors": ("RegnfError",),
+    "fields.observation": ("SdfField",),
+    "geometry.box": ("OrientedBox",),
+    "geometry.sim3": ("Sim3",),
+    "in_memory": ("FieldWarning", "from_function", "from_grid", "from_mesh", "from_points"),
+    "loading": ("open_field",),
+    "options": ("RegistrationOptions",),
+    "rendering.camera": ("Camera",),
+    "rendering.request": ("RenderOptions",),
 }
-
+_HOMES = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names}
 __all__ = [
-    "BatchOutcome",
-    "Camera",
-    "FieldWarning",
-    "Insertion",
-    "OrientedBox",
-    "Registered",
-    "RegistrationOptions",
-    "RegistrationResult",
-    "RegnfError",
-    "Removal",
-    "RenderOptions",
-    "Replacement",
-    "SdfField",
-    "Search",
-    "Sim3",
-    "Substitution",
-    "WarmStart",
-    "__version__",
-    "compose",
-    "from_function",
-    "from_grid",
-    "from_mesh",
-    "from_points",
-    "open_field",
-    "register",
-    "register_batch",
-    "render",
-    "search",
-]
+    "BatchOutcome", "Camera", "FieldWarning", "Insertion", "OrientedBox", "Registered", "RegistrationOptions",
+    "RegistrationResult", "RegnfError", "Removal", "RenderOptions", "Replacement", "SdfField", "Search", "Sim3",
+    "Substitution", "__version__", "compose", "from_function", "from_grid", "from_mesh", "from_points", "open_field",
+    "register", "register_batch", "render", "search",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> object:

@@ -8,17 +8,18 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 import regnf_core.batch as engine_batch
 import regnf_core.library as engine
-from regnf_core.batch import ModeledObject
+from regnf_core.batch import BatchOutcome, ModeledObject
 from regnf_core.detections.parsing import BoxLike, detection_of
 from regnf_core.document import Candidate, ProgressCallback, RegistrationResult, result_document
 from regnf_core.editing.compose import compose as engine_compose
@@ -29,16 +30,16 @@ from regnf_core.errors import (
     InvalidInputError,
     InvalidOptionsError,
     NoSurfaceError,
-    RegnfError,
     filled_folder,
     verdict_in_words,
 )
 from regnf_core.field_files import library_files, require_file
 from regnf_core.field_notes import FieldNotes
-from regnf_core.field_source import FieldSource, Role, find_source
+from regnf_core.field_source import Role, find_source
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import uncertainty
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.in_memory import FieldWarning, HasGeometry, HasPoints, HasVertices, field_of
 from regnf_core.library import LibraryObject, model_object, search_library
 from regnf_core.loading import import_smallest_first, load_field
@@ -48,7 +49,7 @@ from regnf_core.pairs import pairs_of
 from regnf_core.rendering.camera import Camera, Frame
 from regnf_core.rendering.render import render as engine_render
 from regnf_core.rendering.request import RenderOptions
-from regnf_core.robust.pipeline import WarmStart
+from regnf_core.robust.model import ObjectModel
 from regnf_core.texts import json_value
 from regnf_core.viewing.artifacts import write_artifacts
 from regnf_core.viewing.recording import write_recording
@@ -87,22 +88,12 @@ def opened(field: FieldLike, role: Role | None = None) -> Opened:
 def opened_pair(scene: FieldLike, obj: FieldLike) -> tuple[Opened, Opened]:
     """Both; what is refused is refused before a large file is imported. Raises what ``open_field`` does."""
     given: dict[Role, FieldLike] = {"scene": scene, "object": obj}
-    sources = {
-        role: find_source(Path(one), role=role) for role, one in given.items() if isinstance(one, str | os.PathLike)
-    }
-    found = {role: opened(one, role) for role, one in given.items() if role not in sources}
-    import_smallest_first(sources.values())
-    for role in sources:
-        found[role] = opened(given[role], role)
+    paths: dict[Role, Path] = {role: Path(one) for role, one in given.items() if isinstance(one, str | os.PathLike)}
+    sources = [find_source(path, role=role) for role, path in paths.items()]
+    found = {role: opened(one, role) for role, one in given.items() if role not in paths}
+    import_smallest_first(sources)
+    found |= {role: opened(given[role], role) for role in paths}
     return found["scene"], found["object"]
-
-
-def opened_several(fields: Sequence[FieldLike], role: Role) -> list[Opened]:
-    """The same for a list. Raises InvalidInputError (NO_FIELD) for what is no list."""
-    if isinstance(fields, str | os.PathLike | SdfField) or not isinstance(fields, Sequence):
-        message = f"the {role}s are a {type(fields).__name__}, expected a list"
-        raise InvalidInputError(message, reason="NO_FIELD", hint=f"Write a list: [{role}].")
-    return [opened(one, role) for one in fields]
 
 
 def notes_of(scene: Opened, obj: Opened) -> dict[str, FieldNotes] | None:
@@ -250,16 +241,6 @@ class Registered(RegistrationResult):
 # ``register`` and ``register_batch`` as users call them.
 
 
-@dataclass(frozen=True)
-class BatchOutcome:
-    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
-
-    detection: int
-    object: int
-    result: Registered | None
-    error: RegnfError | None = None
-
-
 def register(
     scene: FieldLike,
     obj: FieldLike,
@@ -267,7 +248,8 @@ def register(
     options: OptionsLike = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
-    warm_start: WarmStart | None = None,
+    initial_transform: Sim3 | ArrayLike | None = None,
+    object_model: ObjectModel | None = None,
     clouds: bool = True,
 ) -> Registered:
     """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
@@ -275,15 +257,19 @@ def register(
     scene, obj: fields, their paths, or meshes of trimesh or Open3D · detection: a box of regnf or Open3D, two corners,
     a detection's JSON, or the path of its file ·
     options: RegistrationOptions, or a dictionary of those that are not to have their defaults · progress: called with
-    the phase and the overall share done, 0..1 · warm_start: a pose to try first, and the object's model · clouds: False
-    saves time when nothing is drawn or saved.
+    the phase and the overall share done, 0..1 · initial_transform: a T_object_scene to try first, a Sim3 or a 4x4
+    matrix · object_model: what ``model_object`` made of the object earlier · clouds: False saves time when nothing is
+    drawn or saved.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidOptionsError, InvalidDetectionError, FieldFormatError, InvalidInputError (NO_FIELD, FILE_NOT_FOUND,
     FIELD_NOT_FINITE), NoSurfaceError, InitializationError.
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
+    if initial_transform is not None and not isinstance(initial_transform, Sim3):
+        initial_transform = Sim3.from_matrix(torch.as_tensor(initial_transform))
     place, thing = opened_pair(scene, obj)
-    result = engine.register(place.field, thing.field, box, chosen, seed, progress, warm_start, clouds)
+    start = initial_transform, object_model
+    result = engine.register(place.field, thing.field, box, chosen, seed, progress, *start, clouds)
     return Registered.of(result, thing.name, notes_of(place, thing), box)
 
 
@@ -296,19 +282,27 @@ def register_batch(
     seed: int = 0,
     progress: ProgressCallback | None = None,
     clouds: bool = True,
-) -> list[BatchOutcome]:
+) -> list[BatchOutcome[Registered]]:
     """Register pairs of detection and object, by their numbers (None: each with each), by the preset `robust`.
 
     What they share is made once; a pair that fails does not stop the others. Arguments as of ``register``.
     Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN, NO_FIELD).
     """
-    chosen, boxes, seed = options_of(options), [box_of(one) for one in _several(detections)], seed_of(seed)
+    if isinstance(detections, OrientedBox | str | os.PathLike) or not isinstance(detections, Sequence):
+        raise InvalidDetectionError("the detections are one box, expected a list", hint="Write a list: [box].")
+    chosen, boxes, seed = options_of(options), [box_of(one) for one in detections], seed_of(seed)
     pairs_of(pairs, len(boxes), len(objects))  # before any field is opened
     place = opened(scene, "scene")
-    fields = [one if isinstance(one, ModeledObject) else opened_several([one], "object")[0] for one in objects]
+    fields = [one if isinstance(one, ModeledObject) else opened(one, "object") for one in objects]
     plain = [one.field if isinstance(one, Opened) else one for one in fields]
-    found = engine_batch.register_batch(place.field, boxes, plain, pairs, chosen, seed, progress, clouds)
-    return [_outcome(one, place, fields[one.object], boxes[one.detection]) for one in found]
+    outcomes = []
+    for one in engine_batch.register_batch(place.field, boxes, plain, pairs, chosen, seed, progress, clouds):
+        obj, result = fields[one.object], None
+        known = obj if isinstance(obj, Opened) else Opened(obj.field)
+        if one.result is not None:
+            result = Registered.of(one.result, known.name, notes_of(place, known), boxes[one.detection])
+        outcomes.append(BatchOutcome(one.detection, one.object, result, one.error))
+    return outcomes
 
 
 def box_of(detection: BoxLike) -> OrientedBox:
@@ -317,22 +311,6 @@ def box_of(detection: BoxLike) -> OrientedBox:
         require_file(Path(detection))
         return OrientedBox.from_dict(json_value(Path(detection).read_bytes(), f"detection {detection}: "))
     return detection if isinstance(detection, OrientedBox) else OrientedBox.from_detection(detection_of(detection))
-
-
-def _several(detections: Sequence[BoxLike]) -> Sequence[BoxLike]:
-    if isinstance(detections, OrientedBox | str | os.PathLike) or not isinstance(detections, Sequence):
-        raise InvalidDetectionError("the detections are one box, expected a list", hint="Write a list: [box].")
-    return detections
-
-
-def _outcome(
-    one: engine_batch.BatchOutcome, scene: Opened, obj: Opened | ModeledObject, detection: OrientedBox
-) -> BatchOutcome:
-    if one.result is None:
-        return BatchOutcome(one.detection, one.object, None, one.error)
-    known = obj if isinstance(obj, Opened) else Opened(obj.field)
-    result = Registered.of(one.result, known.name, notes_of(scene, known), detection)
-    return BatchOutcome(one.detection, one.object, result)
 
 
 # ``search`` as users call it: which of several objects a detection shows.
@@ -367,18 +345,16 @@ def search(
 
     An object's model is made once and kept in the user's cache, for objects that are given by their paths. Other
     arguments as of ``register``. Raises InvalidInputError (LIBRARY_EMPTY), InvalidOptionsError
-    (LIBRARY_SEARCH_UNSUPPORTED), NoSurfaceError, and what ``register`` raises.
+    (PRESET_UNSUITABLE), NoSurfaceError, and what ``register`` raises.
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
-    chosen.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
+    chosen.require_robust("searches a library", reason="PRESET_UNSUITABLE")
     named = _named(objects)
-    given: list[tuple[FieldLike | LibraryObject, Role]] = [
-        (scene, "scene"),
-        *((one, "object") for one in named.values()),
-    ]
-    import_smallest_first(
-        find_source(Path(one), role=role) for one, role in given if isinstance(one, str | os.PathLike)
-    )
+    paths = [one for one in named.values() if isinstance(one, str | os.PathLike)]
+    sources = [find_source(Path(one), role="object") for one in paths]
+    if isinstance(scene, str | os.PathLike):
+        sources.append(find_source(Path(scene), role="scene"))
+    import_smallest_first(sources)
     place = opened(scene, "scene")
     library, unusable = [], {}
     for name, one in named.items():
@@ -401,7 +377,10 @@ def _named(objects: Objects) -> dict[str, FieldLike | LibraryObject]:
     if isinstance(objects, Mapping):
         named: dict[str, FieldLike | LibraryObject] = dict(objects)
     elif isinstance(objects, Sequence):
-        named = {_name(one, number): one for number, one in enumerate(objects)}
+        named = {}
+        for number, one in enumerate(objects):
+            name = one.name if isinstance(one, LibraryObject) else f"object {number}"
+            named[str(one) if isinstance(one, str | os.PathLike) else name] = one
     else:
         hint = "Give a folder, a list of fields or paths, or a dictionary of them by name."
         raise InvalidInputError(f"the objects are a {type(objects).__name__}", reason="NO_FIELD", hint=hint)
@@ -410,24 +389,14 @@ def _named(objects: Objects) -> dict[str, FieldLike | LibraryObject]:
     return named
 
 
-def _name(one: FieldLike | LibraryObject, number: int) -> str:
-    if isinstance(one, LibraryObject):
-        return one.name
-    return str(one) if isinstance(one, str | os.PathLike) else f"object {number}"
-
-
 def _modeled(name: str, one: FieldLike | LibraryObject, options: RobustOptions) -> LibraryObject:
     if isinstance(one, LibraryObject):
         return one
     if isinstance(one, str | os.PathLike):
         source = find_source(Path(one), role="object")
-        return LibraryObject(name, partial(_field_of, source), object_model(source, options))
+        return LibraryObject(name, lambda: load_field(source).field, object_model(source, options))
     field = opened(one, "object").field
     return LibraryObject(name, lambda: field, model_object(field, options))
-
-
-def _field_of(source: FieldSource) -> SdfField:
-    return load_field(source).field
 
 
 # ``render`` and ``compose`` as users call them.
@@ -446,7 +415,7 @@ def render(
 
     options: RenderOptions, or a dictionary of those that are not to have their defaults. ``cancelled`` is asked before
     each tile; CancelledError is raised once it says so.
-    Raises InvalidInputError: NO_FIELD, CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and
+    Raises InvalidInputError: NO_FIELD, CAMERA_INVALID, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and
     NoSurfaceError (NO_SURFACE_IN_SCENE).
     """
     chosen = _render_options(options)
@@ -458,7 +427,7 @@ def compose(
 ) -> EditedScene:
     """The scene, or that at a path, with all edits done: a field as any other. See docs/editing.md.
 
-    Raises InvalidInputError: NO_FIELD, INVALID_TRANSFORM, EDIT_INVALID, EDITS_OVERLAP, EDIT_OUTSIDE_SCENE; and
+    Raises InvalidInputError: NO_FIELD, INVALID_TRANSFORM, EDIT_INVALID; and
     NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
     if not isinstance(edits, Sequence):

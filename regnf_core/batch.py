@@ -7,21 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Generic, TypeVar
 
-from regnf_core.document import Phase, ProgressCallback, RegistrationResult, Run
+from regnf_core.document import Phase, ProgressCallback, RegistrationResult
 from regnf_core.errors import CancelledError, RegnfError
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.pairs import pairs_of
+from regnf_core.progress import Run
 from regnf_core.robust.model import ObjectModel, model_object
-from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
-from regnf_core.robust.scene import SceneView, view_scene
+from regnf_core.robust.pipeline import cloud_region, register_robust
+from regnf_core.robust.scene import view_scene
 from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
 
-_T = TypeVar("_T")
+T = TypeVar("T")
+Result = TypeVar("Result", bound=RegistrationResult)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +35,12 @@ class ModeledObject:
 
 
 @dataclass(frozen=True)
-class BatchOutcome:
-    """A result, or the error that the registration of this pair raised."""
+class BatchOutcome(Generic[Result]):
+    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
 
     detection: int
     object: int
-    result: RegistrationResult | None
+    result: Result | None
     error: RegnfError | None = None
 
 
@@ -51,7 +53,7 @@ def register_batch(
     seed: int = 0,
     progress: ProgressCallback | None = None,
     clouds: bool = True,
-) -> list[BatchOutcome]:
+) -> list[BatchOutcome[RegistrationResult]]:
     """Register pairs of detection and object (by number; None: each with each) by the preset `robust`.
 
     Each result is that of :func:`regnf_core.register` for this pair and seed; a pair that fails does not stop the
@@ -62,91 +64,49 @@ def register_batch(
     """
     options = options or RegistrationOptions()
     options.require_robust("registers a batch")
-    wanted = pairs_of(pairs, len(detections), len(objects))
-    batch = _Batch(scene, detections, objects, options, seed)
-    return [
-        batch.one(d, o, Run(_share_of(progress, number, len(wanted))), clouds) for number, (d, o) in enumerate(wanted)
-    ]
+    wanted, device = pairs_of(pairs, len(detections), len(objects)), working_device(scene)
+    fields = [one.field if isinstance(one, ModeledObject) else one for one in objects]
 
+    def modeled(number: int) -> ObjectModel:
+        one = objects[number]
+        return (one.model if isinstance(one, ModeledObject) else model_object(one, options.robust)).on(device)
 
-class _Batch:
-    """Views and models, made when first needed. What failed once fails again without another attempt."""
-
-    def __init__(
-        self,
-        scene: SdfField,
-        detections: Sequence[OrientedBox],
-        objects: Sequence[SdfField | ModeledObject],
-        options: RegistrationOptions,
-        seed: int,
-    ) -> None:
-        self.scene, self.detections, self.options, self.seed = scene, detections, options, seed
-        self.objects = [one.field if isinstance(one, ModeledObject) else one for one in objects]
-        models = {number: one.model for number, one in enumerate(objects) if isinstance(one, ModeledObject)}
-        self._views: dict[int, SceneView | RegnfError] = {}
-        self._given: dict[int, ObjectModel | RegnfError] = dict(models)
-        self._models: dict[int, ObjectModel] = {}
-
-    def one(self, d: int, o: int, run: Run, clouds: bool) -> BatchOutcome:
-        """Of one pair."""
-        return _outcome(d, o, lambda: self._register(d, o, run, clouds))
-
-    def _register(self, d: int, o: int, run: Run, clouds: bool) -> RegistrationResult:
-        with run.phase("sampling"):
-            view, model = self._view(d), self._model(o)
-        result = register_robust(
-            self.scene,
-            self.objects[o],
-            self.detections[d],
-            self.options,
-            self.seed,
-            run,
-            WarmStart(object_model=model),
-            view,
-        )
-        return run.finish(result, (lambda found: self._with_clouds(d, o, found)) if clouds else None)
-
-    def _with_clouds(self, d: int, o: int, found: RegistrationResult) -> RegistrationResult:
-        box = self.detections[d]
-        return with_clouds(found, self.scene, self.objects[o], box, cloud_region(box))
-
-    def _view(self, d: int) -> SceneView:
-        return _once(self._views, d, lambda: self._seen(self.detections[d]))
-
-    def _seen(self, detection: OrientedBox) -> SceneView:
-        """On the device that the work is done on."""
-        view = view_scene(self.scene, detection, self.options.robust)
-        return view.to(working_device(self.scene))
-
-    def _model(self, o: int) -> ObjectModel:
-        """On the same device."""
-        if o not in self._models:
-            made = _once(self._given, o, lambda: model_object(self.objects[o], self.options.robust))
-            self._models[o] = made.to(working_device(self.scene))
-        return self._models[o]
-
-
-def _once(made: dict[int, _T | RegnfError], key: int, make: Callable[[], _T]) -> _T:
-    """What ``make`` gave or raised the first time."""
-    if key not in made:
+    view_of = _once(lambda number: view_scene(scene, detections[number], options.robust).on(device))
+    model_of = _once(modeled)
+    outcomes = []
+    for number, (d, o) in enumerate(wanted):
+        run, box = Run(_share_of(progress, number, len(wanted))), detections[d]
         try:
-            made[key] = make()
+            with run.phase("sampling"):
+                view, model = view_of(d), model_of(o)
+            result = register_robust(scene, fields[o], box, options, seed, run, None, model, view)
+            if clouds:
+                with run.phase("exporting"):
+                    result = with_clouds(result, scene, fields[o], box, cloud_region(box))
+            outcomes.append(BatchOutcome(d, o, run.finish(result)))
+        except CancelledError:
+            raise
         except RegnfError as error:
-            made[key] = error
-    found = made[key]
-    if isinstance(found, RegnfError):
-        raise found
-    return found
+            outcomes.append(BatchOutcome[RegistrationResult](d, o, None, error))
+    return outcomes
 
 
-def _outcome(d: int, o: int, make: Callable[[], RegistrationResult]) -> BatchOutcome:
-    """The result that is made, or the error. Raises CancelledError."""
-    try:
-        return BatchOutcome(d, o, make())
-    except CancelledError:
-        raise
-    except RegnfError as error:
-        return BatchOutcome(d, o, None, error)
+def _once(make: Callable[[int], T]) -> Callable[[int], T]:
+    """``make``, called once for each number: what it gave or raised the first time, it gives or raises again."""
+    made: dict[int, T | RegnfError] = {}
+
+    def of(number: int) -> T:
+        if number not in made:
+            try:
+                made[number] = make(number)
+            except RegnfError as error:
+                made[number] = error
+        found = made[number]
+        if isinstance(found, RegnfError):
+            raise found
+        return found
+
+    return of
 
 
 def _share_of(progress: ProgressCallback | None, number: int, count: int) -> ProgressCallback | None:

@@ -82,6 +82,12 @@ def ray_count(options: RegistrationOptions) -> int:
     return one.views * max(1, one.image_size // one.pixel_stride) ** 2
 
 
+def _term(counts: str, count: int, options: str, memory_bytes: int = 0, seconds: float = 0.0) -> Term:
+    """options: their paths, with blanks between them."""
+    paths = tuple(tuple(path.split(".")) for path in options.split())
+    return Term(counts, count, paths, memory_bytes, seconds)
+
+
 def _of_paper(options: RegistrationOptions) -> tuple[Term, ...]:
     start, steps, again = options.initialization, options.optimization, options.resampling
     rays = ray_count(options)
@@ -89,57 +95,27 @@ def _of_paper(options: RegistrationOptions) -> tuple[Term, ...]:
     samples = min(steps.samples_per_iteration, again.max_samples)
     taken = steps.iterations * samples
     resampled = steps.iterations // again.every * again.max_samples
+    of_rays = "sampling.views sampling.image_size sampling.pixel_stride"
+    of_draws = "initialization.draws initialization.ransac_iterations"
+    of_steps = "optimization.iterations optimization.samples_per_iteration"
+    of_resampling = "optimization.iterations resampling.every resampling.max_samples"
+    kept_bytes = _SIDES * again.max_samples * _SAMPLE_BYTES
     return (
-        Term(
-            "rays",
-            rays,
-            (("sampling", "views"), ("sampling", "image_size"), ("sampling", "pixel_stride")),
-            _SIDES * rays * _RAY_BYTES,
-            _SIDES * rays * _RAY_S,
-        ),
-        Term(
-            "draws of RANSAC",
-            draws,
-            (("initialization", "draws"), ("initialization", "ransac_iterations")),
-            0,
-            draws * _DRAW_S,
-        ),
-        Term(
-            "samples in all iterations",
-            taken,
-            (("optimization", "iterations"), ("optimization", "samples_per_iteration")),
-            _SIDES * samples * _SAMPLE_BYTES,
-            _SIDES * taken * _STEP_S,
-        ),
-        Term(
-            "samples in all resamplings",
-            resampled,
-            (("optimization", "iterations"), ("resampling", "every"), ("resampling", "max_samples")),
-            _SIDES * again.max_samples * _SAMPLE_BYTES,
-            _SIDES * resampled * _RESAMPLE_S,
-        ),
+        _term("rays", rays, of_rays, _SIDES * rays * _RAY_BYTES, _SIDES * rays * _RAY_S),
+        _term("draws of RANSAC", draws, of_draws, 0, draws * _DRAW_S),
+        _term("samples in all iterations", taken, of_steps, _SIDES * samples * _SAMPLE_BYTES, _SIDES * taken * _STEP_S),
+        _term("samples in all resamplings", resampled, of_resampling, kept_bytes, _SIDES * resampled * _RESAMPLE_S),
     )
 
 
 def _of_robust(options: RegistrationOptions, objects: int) -> tuple[Term, ...]:
     one = options.robust
     scene, obj = (min(limit, _MOST_SURFACE_SAMPLES) for limit in (one.scene_samples, one.object_samples))
-    modeled = objects * obj
+    both, modeled = scene + obj, objects * obj
+    of_both, of_modeled = "robust.scene_samples robust.object_samples", "robust.object_samples"
     return (
-        Term("rotations", one.rotations, (("robust", "rotations"),), 0, one.rotations * _ROTATION_S),
-        Term("feature matches", one.feature_draws, (("robust", "feature_draws"),), 0, one.feature_draws * _MATCH_S),
-        Term(
-            "surface samples",
-            scene + obj,
-            (("robust", "scene_samples"), ("robust", "object_samples")),
-            (scene + obj) * _SURFACE_SAMPLE_BYTES,
-            (scene + obj) * _SURFACE_SAMPLE_S,
-        ),
-        Term(
-            "samples of all objects",
-            modeled,
-            (("robust", "object_samples"),),
-            modeled * _MODEL_BYTES,
-            objects * _MODEL_S,
-        ),
+        _term("rotations", one.rotations, "robust.rotations", 0, one.rotations * _ROTATION_S),
+        _term("feature matches", one.feature_draws, "robust.feature_draws", 0, one.feature_draws * _MATCH_S),
+        _term("surface samples", both, of_both, both * _SURFACE_SAMPLE_BYTES, both * _SURFACE_SAMPLE_S),
+        _term("samples of all objects", modeled, of_modeled, modeled * _MODEL_BYTES, objects * _MODEL_S),
     )

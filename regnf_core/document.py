@@ -7,9 +7,7 @@ Torch-free.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -34,16 +32,29 @@ ProgressCallback = Callable[[Phase, float], None]
 """Called with the phase and the overall progress 0..1. May raise CancelledError to stop the work."""
 
 
+class _Posed:
+    """What has a T_object_scene."""
+
+    T_object_scene: Sim3
+
+    @property
+    def T_scene_object(self) -> Sim3:
+        """The object's pose in the scene."""
+        return self.T_object_scene.inverse()
+
+
 @dataclass(frozen=True)
 class IterationRecord:
-    """One iteration of the optimizer: everything that trace.json shows."""
+    """One iteration of the optimizer: everything that trace.json shows.
+
+    residual_scene: mean |r| over the scene's samples, object units · residual_object: over the object's samples, scene
+    units, as the paper has it.
+    """
 
     iteration: int
     loss: float
     residual_scene: float
-    """Mean |r| over the scene's samples, object units."""
     residual_object: float
-    """Mean |r| over the object's samples, scene units, as the paper has it."""
     regularizer: float
     kernel_shape: float
     kernel_scale: float
@@ -53,32 +64,22 @@ class IterationRecord:
 
 
 @dataclass(frozen=True)
-class Alternative:
+class Alternative(_Posed):
     """Another pose that matches the data equally well, for example a symmetry equivalent."""
 
     T_object_scene: Sim3
     score: float
     relation: str
 
-    @property
-    def T_scene_object(self) -> Sim3:
-        """The object's pose in the scene."""
-        return self.T_object_scene.inverse()
-
 
 @dataclass(frozen=True)
-class ConsideredPose:
+class ConsideredPose(_Posed):
     """One pose that was refined and judged by itself, whatever rivals it has. reason, limit: as of a verdict."""
 
     T_object_scene: Sim3
     reason: str
     metrics: dict[str, float]
     limit: str = ""
-
-    @property
-    def T_scene_object(self) -> Sim3:
-        """The object's pose in the scene."""
-        return self.T_object_scene.inverse()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,48 +114,41 @@ class ObjectSymmetry:
 
 
 @dataclass(frozen=True, eq=False)
-class RegistrationResult:
-    """The outcome of one registration. The object's pose in the scene is ``T_scene_object``."""
+class RegistrationResult(_Posed):
+    """The outcome of one registration. The object's pose in the scene is ``T_scene_object``.
+
+    verdict_reason: one stable UPPER_SNAKE word, e.g. SURFACES_AGREE, LOW_OVERLAP · metrics: of the manual's list, and
+    seconds by phase as seconds_<phase> · residuals: per point of both clouds: scene_points, scene_residuals,
+    object_points, object_residuals; object units · center_object: (3,) float64, object frame: the centroid of the
+    object's surface · verdict_limit: the limit that a rejected pose does not keep, in words, with both numbers; "" if
+    there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
+    symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
+    viewers · surroundings: the scene's surface around the detection, for viewers.
+    covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
+    becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
+    place of the scene's origin: the farther that is from the object, the larger are the entries of t, however well the
+    object's place is known. :func:`regnf_core.geometry.metrics.center_covariance` gives that.
+    The preset `paper` gives no alternatives, covariance, symmetry and considered poses.
+    """
 
     verdict: Verdict
     verdict_reason: str
-    """One stable UPPER_SNAKE word, e.g. SURFACES_AGREE, LOW_OVERLAP."""
     T_object_scene: Sim3
     T_object_scene_initial: Sim3
     scene_samples: SurfaceSamples
     object_samples: SurfaceSamples
     metrics: dict[str, float]
-    """residual_rms (object diameters, both directions), inlier_share_scene, inlier_share_object, iterations,
-    field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more:
-    the manual lists them all."""
     trace: list[IterationRecord]
     residuals: dict[str, Tensor]
-    """Per point of both clouds: scene_points, scene_residuals, object_points, object_residuals; object units."""
     seed: int
     options: dict[str, Any]
     center_object: Tensor
-    """(3,) float64, object frame: the centroid of the object's surface."""
     verdict_limit: str = ""
-    """The limit that a rejected pose does not keep, in words, with both numbers; "" where there is none."""
     alternatives: list[Alternative] = field(default_factory=list)
-    """The preset `robust` lists every distinct pose that matches the data equally well; empty unless ``ambiguous``."""
     covariance: Tensor | None = None
-    """(7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t, becomes
-    s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the place of
-    the scene's origin: the farther that is from the object, the larger are the entries of t, however well the object's
-    place is known. :func:`regnf_core.geometry.metrics.center_covariance` gives that. None from the preset
-    `paper`."""
     symmetry: ObjectSymmetry | None = None
-    """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
     considered: Considered | None = None
-    """The poses that were judged, for viewers. None from the preset `paper`."""
     surroundings: SurfaceSamples | None = None
-    """The scene's surface around the detection, for viewers."""
-
-    @property
-    def T_scene_object(self) -> Sim3:
-        """The object's pose in the scene."""
-        return self.T_object_scene.inverse()
 
     @property
     def center_scene(self) -> Tensor:
@@ -189,53 +183,6 @@ class Candidate:
     def T_scene_object(self) -> Sim3 | None:
         """The object's pose in the scene; None for the others."""
         return None if self.T_object_scene is None else self.T_object_scene.inverse()
-
-
-# Progress reports and the seconds of each phase, the same for every preset.
-
-STARTS: dict[Phase, float] = {
-    "sampling": 0.0,
-    "initializing": 0.15,
-    "optimizing": 0.2,
-    "verifying": 0.95,
-    "exporting": 0.98,
-}
-"""The overall share done when each phase begins."""
-
-
-class Run:
-    """Progress reports and the seconds of each phase."""
-
-    def __init__(self, progress: ProgressCallback | None) -> None:
-        self.seconds: dict[str, float] = {}
-        self._done = 0.0
-        self._progress = progress
-
-    def report(self, phase: Phase, done: float) -> None:
-        """Report a phase and the overall share done (0..1). The share never falls: a second attempt repeats earlier
-        phases."""
-        self._done = max(self._done, min(done, 1.0))
-        if self._progress is not None:
-            self._progress(phase, self._done)
-
-    def finish(
-        self, result: RegistrationResult, add_clouds: Callable[[RegistrationResult], RegistrationResult] | None = None
-    ) -> RegistrationResult:
-        """The result with its clouds, if any are wanted, and with the seconds of all phases among its metrics."""
-        if add_clouds is not None:
-            with self.phase("exporting"):
-                result = add_clouds(result)
-        self.report("exporting", 1.0)
-        result.metrics.update(self.seconds)
-        return result
-
-    @contextmanager
-    def phase(self, name: Phase) -> Iterator[None]:
-        self.report(name, STARTS[name])
-        start = time.perf_counter()
-        yield
-        key = f"seconds_{name}"
-        self.seconds[key] = self.seconds.get(key, 0.0) + time.perf_counter() - start
 
 
 # The document: JSON values.
@@ -294,9 +241,7 @@ class UncertaintyDocument(Outgoing):
 class SymmetryDocument(Outgoing):
     """The turns that carry the object onto itself, found by registering it with itself."""
 
-    order: int = Field(
-        ge=1, description="How many, the identity included; with `continuous`, how many ends look alike: 1 or 2."
-    )
+    order: int = Field(ge=1, description="The identity included; with `continuous`, how many ends look alike: 1 or 2.")
     axis: list[float] | None = Field(description="Unit vector, object frame, that all of them turn about; or null.")
     continuous: bool = Field(description="Whether every turn about the axis is one.")
 
@@ -323,7 +268,7 @@ class SettingsUsedDocument(Outgoing):
     trainer: str | None = None
     files: list[str] = Field(default=[], description="Their names.")
     used: dict[str, Any] = Field(
-        default={}, description="Entries of a description, such as `hash.levels`, and their values."
+        default={}, description="Entries of a description, such as `hash.levels`, with values."
     )
 
 
@@ -332,9 +277,7 @@ class FieldNotesDocument(Outgoing):
 
     family: str | None = Field(default=None, description="The format that was recognized.")
     settings: SettingsUsedDocument | None = Field(default=None, description="The trainer's settings that counted.")
-    warnings: list[str] = Field(
-        default=[], description="Each begins with a stable word and a colon: docs/import-gate.md."
-    )
+    warnings: list[str] = Field(default=[], description="Each begins with a stable word: docs/import-gate.md.")
 
 
 class ArtifactEntry(Outgoing):
@@ -354,9 +297,7 @@ class ResultDocument(Outgoing):
 
     verdict: Verdict
     verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
-    verdict_detail: str = Field(
-        default="", description="The reason in words, for people, with the number and the limit that it does not keep."
-    )
+    verdict_detail: str = Field(default="", description="The reason in words, with the limit that it does not keep.")
     verdict_hint: str = Field(default="", description="What to do next, for people; empty for a registered result.")
     probability: float | None = Field(
         default=None,
@@ -365,12 +306,10 @@ class ResultDocument(Outgoing):
         "Null from the preset `paper`.",
     )
     T_scene_object: TransformDocument = Field(
-        description="The object's pose in the scene: object coordinates to scene coordinates."
+        description="The object's pose in the scene: object to scene coordinates."
     )
     T_object_scene: TransformDocument = Field(description="Its inverse: scene coordinates to object coordinates.")
-    center_scene: list[float] = Field(
-        default=[], description="Where the object's center is, scene frame: T_scene_object of `center_object`."
-    )
+    center_scene: list[float] = Field(default=[], description="T_scene_object of `center_object`, scene frame.")
     center_object: list[float] = Field(default=[], description="The centroid of the object's surface, object frame.")
     T_object_scene_initial: TransformDocument | None = Field(default=None, description="Where the refinement began.")
     alternatives: list[AlternativeDocument] = Field(
@@ -387,35 +326,26 @@ class ResultDocument(Outgoing):
         "p = R^T (c - t) / s and moves by J (omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s: its "
         "covariance is J C J^T. docs/api.md has an example in numbers. Null from the preset `paper`.",
     )
-    covariance_ordering: list[str] | None = Field(
-        default=None, description="omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s."
-    )
+    covariance_ordering: list[str] | None = Field(default=None, description="omega (3), t (3), log_s.")
     uncertainty: UncertaintyDocument | None = None
     symmetry: SymmetryDocument | None = Field(
         default=None, description="The object's own; null from the preset `paper`."
     )
     metrics: dict[str, float | None] = Field(default={})
-    object: str | None = Field(
-        default=None, description="SHA-256 of the object's field; of a search, of the likeliest's."
-    )
-    candidates: list[CandidateDocument] | None = Field(
-        default=None, description="All candidates of a search, the likeliest first; null for one object."
-    )
+    object: str | None = Field(default=None, description="SHA-256 of the object's field; of a search, the likeliest's.")
+    candidates: list[CandidateDocument] | None = Field(default=None, description="Of a search, the likeliest first.")
     fields: dict[Literal["scene", "object"], FieldNotesDocument] | None = Field(
-        default=None, description="What is known of the imports of scene and object."
+        default=None, description="Their imports."
     )
     seed: int = 0
     options: dict[str, Any] = Field(default={}, description="Every option that was used, defaults included.")
     engine: dict[str, Any] = Field(default={}, description="Name, version, device.")
     artifacts: list[ArtifactEntry] = Field(default=[])
-    missing_artifacts: list[str] = Field(
-        default=[], description="Names of pictures and clouds that could not be made once the result was out."
-    )
+    missing_artifacts: list[str] = Field(default=[], description="Names of those that could not be made afterwards.")
 
 
 COVARIANCE_ORDERING = ("omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s")
 """What the rows and columns of a covariance belong to: see ``RegistrationResult.covariance``."""
-_ROLES: tuple[Literal["scene", "object"], ...] = ("scene", "object")
 
 
 def result_document(
@@ -438,47 +368,43 @@ def result_document(
 
     from regnf_core.geometry.metrics import errors_against_truth, paper_errors, uncertainty
 
-    metrics = dict(result.metrics)
+    metrics, center, T = dict(result.metrics), result.center_object, result.T_object_scene
     if truth is not None:
-        metrics |= errors_against_truth(
-            result.T_object_scene, truth, result.object_samples.points, symmetries, result.center_object
-        )
+        metrics |= errors_against_truth(T, truth, result.object_samples.points, symmetries, center)
         if result.options.get("preset") == "paper":
-            metrics |= paper_errors(result.T_object_scene, truth)
-    covariance, symmetry = result.covariance, result.symmetry
+            metrics |= paper_errors(T, truth)
     document = ResultDocument(
         verdict=result.verdict,
         verdict_reason=result.verdict_reason,
         verdict_detail=verdict_in_words(result.verdict_reason, result.verdict_limit),
         verdict_hint=verdict_hint(result.verdict_reason, result.options),
         probability=None if result.probability is None else json_number(result.probability),
-        T_scene_object=_transform(result.T_scene_object),
-        T_object_scene=_transform(result.T_object_scene),
+        **_both_ways(result),
         center_scene=result.center_scene.tolist(),
-        center_object=result.center_object.tolist(),
-        T_object_scene_initial=_transform(result.T_object_scene_initial),
+        center_object=center.tolist(),
+        T_object_scene_initial=TransformDocument(**result.T_object_scene_initial.to_dict()),
         alternatives=[
             AlternativeDocument(**_both_ways(other), score=other.score, relation=other.relation)
             for other in result.alternatives
         ],
-        considered=None if result.considered is None else [_considered(one) for one in result.considered.poses],
-        covariance=None if covariance is None else [[json_number(v) for v in row] for row in covariance.tolist()],
-        covariance_ordering=None if covariance is None else list(COVARIANCE_ORDERING),
-        uncertainty=None
-        if covariance is None
-        else UncertaintyDocument(**uncertainty(covariance, result.T_object_scene, result.center_object)),
-        symmetry=None if symmetry is None else SymmetryDocument(**asdict(symmetry)),
-        metrics={name: json_number(value) for name, value in metrics.items()},
+        metrics=_numbers(metrics),
         object=object_name,
         candidates=None if candidates is None else [CandidateDocument(**one) for one in candidates],
-        fields=None
-        if fields is None
-        else {role: FieldNotesDocument(**fields[role].to_dict()) for role in _ROLES if role in fields},
         seed=result.seed,
         options=result.options,
         engine={"name": "regnf", "version": __version__, "device": str(device), "torch": torch.__version__},
-    )
-    return document.model_dump(exclude={"artifacts", "missing_artifacts"})
+    ).model_dump(exclude={"artifacts", "missing_artifacts"})
+    if result.considered is not None:
+        document["considered"] = [_considered(one) for one in result.considered.poses]
+    if result.covariance is not None:
+        document["covariance"] = [[json_number(value) for value in row] for row in result.covariance.tolist()]
+        document["covariance_ordering"] = list(COVARIANCE_ORDERING)
+        document["uncertainty"] = uncertainty(result.covariance, T, center)
+    if result.symmetry is not None:
+        document["symmetry"] = SymmetryDocument(**asdict(result.symmetry)).model_dump()
+    if fields is not None:
+        document["fields"] = {role: fields[role].to_dict() for role in ("scene", "object") if role in fields}
+    return document
 
 
 def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -491,8 +417,7 @@ def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) 
             verdict=one.verdict,
             verdict_reason=one.verdict_reason,
             probability=one.probability,
-            T_scene_object=None if one.T_scene_object is None else _transform(one.T_scene_object),
-            T_object_scene=None if one.T_object_scene is None else _transform(one.T_object_scene),
+            **_both_ways(one),
         )
         for one in ranking
     ]
@@ -503,21 +428,20 @@ def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) 
     return [one.model_dump() for one in ranked + left_out]
 
 
-def _considered(one: ConsideredPose) -> ConsideredDocument:
-    return ConsideredDocument(
-        **_both_ways(one),
-        reason=one.reason,
-        detail=verdict_in_words(one.reason, one.limit),
-        metrics={name: json_number(value) for name, value in one.metrics.items()},
-    )
+def _considered(one: ConsideredPose) -> dict[str, Any]:
+    detail = verdict_in_words(one.reason, one.limit)
+    found = ConsideredDocument(**_both_ways(one), reason=one.reason, detail=detail, metrics=_numbers(one.metrics))
+    return found.model_dump()
 
 
-def _both_ways(pose: Alternative | ConsideredPose) -> dict[str, Any]:
-    return {"T_scene_object": _transform(pose.T_scene_object), "T_object_scene": _transform(pose.T_object_scene)}
+def _both_ways(pose: _Posed | Candidate) -> dict[str, Any]:
+    there, back = pose.T_scene_object, pose.T_object_scene
+    found = {"T_scene_object": there, "T_object_scene": back}
+    return {name: None if T is None else TransformDocument(**T.to_dict()) for name, T in found.items()}
 
 
-def _transform(T: Sim3) -> TransformDocument:
-    return TransformDocument(**T.to_dict())
+def _numbers(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: json_number(value) for name, value in values.items()}
 
 
 def json_number(value: float) -> float | None:

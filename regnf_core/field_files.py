@@ -69,12 +69,11 @@ def stored_bounds(path: Path) -> Bounds | None:
 def checkpoint_below(folder: Path) -> Path | None:
     """The checkpoint of the latest step in a training run's folder; None where there is none."""
     found = [path for path in _files(folder) if path.suffix.lower() in CHECKPOINT_SUFFIXES]
-    return max(found, key=lambda path: (_step(path), path.stat().st_mtime, path.name), default=None)
 
+    def step(path: Path) -> int:
+        return int([-1, *re.findall(r"\d{1,12}", path.stem)][-1])
 
-def _step(path: Path) -> int:
-    numbers = re.findall(r"\d{1,12}", path.stem)
-    return int(numbers[-1]) if numbers else -1
+    return max(found, key=lambda path: (step(path), path.stat().st_mtime, path.name), default=None)
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -118,7 +117,11 @@ def library_files(named: list[Path]) -> list[Path]:
     """
     files: dict[Path, Path] = {}
     for path in named:
-        for file in _fields_in(path) if path.is_dir() else [path]:
+        found = [path]
+        if path.is_dir():  # its fields; itself where it has none and is a training run's
+            fields = sorted(filter(_looks_like_a_field, path.iterdir()))
+            found = fields if fields or checkpoint_below(path) is None else [path]
+        for file in found:
             files.setdefault(file.resolve(), file)
     if not files:
         message = f"{', '.join(map(str, named))}: no fields in it, expected safe fields, checkpoints or meshes"
@@ -127,12 +130,6 @@ def library_files(named: list[Path]) -> list[Path]:
     if len(files) > _MOST:
         raise InvalidInputError(f"{len(files)} objects; at most {_MOST} are searched", reason="LIBRARY_TOO_LARGE")
     return list(files.values())
-
-
-def _fields_in(folder: Path) -> list[Path]:
-    """The fields that lie in a folder; the folder itself where it has none and is a training run's."""
-    found = sorted(filter(_looks_like_a_field, folder.iterdir()))
-    return found if found or checkpoint_below(folder) is None else [folder]
 
 
 def _looks_like_a_field(path: Path) -> bool:

@@ -26,7 +26,7 @@ A file of the dataset (meta_data.json, dataparser_transforms.json ...) joins tho
 """
 _WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, *RUN_ARCHIVES, "safetensors"})
 """Formats that no trainer's settings say anything about, and archives, which have their own."""
-_FOUND_BESIDE = "They were found beside the checkpoint: --no-config (in Python settings=False) leaves them unread."
+_FOUND_BESIDE = "They were found beside the checkpoint: --no-config (in Python config=False) leaves them unread."
 _WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "sqlite", "onnx"})
 """Formats whose files say which side of the surface is free; of the others the use decides."""
 
@@ -102,10 +102,7 @@ class FieldSource:
 
 
 def find_source(
-    path: Path,
-    description: Mapping[str, Any] | None = None,
-    settings: SettingsChoice = None,
-    role: Role | None = None,
+    path: Path, description: Mapping[str, Any] | None = None, config: SettingsChoice = None, role: Role | None = None
 ) -> FieldSource:
     """What a path stands for. role: what the field will be used as.
 
@@ -121,12 +118,12 @@ def find_source(
         file = run.checkpoint
     require_field_file(file)
     format_ = format_of(file)
-    if run is None and format_ not in _WITHOUT_SETTINGS and settings is not False:
+    if run is None and format_ not in _WITHOUT_SETTINGS and config is not False:
         with naming(path):
             run = Run(file.resolve(), settings_beside(file))
-    run, config = _settings_of(run, settings)
+    run, named = _settings_of(run, config)
     said = dict(description or {})
-    return FieldSource(path, file, run, config, said, assumed_role(said, format_, role).get("as"), role)
+    return FieldSource(path, file, run, named, said, assumed_role(said, format_, role).get("as"), role)
 
 
 def _settings_of(run: Run | None, chosen: SettingsChoice) -> tuple[Run | None, Path | None]:

@@ -154,7 +154,11 @@ def field_of(thing: Any, role: Role | None = None, description: Said = None) -> 
     if role is not None and "as" not in said:
         said["as"] = role
     if isinstance(thing, SdfField) and not isinstance(thing, type):
-        return _users(thing)
+        if type(thing).__module__.partition(".")[0] in ("regnf_core", "regnf_fit", "regnf_data"):
+            return thing
+        from regnf_core.fields.user_fields import UserField
+
+        return UserField(thing)  # is given float32 points, and what it returns is checked
     geometry = geometry_of(thing, role)
     if len(geometry.faces) == 0:
         return from_points(geometry.vertices, geometry.normals, said)
@@ -182,16 +186,10 @@ def geometry_of(thing: Any, role: Role | None = None) -> Geometry:
         normals = _first(thing, "normals", "point.normals")
         given = None if normals is None or len(normals) == 0 else _rows("normals", normals, "MESH_INVALID")
         return Geometry(_rows("points", points, "MESH_INVALID"), np.zeros((0, 3), np.int64), given)
-    raise _no_field(_kind(thing), role, _missing_members(thing))
-
-
-def _users(field: SdfField) -> SdfField:
-    """One of regnf's own as it is; any other is given float32 points, and what it returns is checked."""
-    if type(field).__module__.partition(".")[0] in ("regnf_core", "regnf_fit", "regnf_data"):
-        return field
-    from regnf_core.fields.user_fields import UserField
-
-    return UserField(field)
+    asked = ("signed_distance", "signed_distance_and_gradient")
+    missing = [name for name in ("bounds", "device", "to", *asked) if not hasattr(thing, name)]
+    some = any(hasattr(thing, name) for name in asked)
+    raise _no_field(_kind(thing), role, f": SdfField's {', '.join(missing)} is missing" if some else "")
 
 
 def _mesh(places: Float64Array, corners: Int64Array, painted: Float64Array | None, description: Said) -> SdfField:
@@ -219,7 +217,7 @@ def _scene(scene: Any, role: Role | None) -> Geometry:
 def _field(converted: ConvertedField, description: Said) -> SdfField:
     """The field of what a converter made, checked as an import's is; warnings are issued as FieldWarnings."""
     from regnf_core.importing.families.converted import Reading
-    from regnf_core.importing.gate.reading_field import field_of as built
+    from regnf_core.importing.gate.evidence import field_of as built
     from regnf_core.importing.gate.report import placed
 
     done = placed(converted, _said(description))
@@ -285,10 +283,9 @@ def _faces(faces: Any, vertices: int) -> Int64Array:
     """(F, 3) indices of ``vertices``; polygons as fans. Raises FieldFormatError (MESH_INVALID)."""
     from regnf_core.importing.meshes.triangle_files import fan, fans
 
-    counts = {len(face) for face in faces} if isinstance(faces, list | tuple) and all(map(_is_row, faces)) else set()
-    if len(counts) > 1:
-        parts = [fan(_indices(face).reshape(-1)) for face in faces]
-        corners = np.concatenate(parts)
+    rows = isinstance(faces, list | tuple) and all(isinstance(face, list | tuple | np.ndarray) for face in faces)
+    if rows and len({len(face) for face in faces}) > 1:
+        corners = np.concatenate([fan(_indices(face).reshape(-1)) for face in faces])
     else:
         array = _indices(faces)
         if array.ndim != 2 or len(array) == 0 or not 3 <= array.shape[1] <= 255:
@@ -314,10 +311,6 @@ def _indices(values: Any) -> Int64Array:
     if array.dtype.kind == "f" and not (np.isfinite(array) & (array == np.round(array))).all():
         raise FieldFormatError("faces holds numbers that are not whole", reason="MESH_INVALID")
     return array.astype(np.int64)
-
-
-def _is_row(value: Any) -> bool:
-    return isinstance(value, list | tuple | np.ndarray)
 
 
 def _colors(colors: Any, vertices: int) -> Float64Array:
@@ -351,15 +344,6 @@ def _first(thing: Any, *names: str) -> Any:
         if found is not None and not callable(found):
             return found
     return None
-
-
-def _missing_members(thing: Any) -> str:
-    """Which of SdfField's members an object lacks that has some of them."""
-    members = ("bounds", "device", "to", "signed_distance", "signed_distance_and_gradient")
-    missing = [name for name in members if not hasattr(thing, name)]
-    if not hasattr(thing, "signed_distance") and not hasattr(thing, "signed_distance_and_gradient"):
-        return ""
-    return f": SdfField's {', '.join(missing)} is missing"
 
 
 def _kind(thing: Any) -> str:

@@ -1,4 +1,4 @@
-"""Which object of a library a detection shows, and where it stands.
+"""Registration of two fields, and which object of a library a detection shows, and where it stands.
 
 library = [LibraryObject(path.stem, partial(open_field, path), read_object_model(path.with_suffix(".model")))
            for path in paths]
@@ -10,26 +10,49 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
-from regnf_core.document import STARTS, Candidate, ProgressCallback, RegistrationResult, Run
+import torch
+
+from regnf_core.document import Candidate, ProgressCallback, RegistrationResult
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.observation import SdfField
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.paper import pipeline as paper
-from regnf_core.robust.library_search import (
-    CoarseMatch,
-    LibraryQuery,
-    RefinedMatch,
-    match_coarsely,
-    rank_by_signature,
-    refine_match,
-    worth_refining,
+from regnf_core.progress import Run
+from regnf_core.robust.constants import LIBRARY
+from regnf_core.robust.model import ObjectModel, model_object, read_object_model, signature, write_object_model
+from regnf_core.robust.pipeline import (
+    cloud_region,
+    geometric_seeds,
+    refine_poses,
+    register_robust,
+    result_of,
+    search_poses,
 )
-from regnf_core.robust.model import ObjectModel, model_object, read_object_model, write_object_model
-from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust, result_of
-from regnf_core.robust.scene import view_scene
+from regnf_core.robust.problem import make_problem, pose_bound
+from regnf_core.robust.scene import SceneView, view_scene
+from regnf_core.robust.search.bounds import start_rotations
+from regnf_core.robust.verdict.evaluation import evaluate_candidates
+from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
+
+__all__ = [
+    "Candidate",
+    "LibraryObject",
+    "LibrarySearch",
+    "ObjectModel",
+    "model_object",
+    "read_object_model",
+    "register",
+    "search_library",
+    "with_late_clouds",
+    "write_object_model",
+]
+
+_MAX_SQUARED_DISTANCE = 4.0  # of two signatures without a common bin
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,100 +83,75 @@ def search_library(
 ) -> LibrarySearch:
     """Rank the library's objects for one detection, and register the likeliest, by the preset `robust`.
 
-    All are compared by signature, the nearest 12 searched coarsely, at most 4 refined on their fields and evaluated:
-    the time hardly grows with the library. Deterministic for a seed. ``progress`` and ``clouds`` as in
+    All are compared by signature, the nearest 12 searched coarsely on samples, at most 4 refined on their fields and
+    evaluated: the time hardly grows with the library. Deterministic for a seed. ``progress`` and ``clouds`` as in
     :func:`regnf_core.register`.
-    Raises InvalidOptionsError (LIBRARY_SEARCH_UNSUPPORTED) for options of another preset, InvalidInputError
+    Raises InvalidOptionsError (PRESET_UNSUITABLE) for options of another preset, InvalidInputError
     (LIBRARY_EMPTY, FIELD_NOT_FINITE), InvalidDetectionError, NoSurfaceError.
     """
     options = options or RegistrationOptions()
-    options.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
+    options.require_robust("searches a library", reason="PRESET_UNSUITABLE")
     if not library:
         raise InvalidInputError("the library has no objects", reason="LIBRARY_EMPTY")
     run = Run(progress)
-    models = [one.model for one in library]
     with run.phase("sampling"):
-        query = LibraryQuery(scene, view_scene(scene, detection, options.robust), options, seed)
+        view = view_scene(scene, detection, options.robust)
     with run.phase("initializing"):
-        nearest = rank_by_signature(query.view, models)
-        coarse = match_coarsely(query, models, [number for number, _ in nearest])
-    with run.phase("optimizing"):
-        refined = _refine(query, library, worth_refining(coarse), run)
-    with run.phase("verifying"):
-        first = library[refined[0].number]
-        result = _register_first(query, first, refined[0])
-
-    def add_clouds(found: RegistrationResult) -> RegistrationResult:
-        return with_clouds(found, scene, first.field(), detection, cloud_region(detection))
-
-    result = run.finish(result, add_clouds if clouds else None)
-    return LibrarySearch(_ranking(library, nearest, coarse, refined, result), result)
-
-
-def _refine(
-    query: LibraryQuery, library: Sequence[LibraryObject], matches: Sequence[CoarseMatch], run: Run
-) -> list[RefinedMatch]:
-    """The matches refined on their fields, best first."""
-    span = (STARTS["verifying"] - STARTS["optimizing"]) / len(matches)
+        nearest = rank_by_signature(view, [one.model for one in library])
+        there = view.on(working_device(scene))
+        coarse = [_searched_coarsely(there, library[n], n, options, seed) for n, _ in nearest[: LIBRARY.shortlist]]
+        coarse.sort(key=lambda found: found[0])
+        worth = [found for found in coarse if found[0] <= coarse[0][0] + LIBRARY.margin][: LIBRARY.max_refined]
     refined = []
-    for taken, match in enumerate(matches):
-        done = STARTS["optimizing"] + span * taken
-        one = library[match.number]
-
-        def on_step(done: float = done) -> None:
-            run.report("optimizing", done)
-
-        refined.append(refine_match(query, one.field(), one.model, match, on_step))
-    return sorted(refined, key=lambda found: found.evaluation.rank)
-
-
-def _register_first(query: LibraryQuery, one: LibraryObject, match: RefinedMatch) -> RegistrationResult:
-    """The first match's result; where the coarse search led to a rejection, that of a whole registration."""
-    view, options, seed = query.view, query.options, query.seed
-    if match.evaluation.verdict == "rejected":
-        known = WarmStart(object_model=one.model)
-        return register_robust(query.scene, one.field(), view.detection, options, seed, Run(None), known, view)
-    evaluations = view.evaluations + match.field_evaluations
-    return result_of(match.problem, match.evaluation, options, seed, evaluations)
-
-
-def _ranking(
-    library: Sequence[LibraryObject],
-    nearest: Sequence[tuple[int, float]],
-    coarse: Sequence[CoarseMatch],
-    refined: Sequence[RefinedMatch],
-    result: RegistrationResult,
-) -> list[Candidate]:
-    """All objects, those that came farthest first."""
-    first, score = library[refined[0].number].name, result.metrics["score"]
-    found = (result.verdict, result.verdict_reason, result.T_object_scene, result.probability)
-    ranking = [Candidate(first, "refined", score, *found)]
-    for match in refined[1:]:
-        other, name = match.evaluation, library[match.number].name
-        found = (other.verdict, other.reason, other.T, other.metrics["probability"])
-        ranking.append(Candidate(name, "refined", other.metrics["score"], *found))
-    listed = {match.number for match in refined}
-    ranking += [Candidate(library[c.number].name, "coarse", c.score) for c in coarse if c.number not in listed]
-    listed |= {match.number for match in coarse}
+    with run.phase("optimizing"):
+        for taken, (_, number, poses) in enumerate(worth):
+            one, counted = library[number], CountingField(scene)
+            obj, generator = CountingField(one.field()), torch.Generator().manual_seed(seed)
+            problem = make_problem(view, one.model, counted, obj, options.robust)
+            found = refine_poses(problem, poses, generator, partial(run.optimized, taken / len(worth)))
+            evaluation = evaluate_candidates(problem, found, options)
+            refined.append((evaluation, number, problem, counted.evaluations + obj.evaluations))
+        refined.sort(key=lambda found: found[0].rank)
+    evaluation, number, problem, evaluations = refined[0]
+    first = library[number]
+    with run.phase("verifying"):
+        if evaluation.found.verdict == "rejected":  # a whole registration may find what the coarse search lost
+            pair = scene, first.field(), detection
+            result = register_robust(*pair, options, seed, Run(None), None, first.model, view)
+        else:
+            result = result_of(problem, evaluation, options, seed, view.evaluations + evaluations)
+    if clouds:
+        with run.phase("exporting"):
+            result = with_clouds(result, scene, first.field(), detection, cloud_region(detection))
+    told = (result.verdict, result.verdict_reason, result.T_object_scene, result.probability)
+    ranking = [Candidate(first.name, "refined", result.metrics["score"], *told)]
+    for other, number, _, _ in refined[1:]:
+        told = (other.found.verdict, other.found.reason, other.T, other.metrics["probability"])
+        ranking.append(Candidate(library[number].name, "refined", other.metrics["score"], *told))
+    listed = {number for _, number, _, _ in refined}
+    ranking += [Candidate(library[number].name, "coarse", score) for score, number, _ in coarse if number not in listed]
+    listed |= {number for _, number, _ in coarse}
     ranking += [Candidate(library[n].name, "signature", apart) for n, apart in nearest if n not in listed]
-    return ranking
+    return LibrarySearch(ranking, run.finish(result))
 
 
-__all__ = [
-    "Candidate",
-    "LibraryObject",
-    "LibrarySearch",
-    "ObjectModel",
-    "model_object",
-    "read_object_model",
-    "search_library",
-    "write_object_model",
-]
+def rank_by_signature(view: SceneView, models: Sequence[ObjectModel]) -> list[tuple[int, float]]:
+    """Number of each model and its distance to the view by signature (0..1), nearest first."""
+    own = signature(view.foreground)
+    apart = torch.stack([(model.signature - own).square().sum() / _MAX_SQUARED_DISTANCE for model in models])
+    order: list[int] = apart.argsort(stable=True).tolist()
+    return [(number, float(apart[number])) for number in order]
 
 
-# Registration of two fields: by the preset that the options name, then the point clouds of the result.
-
-__all__ = ["WarmStart", "register", "with_late_clouds"]
+def _searched_coarsely(
+    view: SceneView, one: LibraryObject, number: int, options: RegistrationOptions, seed: int
+) -> tuple[float, int, Sim3]:
+    """The best pose's score (0..1, smaller is better), the number, and poses (H,), best first."""
+    model, generator = one.model.on(view.foreground.points.device), torch.Generator().manual_seed(seed)
+    bound = pose_bound(view, model, options.robust)
+    seeds = geometric_seeds(view, model, start_rotations(options, LIBRARY.rotations_divisor), bound.scale)
+    found = search_poses(view, model, seeds, generator, bound, LIBRARY.stages)
+    return float(found.scores[0]), number, found.T
 
 
 def register(
@@ -163,30 +161,35 @@ def register(
     options: RegistrationOptions | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
-    warm_start: WarmStart | None = None,
+    initial_transform: Sim3 | None = None,
+    object_model: ObjectModel | None = None,
     clouds: bool = True,
 ) -> RegistrationResult:
     """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimizing; it may
-    raise CancelledError. ``warm_start``, for the preset `robust` alone: a pose to try first, and the object's model.
+    raise CancelledError. For the preset `robust` alone: ``initial_transform``, a T_object_scene to try first, and
+    ``object_model``, what :func:`model_object` made of the object's field earlier.
     Without ``clouds`` the result holds only the samples that the registration used, and neither residuals nor
     surroundings; this saves time when no pictures are drawn.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE), and
-    InvalidOptionsError (INITIAL_TRANSFORM_UNSUPPORTED, INVALID_OPTIONS) for a warm start under another preset.
+    InvalidOptionsError (PRESET_UNSUITABLE, INVALID_OPTIONS) for either of the two under another preset.
     """
     options = options or RegistrationOptions()
-    if warm_start is not None:
-        _check_warm_start(warm_start, options)
+    if initial_transform is not None:
+        options.require_robust("starts from a given transform", reason="PRESET_UNSUITABLE")
+    if object_model is not None:
+        options.require_robust("uses an object model")
     run = Run(progress)
     if options.preset == "robust":
-        result = register_robust(scene, obj, detection, options, seed, run, warm_start)
+        result = register_robust(scene, obj, detection, options, seed, run, initial_transform, object_model)
     else:
         result = paper.register_paper(scene, obj, detection, options, seed, run)
-    return run.finish(
-        result, (lambda found: with_late_clouds(found, scene, obj, detection, options)) if clouds else None
-    )
+    if clouds:
+        with run.phase("exporting"):
+            result = with_late_clouds(result, scene, obj, detection, options)
+    return run.finish(result)
 
 
 def with_late_clouds(
@@ -195,10 +198,3 @@ def with_late_clouds(
     """The result of ``register`` without clouds as it returns it with them, but for the seconds of this phase."""
     region = cloud_region(detection) if options.preset == "robust" else paper.cloud_region(detection, options)
     return with_clouds(result, scene, obj, detection, region)
-
-
-def _check_warm_start(warm_start: WarmStart, options: RegistrationOptions) -> None:
-    if warm_start.T_object_scene is not None:
-        options.require_robust("starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED")
-    if warm_start.object_model is not None:
-        options.require_robust("uses an object model")

@@ -57,20 +57,6 @@ def checked_tags(tags: Sequence[str]) -> list[str]:
     return several
 
 
-def checked_unit(unit: str | None) -> str | None:
-    """The unit of the object's field. Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
-    if unit is not None and unit not in UNITS:
-        raise _invalid(f"no such unit, expected one of {', '.join(UNITS)}")
-    return unit
-
-
-def checked_note(note: str | None) -> str | None:
-    """A note for people. Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
-    if note is not None and (len(note) > MAX_NOTE or re.search(f"[{UNSHOWN}]", note)):
-        raise _invalid(f"a note has one line of at most {MAX_NOTE} characters that can be shown")
-    return note
-
-
 def checked_symmetry(said: Any) -> dict[str, Any] | None:
     """A symmetry as results have it: order, axis and continuous, its axis of length 1.
 
@@ -100,16 +86,14 @@ class EntryNotes:
 
     @classmethod
     def checked(
-        cls,
-        name: str,
-        tags: Sequence[str] = (),
-        unit: str | None = None,
-        note: str | None = None,
-        symmetry: Any = None,
+        cls, name: str, tags: Sequence[str] = (), unit: str | None = None, note: str | None = None, symmetry: Any = None
     ) -> EntryNotes:
         """Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
-        said = checked_symmetry(symmetry)
-        return cls(checked_name(name), tuple(checked_tags(tags)), checked_unit(unit), checked_note(note), said)
+        if unit is not None and unit not in UNITS:
+            raise _invalid(f"no such unit, expected one of {', '.join(UNITS)}")
+        if note is not None and (len(note) > MAX_NOTE or re.search(f"[{UNSHOWN}]", note)):
+            raise _invalid(f"a note has one line of at most {MAX_NOTE} characters that can be shown")
+        return cls(checked_name(name), tuple(checked_tags(tags)), unit, note, checked_symmetry(symmetry))
 
     @classmethod
     def from_dict(cls, values: Any) -> EntryNotes:

@@ -87,11 +87,8 @@ class LibraryFolder:
     @classmethod
     def usual(cls) -> LibraryFolder:
         """The user's own: REGNF_LIBRARY, else below XDG_DATA_HOME or ~/.local/share."""
-        named = os.environ.get("REGNF_LIBRARY")
-        base = os.environ.get("XDG_DATA_HOME")
-        return cls(
-            Path(named) if named else (Path(base) if base else Path.home() / ".local/share") / "regnf" / "library"
-        )
+        base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
+        return cls(Path(os.environ.get("REGNF_LIBRARY") or Path(base) / "regnf" / "library"))
 
     @staticmethod
     def is_one(folder: Path) -> bool:
@@ -113,11 +110,8 @@ class LibraryFolder:
         for one in self.entries():
             if one.notes.name == name:
                 return one
-        raise InvalidInputError(
-            f"{self.folder}: no entry {name!r}",
-            reason="LIBRARY_ENTRY_NOT_FOUND",
-            hint="`regnf library list` shows all names.",
-        )
+        hint = "`regnf library list` shows all names."
+        raise InvalidInputError(f"{self.folder}: no entry {name!r}", reason="LIBRARY_ENTRY_NOT_FOUND", hint=hint)
 
     def file(self, entry: FolderEntry) -> Path:
         """The safe field."""
@@ -216,9 +210,7 @@ def _invalid(detail: str) -> InvalidInputError:
     return InvalidInputError(detail, reason="LIBRARY_INDEX_INVALID", hint=hint)
 
 
-# A library as one zip file: an index, and the safe fields that it names. Read as strictly as an upload.
-#
-# library.json as in a library's folder fields/{sha256}.safetensors each entry's field, not compressed
+# A library as one zip file: library.json and fields/{sha256}.safetensors, not compressed. Read as strictly as uploads.
 
 _INDEX_BYTES = 16 << 20
 _BLOCK = 1 << 20
@@ -277,11 +269,8 @@ def _checked(data: memoryview, path: Path) -> Archive:
     members = {member.name: member for member in read_members(data)}
     index = members.get(INDEX)
     if index is None or index.size > _INDEX_BYTES:
-        raise InvalidInputError(
-            f"{path}: no library: it has no {INDEX}",
-            reason="LIBRARY_INDEX_INVALID",
-            hint="Give a file that `regnf library export` wrote.",
-        )
+        hint = "Give a file that `regnf library export` wrote."
+        raise InvalidInputError(f"{path}: no library: it has no {INDEX}", reason="LIBRARY_INDEX_INVALID", hint=hint)
     entries = index_of(bytes(data[index.offset : index.offset + index.size]), f"{path}: {INDEX}")
     expected = {INDEX, *map(_name, entries)}
     if members.keys() != expected:

@@ -8,6 +8,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +42,7 @@ class LoadedField:
 def open_field(
     path: str | os.PathLike[str] | object,
     description: Mapping[str, Any] | None = None,
-    settings: SettingsChoice = None,
+    config: SettingsChoice = None,
     device: str = "cpu",
     cache_dir: Path | None = None,
 ) -> SdfField:
@@ -49,7 +50,7 @@ def open_field(
 
     A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``.
     In place of a path, a mesh or a cloud of trimesh or Open3D is taken as a file of it would be. ``description`` says
-    what the file does not carry, see UploadDescription. ``settings`` names the trainer's settings: a file, or an
+    what the file does not carry, see UploadDescription. ``config`` names the trainer's settings: a file, or an
     archive of several; None takes those beside the checkpoint, False none. A warning of the import is issued as a
     FieldWarning.
 
@@ -60,7 +61,7 @@ def open_field(
         from regnf_core.fields.build import usable_device
 
         return field_of(path, description=description).to(usable_device(device))
-    loaded = load_field(find_source(Path(path), description, settings), device, cache_dir)
+    loaded = load_field(find_source(Path(path), description, config), device, cache_dir)
     for warning in loaded.notes.warnings:
         warnings.warn(f"{path}: {warning}", FieldWarning, stacklevel=2)
     return loaded.field
@@ -81,8 +82,10 @@ def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
     Raises FieldFormatError and InvalidInputError naming the file.
     """
     with source.naming():
-        if (notes := _safe_field_notes(source)) is not None:
-            return SafeField(source.file, notes)
+        if source.file.suffix.lower() == ".safetensors" and not source.description and not source.settings:
+            from regnf_core.schema.safe_format import read_description
+
+            return SafeField(source.file, FieldNotes.of_source(read_description(source.file)["source"]))
         return _imported(source, cache_dir or default_cache_dir())
 
 
@@ -101,22 +104,15 @@ def default_cache_dir() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "regnf" / "fields"
 
 
-def _safe_field_notes(source: FieldSource) -> FieldNotes | None:
-    """The notes of a file that can be opened as it is. Raises FieldFormatError: it only looks like a safe field."""
-    from regnf_core.schema.safe_format import read_description
-
-    if source.file.suffix.lower() != ".safetensors" or source.description or source.settings:
-        return None
-    return FieldNotes.of_source(read_description(source.file)["source"])
-
-
 def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
     from regnf_core.importing.gate.gate import FIELD_NAME, import_field
 
     name = _digest(source)
     kept, report = cache_dir / f"{name}.safetensors", cache_dir / f"{name}.json"
-    if kept.exists() and (notes := _read_notes(report)) is not None:
-        return SafeField(kept, notes)
+    with suppress(OSError, ValueError, AttributeError):  # not there, or damaged: made again
+        notes = FieldNotes.of_report(json.loads(report.read_text(encoding="utf-8")))
+        if kept.exists():
+            return SafeField(kept, notes)
     cache_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache_dir) as folder, source.packed_settings() as settings:
         said = source.description or None
@@ -126,13 +122,6 @@ def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
             path.write_text(json.dumps(notes.to_dict()), encoding="utf-8")
         os.replace(Path(folder) / FIELD_NAME, kept)
     return SafeField(kept, notes)
-
-
-def _read_notes(path: Path) -> FieldNotes | None:
-    try:
-        return FieldNotes.of_report(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, AttributeError):
-        return None
 
 
 def _digest(source: FieldSource) -> str:

@@ -213,9 +213,8 @@ class RegistrationOptions:
     def require_robust(self, feature: str, reason: str = InvalidOptionsError.reason) -> None:
         """Raises InvalidOptionsError with ``reason`` under another preset. feature: what only `robust` can do."""
         if self.preset != "robust":
-            raise InvalidOptionsError(
-                f"only the preset `robust` {feature}; the options name `{self.preset}`", reason=reason
-            )
+            message = f"only the preset `robust` {feature}; the options name `{self.preset}`"
+            raise InvalidOptionsError(message, reason=reason)
 
 
 def _refuse_other_types(given: Mapping[str, Any], read: Any, place: str = "options") -> None:
@@ -225,9 +224,9 @@ def _refuse_other_types(given: Mapping[str, Any], read: Any, place: str = "optio
         if isinstance(value, Mapping):
             _refuse_other_types(value, taken, f"{place}.{name}")
         elif isinstance(value, str | bool) and type(value) is not type(taken):
-            what, hint = (
-                ("a text", "Remove the quotation marks.") if isinstance(value, str) else ("true or false", None)
-            )
+            what, hint = "true or false", None
+            if isinstance(value, str):
+                what, hint = "a text", "Remove the quotation marks."
             wanted = "true or false" if isinstance(taken, bool) else "a number"
             raise InvalidOptionsError(f"{place}.{name}: is {what}, expected {wanted}", hint=hint)
 

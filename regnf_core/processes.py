@@ -57,10 +57,7 @@ def can_fork() -> bool:
 
 
 def in_processes(
-    work: Callable[[Task], Done],
-    tasks: Sequence[Task],
-    processes: int,
-    watch: Callable[[], None] = lambda: None,
+    work: Callable[[Task], Done], tasks: Sequence[Task], processes: int, watch: Callable[[], None] = lambda: None
 ) -> Generator[Done, None, None]:
     """``work`` of each task, in their order, done by forked copies of this process.
 

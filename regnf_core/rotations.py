@@ -99,14 +99,14 @@ def similarity_fault(rows: Any) -> str | None:
         transposed = [row[3] for row in rows] == [0, 0, 0, 1]
         return "the last row is not 0 0 0 1" + (", but the last column is: is it transposed?" if transposed else "")
     x, y, z = ([float(row[column]) for row in rows[:3]] for column in range(3))
-    squared = (_dot(x, x) + _dot(y, y) + _dot(z, z)) / 3
+    squared = (dot(x, x) + dot(y, y) + dot(z, z)) / 3
     if squared < _MIN_SCALE**2:
         return "the scale vanishes"
-    lengths = sum((_dot(axis, axis) / squared - 1) ** 2 for axis in (x, y, z))
-    angles = sum((_dot(a, b) / squared) ** 2 for a, b in ((x, y), (y, z), (z, x)))
+    lengths = sum((dot(axis, axis) / squared - 1) ** 2 for axis in (x, y, z))
+    angles = sum((dot(a, b) / squared) ** 2 for a, b in ((x, y), (y, z), (z, x)))
     if not math.sqrt(lengths + 2 * angles) <= TOLERANCE:
         return "the axes are sheared or stretched differently"
-    if _dot(_cross(x, y), z) < 0:
+    if dot(cross(x, y), z) < 0:
         return "it mirrors space"
     return None
 
@@ -115,7 +115,7 @@ def inverse_rows(rows: Rows) -> Rows:
     """The inverse of a similarity's 4x4: (s R)^T / s^2 and what takes the translation back."""
     scale_squared = sum(float(value) ** 2 for row in rows[:3] for value in row[:3]) / 3
     turned = [[float(rows[j][i]) / scale_squared for j in range(3)] for i in range(3)]
-    back = [-_dot(row, [float(each[3]) for each in rows[:3]]) + 0.0 for row in turned]
+    back = [-dot(row, [float(each[3]) for each in rows[:3]]) + 0.0 for row in turned]
     return [*([*row, t] for row, t in zip(turned, back, strict=True)), [0.0, 0.0, 0.0, 1.0]]
 
 
@@ -140,11 +140,3 @@ def _is_four_by_four(rows: Any) -> bool:
         and all(isinstance(row, Sequence) and len(row) == 4 for row in rows)
         and all(isinstance(number, int | float) and not isinstance(number, bool) for row in rows for number in row)
     )
-
-
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return sum(p * q for p, q in zip(a, b, strict=True))
-
-
-def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -116,7 +116,8 @@ def _hint(error: json.JSONDecodeError) -> str:
     text, at = error.doc, error.pos
     if not text.strip():
         return "It is empty. A JSON value is expected."
-    if _TRAILING_COMMA.match(text, _last_comma(text, at)):
+    before = text[: at + 1].rstrip().rstrip("}]").rstrip()
+    if before.endswith(",") and _TRAILING_COMMA.match(text, len(before) - 1):
         return "Remove the comma before the closing bracket."
     if text[at : at + 1] == "'":
         return 'JSON takes double quotes: "center", with no single ones.'
@@ -136,11 +137,3 @@ def _hint(error: json.JSONDecodeError) -> str:
     if not text[at].isascii():
         return f"The character there is U+{ord(text[at]):04X}, which JSON has in texts alone. Write it anew."
     return "Check the brackets, commas and quotation marks there."
-
-
-def _last_comma(text: str, at: int) -> int:
-    """Where the last comma before ``at`` is, if only white space lies between; else ``at``."""
-    before = text[: at + 1].rstrip()
-    if before and before[-1] in "}]":
-        before = before[:-1].rstrip()
-    return len(before) - 1 if before.endswith(",") else at

@@ -59,6 +59,34 @@ class PosedImages:
     def __len__(self) -> int:
         return len(self.colors)
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(N, H, W): where there is a depth, and no mask says background."""
+        measured = np.zeros(self.colors.shape[:3], np.bool_) if self.depths is None else self.depths > 0.0
+        return measured if self.masks is None else measured & self.masks
+
+    @property
+    def T_world_pixel(self) -> NDArray[np.float64]:
+        """(N, 3, 3): from (column + .5, row + .5, 1) to its ray in the world, whose part along the camera's axis is
+        1."""
+        return self.T_world_camera[:, :3, :3] @ np.linalg.inv(self.intrinsics)
+
+    def rays(
+        self, image: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Origins and directions (R, 3) of the rays of pixels (R,), world frame: as long as one unit of depth."""
+        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=-1)
+        return self.T_world_camera[image, :3, 3], np.einsum("rij,rj->ri", self.T_world_pixel[image], pixels)
+
+    def ends(self, image: int) -> NDArray[np.float64]:
+        """(H, W, 3): where one image's depths end, world frame; the camera's place where there is none."""
+        assert self.depths is not None
+        rows, columns = np.indices(self.size) + 0.5
+        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(self.intrinsics[image]).T
+        T = self.T_world_camera[image]
+        ends: NDArray[np.float64] = (self.depths[image][..., None] * rays) @ T[:3, :3].T + T[:3, 3]
+        return ends
+
     def moved(self, origin: NDArray[np.float64], scale: float) -> PosedImages:
         """The same images in the world x' = scale (x - origin). origin: (3,), world frame."""
         poses, T_world_local = self.T_world_camera.copy(), np.diag([1.0 / scale] * 3 + [1.0])

@@ -8,17 +8,78 @@ import struct
 import tempfile
 import tokenize
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from regnf_core.errors import DatasetError
-from regnf_data.instances import read_instances, write_instance
-from regnf_data.layouts import array, rigid, similarity, whole_number
-from regnf_data.posed_images import PosedImages
+from regnf_core.errors import DatasetError, InvalidDetectionError
+from regnf_core.geometry.box import OrientedBox
+from regnf_data.posed_images import Instance, PosedImages
+
+# Numbers and matrices out of a dataset's JSON, checked.
+
+_RIGID_TOLERANCE = 1e-3  # of rotations and scales: files are often written with few digits
+_LARGEST = 1e9  # larger numbers are neither places nor pixels, and their products overflow
+
+
+def array(value: Any, shapes: tuple[tuple[int, ...], ...], what: str, reason: str) -> NDArray[np.float64]:
+    """``value`` as float64 numbers of one of the shapes, finite and up to 1e9. Raises DatasetError (``reason``)."""
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.zeros(0)
+    if numbers.shape not in shapes or not (np.abs(numbers) <= _LARGEST).all():  # NaN is not either
+        wanted = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
+        raise DatasetError(f"{what} is not {wanted} finite numbers, none beyond {_LARGEST:g}", reason=reason)
+    return numbers
+
+
+def matrix4(value: Any, what: str, reason: str) -> NDArray[np.float64]:
+    """An affine (4, 4) matrix; the last row may be left out."""
+    given = array(value, ((4, 4), (3, 4)), what, reason)
+    matrix = np.eye(4)
+    matrix[: len(given)] = given
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-9):
+        raise DatasetError(f"{what} is not an affine transform: its last row is not 0 0 0 1", reason=reason)
+    return matrix
+
+
+def rigid(value: Any, what: str, reason: str) -> NDArray[np.float64]:
+    """A rotation and a translation, (4, 4)."""
+    matrix = matrix4(value, what, reason)
+    rotation = matrix[:3, :3]
+    straight = np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE)
+    if not straight or np.linalg.det(rotation) < 0.0:
+        raise DatasetError(f"{what} is not a rotation and a translation", reason=reason)
+    return matrix
+
+
+def similarity(value: Any, what: str, reason: str) -> NDArray[np.float64]:
+    """A rotation, one positive scale and a translation, (4, 4)."""
+    matrix = matrix4(value, what, reason)
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    if determinant <= 0.0:
+        raise DatasetError(f"{what} is not a similarity: its determinant is not positive", reason=reason)
+    rotation = matrix[:3, :3] / np.cbrt(determinant)
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE):
+        raise DatasetError(f"{what} is not a similarity: it shears or scales unevenly", reason=reason)
+    return matrix
+
+
+def whole_number(value: Any, what: str, reason: str) -> int:
+    """A positive whole number."""
+    whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    if isinstance(value, bool) or not whole or value < 1:
+        raise DatasetError(f"{what} is not a positive whole number", reason=reason)
+    return int(value)
+
 
 # The image files of a dataset: colors, depths and masks, each checked against the size that is due.
 
@@ -26,16 +87,9 @@ Size = tuple[int, int]
 """Height and width, pixels."""
 
 _FAULTS_OF_CONTENT = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    struct.error,
-    tokenize.TokenError,
-    zlib.error,
-    Image.DecompressionBombError,
-    Image.DecompressionBombWarning,
-)
+    OSError, SyntaxError, ValueError, EOFError, struct.error, tokenize.TokenError, zlib.error,
+    Image.DecompressionBombError, Image.DecompressionBombWarning,
+)  # fmt: skip
 """What pillow and numpy raise on malformed files."""
 
 
@@ -59,24 +113,14 @@ def resolve(folder: Path, name: Any, what: str) -> Path:
     return path
 
 
-def image_size(path: Path) -> Size:
-    """Height and width by the file's header."""
+@contextmanager
+def opened_image(path: Path) -> Iterator[Image.Image]:
+    """The picture in a file. Raises DatasetError (DATASET_IMAGE_INVALID) for what is none, also within the block."""
     try:
         with Image.open(path) as image:
-            return image.height, image.width
+            yield image
     except _FAULTS_OF_CONTENT as error:
         raise _invalid(path, error) from error
-
-
-def read_colors(path: Path, size: Size) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8, sRGB; transparency is left out."""
-    return np.asarray(_decoded(path, size, "RGB"), dtype=np.uint8)
-
-
-def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
-    """(H, W): true where the picture is brighter than half; one of zeros and ones counts as such."""
-    gray = _decoded(path, size, "L")
-    return np.asarray(gray > (127 if gray.max() > 1 else 0))
 
 
 def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32]:
@@ -86,16 +130,13 @@ def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32
     ``.npy`` holds world units; an image holds whole numbers of ``unit`` world units each.
     Raises DatasetError (DATASET_DEPTH_UNIT_MISSING, DATASET_SIZES_DIFFER, DATASET_IMAGE_INVALID).
     """
-    stored = _array_file(path, size) if path.suffix.lower() == ".npy" else None
-    if stored is None and unit is None:
-        raise DatasetError(
-            f"{path.name}: a depth image needs depth_unit_scale_factor in the metadata",
-            reason="DATASET_DEPTH_UNIT_MISSING",
-        )
-    if stored is None:
-        stored, factor = _decoded(path, size, None), unit or 1.0
+    if path.suffix.lower() == ".npy":
+        stored, factor = _array_file(path, size), 1.0
+    elif unit is None:
+        message = f"{path.name}: a depth image needs depth_unit_scale_factor in the metadata"
+        raise DatasetError(message, reason="DATASET_DEPTH_UNIT_MISSING")
     else:
-        factor = 1.0
+        stored, factor = decoded(path, size, None), unit
     largest = np.finfo(stored.dtype).max if stored.dtype.kind == "f" else np.iinfo(stored.dtype).max
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (stored.astype(np.float64) * factor).astype(np.float32)
@@ -116,15 +157,13 @@ def _array_file(path: Path, size: Size) -> NDArray[Any]:
     return np.array(stored).reshape(size)
 
 
-def _decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
-    try:
-        with Image.open(path) as image:
-            # Told by the header: nothing of the wrong size is decoded.
-            if (image.height, image.width) != size:
-                raise _differs(path, (image.height, image.width), size)
-            kind, pixels = image.mode, np.asarray(image.convert(mode) if mode else image)
-    except _FAULTS_OF_CONTENT as error:
-        raise _invalid(path, error) from error
+def decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
+    """The pixels; with a ``mode``, converted to it. Without: numbers (H, W)."""
+    with opened_image(path) as image:
+        # Told by the header: nothing of the wrong size is decoded.
+        if (image.height, image.width) != size:
+            raise _differs(path, (image.height, image.width), size)
+        kind, pixels = image.mode, np.asarray(image.convert(mode) if mode else image)
     if pixels.shape[:2] != size or (mode is None and pixels.ndim != 2):
         raise DatasetError(f"{path.name} has more than one channel", reason="DATASET_IMAGE_INVALID")
     if mode is None and (kind == "P" or pixels.dtype.kind not in "fiu"):
@@ -169,23 +208,34 @@ def load_dataset(folder: str | os.PathLike[str], opengl: bool = False) -> PosedI
     """
     root = Path(folder)
     metadata = read_metadata(root)
-    check_camera(metadata)
-    frames = _frames(metadata)
+    frames = frames_of(metadata)
     size = _size(metadata, root, frames)
     # What lies in the metadata comes first: it is refused before any image is decoded.
     intrinsics = np.stack([intrinsics_of_frame(frame, metadata, index) for index, frame in enumerate(frames)])
-    poses = [rigid(f.get("camtoworld"), f"camtoworld of frame {i}", _pose_reason(f)) for i, f in enumerate(frames)]
-    bounds = _bounds(metadata)
-    instances = read_instances(metadata.get("instances"))
+    poses = []
+    for index, given in enumerate(frame.get("camtoworld") for frame in frames):
+        reason = _INVALID if given is None else "DATASET_POSE_NOT_RIGID"
+        poses.append(rigid(given, f"camtoworld of frame {index}", reason))
+    bounds, instances, T_metric_world = _bounds(metadata), read_instances(metadata.get("instances")), None
+    if (given := worldtogt(metadata)) is not None:
+        T_metric_world = similarity(given, "worldtogt", _INVALID)
+    unit = metadata.get("depth_unit_scale_factor")
+    unit = None if unit is None else float(array(unit, ((),), "depth_unit_scale_factor", _INVALID))
+    pictures = [resolve(root, frame.get("rgb_path"), f"rgb_path of frame {i}") for i, frame in enumerate(frames)]
+    depths = masks = None
+    if (paths := _paths(root, metadata, frames, "sensor_depth_path", "has_sensor_depth")) is not None:
+        depths = np.stack([read_depth(p, size, unit) if p else np.zeros(size, np.float32) for p in paths])
+    if (paths := _paths(root, metadata, frames, "foreground_mask", "has_foreground_mask")) is not None:
+        masks = np.stack([read_mask(p, size) if p else np.ones(size, np.bool_) for p in paths])
     return PosedImages(
-        colors=_colors(root, frames, size),
+        colors=np.stack([np.asarray(decoded(path, size, "RGB"), dtype=np.uint8) for path in pictures]),
         intrinsics=intrinsics,
         T_world_camera=np.stack(poses) * np.array((1.0, -1.0, -1.0, 1.0) if opengl else 1.0),
         bounds=bounds,
-        depths=_depths(root, metadata, frames, size),
-        masks=_masks(root, metadata, frames, size),
+        depths=depths,
+        masks=masks,
         instances=instances,
-        T_metric_world=metric_world(metadata),
+        T_metric_world=T_metric_world,
     )
 
 
@@ -204,17 +254,14 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     return content
 
 
-def check_camera(metadata: dict[str, Any]) -> None:
+def frames_of(metadata: dict[str, Any]) -> list[dict[str, Any]]:
+    """Those with a pose. Raises DatasetError for cameras that are no pinholes, too."""
     model = metadata.get("camera_model", "OPENCV")
     if model not in _CAMERAS:
-        raise DatasetError(
-            f"camera model {model!r:.80}: only {', '.join(_CAMERAS)}", reason="DATASET_CAMERA_UNSUPPORTED"
-        )
+        message = f"camera model {model!r:.80}: only {', '.join(_CAMERAS)}"
+        raise DatasetError(message, reason="DATASET_CAMERA_UNSUPPORTED")
     if any(metadata.get(name) not in (None, 0, 0.0) for name in _DISTORTION):
         raise DatasetError("lenses that distort: undistort the images", reason="DATASET_CAMERA_UNSUPPORTED")
-
-
-def _frames(metadata: dict[str, Any]) -> list[dict[str, Any]]:
     frames = metadata.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DatasetError("the metadata lists no frames", reason="DATASET_NO_FRAMES")
@@ -236,17 +283,14 @@ def _lost(pose: Any) -> bool:
 
 
 def _size(metadata: dict[str, Any], folder: Path, frames: list[dict[str, Any]]) -> Size:
-    stated = (metadata.get("height"), metadata.get("width"))
-    if None in stated:
-        height, width = image_size(resolve(folder, frames[0].get("rgb_path"), "rgb_path of frame 0"))
+    if metadata.get("height") is None or metadata.get("width") is None:
+        with _opened(resolve(folder, frames[0].get("rgb_path"), "rgb_path of frame 0")) as image:
+            height, width = image.height, image.width
     else:
-        height, width = (
-            whole_number(value, name, _INVALID) for value, name in zip(stated, ("height", "width"), strict=True)
-        )
+        height, width = (whole_number(metadata[name], name, _INVALID) for name in ("height", "width"))
     if len(frames) * height * width > _MAX_PIXELS:
-        raise DatasetError(
-            f"{len(frames)} images of {height} x {width}: more than {_MAX_PIXELS} pixels", reason="DATASET_TOO_LARGE"
-        )
+        message = f"{len(frames)} images of {height} x {width}: more than {_MAX_PIXELS} pixels"
+        raise DatasetError(message, reason="DATASET_TOO_LARGE")
     return height, width
 
 
@@ -259,10 +303,6 @@ def intrinsics_of_frame(frame: dict[str, Any], metadata: dict[str, Any], index: 
     return matrix
 
 
-def _pose_reason(frame: dict[str, Any]) -> str:
-    return _INVALID if frame.get("camtoworld") is None else "DATASET_POSE_NOT_RIGID"
-
-
 def _bounds(metadata: dict[str, Any]) -> NDArray[np.float64]:
     scene_box = metadata.get("scene_box") or {}
     if not isinstance(scene_box, dict):
@@ -273,51 +313,30 @@ def _bounds(metadata: dict[str, Any]) -> NDArray[np.float64]:
     return bounds
 
 
-def metric_world(metadata: dict[str, Any]) -> NDArray[np.float64] | None:
-    given = metadata.get("worldtogt")
-    if given is None:  # some files say it with each instance instead
-        named = metadata.get("instances")
-        entries = list(named.values()) if isinstance(named, dict) else named or []
-        given = next((entry["worldtogt"] for entry in entries if entry.get("worldtogt") is not None), None)
-    return None if given is None else similarity(given, "worldtogt", _INVALID)
+def worldtogt(metadata: dict[str, Any]) -> Any:
+    """Some files say it with each instance instead."""
+    named = metadata.get("instances") or []
+    entries = list(named.values()) if isinstance(named, dict) else named
+    return next((e["worldtogt"] for e in (metadata, *entries) if e.get("worldtogt") is not None), None)
 
 
-def _colors(folder: Path, frames: list[dict[str, Any]], size: Size) -> NDArray[np.uint8]:
-    paths = [resolve(folder, frame.get("rgb_path"), f"rgb_path of frame {i}") for i, frame in enumerate(frames)]
-    return np.stack([read_colors(path, size) for path in paths])
+def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
+    """(H, W): true where the picture is brighter than half; one of zeros and ones counts as such."""
+    gray = decoded(path, size, "L")
+    return np.asarray(gray > (127 if gray.max() > 1 else 0))
 
 
-def _depths(
-    folder: Path, metadata: dict[str, Any], frames: list[dict[str, Any]], size: Size
-) -> NDArray[np.float32] | None:
-    if metadata.get("has_sensor_depth") is False:
-        return None
-    paths = _paths(folder, frames, "sensor_depth_path", bool(metadata.get("has_sensor_depth")))
-    if paths is None:
-        return None
-    given = metadata.get("depth_unit_scale_factor")
-    unit = None if given is None else float(array(given, ((),), "depth_unit_scale_factor", _INVALID))
-    return np.stack([read_depth(p, size, unit) if p else np.zeros(size, dtype=np.float32) for p in paths])
-
-
-def _masks(
-    folder: Path, metadata: dict[str, Any], frames: list[dict[str, Any]], size: Size
-) -> NDArray[np.bool_] | None:
-    if metadata.get("has_foreground_mask") is False:
-        return None
-    paths = _paths(folder, frames, "foreground_mask", bool(metadata.get("has_foreground_mask")))
-    if paths is None:
-        return None
-    return np.stack([read_mask(p, size) if p else np.ones(size, dtype=np.bool_) for p in paths])
-
-
-def _paths(folder: Path, frames: list[dict[str, Any]], key: str, promised: bool) -> list[Path | None] | None:
+def _paths(
+    folder: Path, metadata: dict[str, Any], frames: list[dict[str, Any]], key: str, promise: str
+) -> list[Path | None] | None:
     """A frame may lack its file; if all do, the dataset has none of the kind, unless it promised them."""
     named = [frame.get(key) for frame in frames]
+    if metadata.get(promise) is False:
+        return None
     if any(name is not None for name in named):
         what = f"{key} of frame"
         return [None if n is None else resolve(folder, n, f"{what} {i}") for i, n in enumerate(named)]
-    if promised:
+    if metadata.get(promise):
         raise DatasetError(f"the metadata promises files that no frame names: {key}", reason="DATASET_IMAGE_MISSING")
     return None
 
@@ -369,20 +388,18 @@ def _write_frame(images: PosedImages, index: int, folder: Path) -> dict[str, Any
 
 
 def _written_metadata(images: PosedImages, frames: list[dict[str, Any]]) -> dict[str, Any]:
-    height, width = images.size
-    metadata: dict[str, Any] = {
+    known = {} if images.T_metric_world is None else {"worldtogt": images.T_metric_world.tolist()}
+    return {
         "camera_model": "OPENCV",
-        "height": height,
-        "width": width,
+        "height": images.size[0],
+        "width": images.size[1],
         "has_sensor_depth": images.depths is not None,
         "has_foreground_mask": images.masks is not None,
         "scene_box": _scene_box(images),
+        **known,
+        "instances": [write_instance(instance) for instance in images.instances],
+        "frames": frames,
     }
-    if images.T_metric_world is not None:
-        metadata["worldtogt"] = images.T_metric_world.tolist()
-    metadata["instances"] = [write_instance(instance) for instance in images.instances]
-    metadata["frames"] = frames
-    return metadata
 
 
 def _scene_box(images: PosedImages) -> dict[str, Any]:
@@ -401,4 +418,87 @@ def _scene_box(images: PosedImages) -> dict[str, Any]:
     }
 
 
-__all__ = ["METADATA", "check_target", "load_dataset", "write_dataset"]
+# The things that a dataset names: their boxes and poses, in JSON and out of it.
+
+_REASON = "DATASET_INSTANCE_INVALID"
+_LABELS = ("label", "name", "id", "class", "class_name")
+_LONGEST_LABEL = 200
+_CORNER_TOLERANCE = 1e-3
+"""Of a box's corners, as a share of its diagonal."""
+
+
+def read_instances(given: Any) -> tuple[Instance, ...]:
+    """The instances of a list, or of an object that names them by its keys; None is none.
+
+    Raises DatasetError (DATASET_INSTANCE_INVALID).
+    """
+    if not isinstance(given, dict | list | None):
+        raise DatasetError("instances are neither a list nor an object", reason=_REASON)
+    named = given.items() if isinstance(given, dict) else ((None, entry) for entry in given or ())
+    return tuple(_read(entry, name) for name, entry in named)
+
+
+def write_instance(instance: Instance) -> dict[str, Any]:
+    """One instance as the metadata holds it. ``box_min`` and ``box_max`` bound the corners along the world's axes."""
+    box = instance.box
+    corners = box.corners().numpy()
+    written: dict[str, Any] = {
+        "label": instance.label,
+        "box_min": corners.min(axis=0).tolist(),
+        "box_max": corners.max(axis=0).tolist(),
+        "box_corners": corners.tolist(),
+        # The three above lose the last digits, and the box's own axes; this is what regnf reads back.
+        "box": {"center": box.center.tolist(), "size": box.size.tolist(), "rotation": box.rotation.tolist()},
+    }
+    matrices = {name: getattr(instance, name) for name in ("T_object_world", "world_pose", "gt_pose")}
+    return written | {name: np.asarray(T).tolist() for name, T in matrices.items() if T is not None}
+
+
+def _box_of_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Center (3,), edge lengths (3,) and axes (3, 3), as columns, of the box whose corners (8, 3) come in any order."""
+    offsets = corners[1:] - corners[0]
+    lengths = np.linalg.norm(offsets, axis=1)
+    diagonal = offsets[lengths.argmax()]
+    allowed = _CORNER_TOLERANCE * float(np.linalg.norm(diagonal))
+    for chosen in combinations(range(7), 3):
+        edges, size = offsets[list(chosen)], lengths[list(chosen)]
+        if size.min() <= 0.0 or np.abs(edges.sum(axis=0) - diagonal).max() > allowed:
+            continue
+        axes = (edges / size[:, None]).T
+        if np.abs(axes.T @ axes - np.eye(3)).max() <= _CORNER_TOLERANCE:
+            if np.linalg.det(axes) < 0.0:
+                axes = axes[:, ::-1]
+                size = size[::-1]
+            left, _, right = np.linalg.svd(axes)
+            return corners.mean(axis=0), size, left @ right
+    raise DatasetError("box_corners are not the eight corners of a box", reason=_REASON)
+
+
+def _read(entry: Any, name: str | None) -> Instance:
+    if not isinstance(entry, dict):
+        raise DatasetError("an instance is not a JSON object", reason=_REASON)
+    label = str(next((entry[key] for key in _LABELS if entry.get(key) is not None), name or "instance"))
+    label = "".join(letter if letter.isprintable() else "?" for letter in label[:_LONGEST_LABEL])
+    read = {"T_object_world": similarity, "world_pose": matrix4, "gt_pose": matrix4}
+    known = {k: of(entry[k], f"{k} of {label}", _REASON) for k, of in read.items() if entry.get(k) is not None}
+    return Instance(label, _box(entry, label), **known)
+
+
+def _box(entry: dict[str, Any], label: str) -> OrientedBox:
+    """What says most about the box comes first: box, box_corners, box_min with box_max."""
+    try:
+        if isinstance(entry.get("box"), dict):
+            shapes = {"center": (3,), "size": (3,), "rotation": (3, 3)}
+            parts = [array(entry["box"].get(k), (s,), f"box {k} of {label}", _REASON) for k, s in shapes.items()]
+        elif entry.get("box_corners") is not None:
+            corners = array(entry["box_corners"], ((8, 3),), f"box_corners of {label}", _REASON)
+            parts = list(_box_of_corners(corners))
+            if np.allclose(np.abs(parts[2]).max(axis=0), 1.0, atol=1e-6):
+                return OrientedBox.from_corners(corners.min(axis=0), corners.max(axis=0), label)
+        else:
+            lower, upper = (array(entry.get(k), ((3,),), f"{k} of {label}", _REASON) for k in ("box_min", "box_max"))
+            return OrientedBox.from_corners(lower, upper, label)
+        center, size, rotation = (torch.tensor(np.ascontiguousarray(part)) for part in parts)
+        return OrientedBox(center, size, rotation, label)
+    except InvalidDetectionError as error:
+        raise DatasetError(f"the box of {label}: {error}", reason=_REASON) from error

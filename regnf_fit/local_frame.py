@@ -63,8 +63,5 @@ class LocalFrame:
         if self.same:
             return description
         placement = {"transform": self.T_world_local.tolist(), "bounds": description["bounds"]}
-        return {**description, "placement": placement, "bounds": self._outside(description["bounds"])}
-
-    def _outside(self, bounds: Any) -> list[list[float]]:
-        corners = np.asarray(bounds, np.float64) / self.scale + self.origin
-        return [[float(number) for number in corner] for corner in corners]
+        outside = np.asarray(description["bounds"], np.float64) / self.scale + self.origin
+        return {**description, "placement": placement, "bounds": outside.tolist()}

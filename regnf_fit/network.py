@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
+from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.options import NetworkOptions
 
 GRID_RADIUS = 2.0
@@ -44,8 +46,7 @@ class TrainableField(nn.Module):
         super().__init__()
         self.options = options
         grid = options.grid
-        table = torch.rand(grid.entries, grid.features_per_level, generator=generator)
-        self.table = nn.Parameter((2.0 * table - 1.0) * _TABLE_SPREAD)
+        self.table = random_table(grid, generator)
         self._encoding = PositionalEncoding(POSITION_DEGREE)
         widths = [3 + self._encoding.width + grid.width] + [options.hidden_width] * options.hidden_layers
         weights, biases = random_layers(widths, generator)
@@ -78,10 +79,27 @@ class TrainableField(nn.Module):
     def tensors(self) -> dict[str, NDArray[Any]]:
         """The parameters of the distance, by the names of the safe format."""
         table = self.table.detach()
-        tensors: dict[str, Tensor] = {"hash_table": table.half() if self.options.half_table else table}
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"] = weight.detach(), bias.detach()
-        return {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+        tensors = {"hash_table": table.half() if self.options.half_table else table}
+        return arrays_of(tensors | layer_tensors(self.weights, self.biases))
+
+
+def random_table(grid: HashGridConfig, generator: torch.Generator) -> nn.Parameter:
+    """A hash table's start: next to zero."""
+    table = torch.rand(grid.entries, grid.features_per_level, generator=generator)
+    return nn.Parameter((2.0 * table - 1.0) * _TABLE_SPREAD)
+
+
+def layer_tensors(weights: Iterable[Tensor], biases: Iterable[Tensor]) -> dict[str, Tensor]:
+    """Layers by their names in the safe format."""
+    named: dict[str, Tensor] = {}
+    for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        named |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+    return named
+
+
+def arrays_of(tensors: dict[str, Tensor]) -> dict[str, NDArray[Any]]:
+    """The same on the CPU."""
+    return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
 
 
 def random_layers(widths: list[int], generator: torch.Generator) -> tuple[list[Tensor], list[Tensor]]:
@@ -94,15 +112,8 @@ def random_layers(widths: list[int], generator: torch.Generator) -> tuple[list[T
 
 
 def make_optimizer(
-    table: nn.Parameter, networks: list[nn.Parameter], options: NetworkOptions, *more: dict[str, Any]
+    table: nn.Parameter, networks: list[nn.Parameter], table_rate: float, network_rate: float, *more: dict[str, Any]
 ) -> torch.optim.Adam:
     """Adam with one rate for the hash table and one for the networks. more: further parameter groups."""
-    return torch.optim.Adam(
-        [
-            {"params": [table], "lr": options.table_rate, "eps": 1e-15},
-            {"params": networks, "lr": options.network_rate},
-            *more,
-        ],
-        betas=(0.9, 0.99),
-        fused=True,
-    )
+    groups = [{"params": [table], "lr": table_rate, "eps": 1e-15}, {"params": networks, "lr": network_rate}, *more]
+    return torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)

@@ -11,7 +11,9 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, StrictInt, TypeAdapter
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.records import FORMAT, UnreadableRecordError, check_json_format
@@ -57,7 +59,7 @@ class Artifact:
     """One file that an attempt wrote."""
 
     name: str
-    bytes: int
+    bytes: Annotated[int, Field(strict=True, ge=0)]
     sha256: str
 
     @property
@@ -107,6 +109,19 @@ class Rest:
         return _document({"artifacts": _listed(self.artifacts), "missing": list(self.missing)})
 
 
+@dataclass(frozen=True)
+class _Document:
+    """A manifest or a rest, as it is read."""
+
+    artifacts: tuple[Artifact, ...]
+    attempt: StrictInt = 0
+    pending: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+
+_DOCUMENT = TypeAdapter(_Document)
+
+
 def _document(members: dict[str, Any]) -> bytes:
     return json.dumps({"format": FORMAT} | members, indent=1).encode()
 
@@ -134,49 +149,26 @@ def read_manifest(blobs: BlobStore, job_id: str) -> Manifest | None:
 
     Raises UnreadableRecordError.
     """
-    document = _read(blobs, job_id, manifest_key(job_id))
-    if document is None:
+    first = _read(blobs, job_id, manifest_key(job_id))
+    if first is None:
         return None
-    attempt = document.get("attempt")
-    if not isinstance(attempt, int):
+    if not first.attempt:
         raise UnreadableRecordError(job_id, "its manifest is damaged")
-    published = Manifest(job_id, attempt, _artifacts(document, job_id), _names(document, "pending", job_id))
-    rest = _read(blobs, job_id, rest_key(job_id)) if published.pending else None
+    published = Manifest(job_id, first.attempt, first.artifacts, first.pending)
+    rest = _read(blobs, job_id, rest_key(job_id)) if first.pending else None
     if rest is None:
         return published
-    artifacts = published.artifacts + _artifacts(rest, job_id)
-    return replace(published, artifacts=artifacts, pending=(), missing=_names(rest, "missing", job_id))
+    return replace(published, artifacts=first.artifacts + rest.artifacts, pending=(), missing=rest.missing)
 
 
-def _read(blobs: BlobStore, job_id: str, key: str) -> dict[str, Any] | None:
+def _read(blobs: BlobStore, job_id: str, key: str) -> _Document | None:
     try:
         with blobs.open(key) as file:
-            return check_json_format(job_id, json.load(file))
+            return _DOCUMENT.validate_python(check_json_format(job_id, json.load(file)))
     except FileNotFoundError:
         return None
-    except ValueError as error:
+    except ValueError as error:  # pydantic's are
         raise UnreadableRecordError(job_id, "its manifest is damaged") from error
-
-
-def _artifacts(document: dict[str, Any], job_id: str) -> tuple[Artifact, ...]:
-    try:
-        listed = tuple(Artifact(one["name"], one["bytes"], one["sha256"]) for one in document["artifacts"])
-    except (KeyError, TypeError) as error:
-        raise UnreadableRecordError(job_id, "its manifest is damaged") from error
-    if not all(map(_is_sound, listed)):
-        raise UnreadableRecordError(job_id, "its manifest is damaged")
-    return listed
-
-
-def _names(document: dict[str, Any], member: str, job_id: str) -> tuple[str, ...]:
-    names = document.get(member, [])
-    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        raise UnreadableRecordError(job_id, "its manifest is damaged")
-    return tuple(names)
-
-
-def _is_sound(one: Artifact) -> bool:
-    return isinstance(one.name, str) and isinstance(one.bytes, int) and isinstance(one.sha256, str) and one.bytes >= 0
 
 
 def read_result(blobs: BlobStore, manifest: Manifest) -> dict[str, Any]:

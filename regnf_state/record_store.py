@@ -7,10 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from regnf_core.library_entries import EntryNotes
-from regnf_state.records import (
-    FieldRecord,
-    RecordError,
-)
+from regnf_state.records import FieldRecord, RecordError
 
 # The entries of callers' libraries: each is a part of the record of the field that it names.
 

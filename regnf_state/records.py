@@ -45,7 +45,7 @@ class QuotaError(RecordError):
 class RecordsFullError(RecordError):
     """The store keeps the room that it has left for what goes on already."""
 
-    reason = "RECORDS_FULL"
+    reason = "STORAGE_FULL"
 
 
 class StaleAttemptError(RecordError):
@@ -132,10 +132,6 @@ class JobRecord:
         return "batch" in self.inputs
 
 
-ORIGINAL_UNTIL = "original_until"
-"""In a rejected field's error or a ready field's report: until when the upload itself is kept."""
-VIEWS, DRAWINGS = "views", "drawings"
-"""In a ready field's report: what has become of its mesh and picture, and how often their making was begun."""
 CANDIDATES = "candidates"
 """In a rejected field's error: what its upload may be, each with its name, the entries of a description that choose it,
 and whether its picture is stored for as long as the upload is kept."""
@@ -185,6 +181,12 @@ class FieldRecord:
     """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
     library: dict[str, Any] | None = None
     """What its owner's library says of it: see ``regnf_state.record_store``. None: it is no entry of it."""
+    original_until: float | None = None
+    """Until when the upload is kept although its import has ended; None: it is not."""
+    views: ViewState | None = None
+    """Of a ready field: whether its mesh and picture are still to be made, are there, or cannot be made."""
+    drawings: int = 0
+    """How often the making of mesh and picture was begun."""
 
     @property
     def owner(self) -> str:
@@ -216,29 +218,6 @@ class FieldRecord:
             case {"name": str() as name, "sha256": str() as sha256, "bytes": int() as size}:
                 return SettingsFile(name, sha256, size)
         return None
-
-    @property
-    def views(self) -> ViewState | None:
-        """Of a ready field: whether its mesh and picture are still to be made, are there, or cannot be made.
-
-        None: of an import by an earlier release, which made them itself where it could.
-        """
-        state = self.report.get(VIEWS) if self.state == "ready" else None
-        return state if state in ("pending", "ready", "none") else None
-
-    @property
-    def drawings(self) -> int:
-        """How often the making of mesh and picture was begun."""
-        begun = self.report.get(DRAWINGS)
-        return begun if isinstance(begun, int) else 0
-
-    @property
-    def original_until(self) -> float | None:
-        """Until when the upload is kept although its import has ended; None: it is not."""
-        if self.state == "validating":
-            return None
-        until = ((self.error if self.state == "rejected" else self.report) or {}).get(ORIGINAL_UNTIL)
-        return float(until) if isinstance(until, int | float) else None
 
     def has_candidate_picture(self, number: int) -> bool:
         """Whether the ``number``-th candidate, counted from 1, has a picture."""

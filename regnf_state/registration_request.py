@@ -66,18 +66,11 @@ class RegistrationRequest:
 
     def values(self) -> dict[str, Any]:
         """Plain (JSON) values; equal requests have equal ones."""
-        box = self.detection
         values = {
             "scene": self.scene,
             "object": self.object,
             "candidates": None if self.candidates is None else list(self.candidates),
-            "detection": {
-                "center": list(box.center),
-                "size": list(box.size),
-                "rotation_quaternion_xyzw": list(box.rotation_quaternion_xyzw),
-                "label": box.label,
-                "score": box.score,
-            },
+            "detection": self.detection.values(),
             "options": self.options.to_dict(),
             "seed": self.seed,
             "initial_transform": self.initial_transform,
@@ -101,7 +94,7 @@ class RegistrationRequest:
             scene=record["scene"],
             object=record["object"],
             candidates=None if candidates is None else tuple(candidates),
-            detection=recorded_detection(record["detection"]),
+            detection=_recorded(record["detection"]),
             options=RegistrationOptions.from_dict(record["options"]),
             seed=record["seed"],
             initial_transform=record["initial_transform"],
@@ -111,15 +104,10 @@ class RegistrationRequest:
         )
 
 
-def recorded_detection(record: Mapping[str, Any]) -> Detection:
-    """The box of canonical values, as they are: to normalize the quaternion again might change its last bits."""
-    return Detection(
-        center=tuple(record["center"]),
-        size=tuple(record["size"]),
-        rotation_quaternion_xyzw=tuple(record["rotation_quaternion_xyzw"]),
-        label=record["label"],
-        score=record["score"],
-    )
+def _recorded(values: Mapping[str, Any]) -> Detection:
+    """The box of recorded values, as they are: to normalize the quaternion again might change its last bits."""
+    members: dict[str, Any] = {n: tuple(one) if isinstance(one, list) else one for n, one in values.items()}
+    return Detection(**members)
 
 
 # What a rendering job is asked to do: one typed value, from the HTTP route through the record to the engine.

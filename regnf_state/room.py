@@ -9,7 +9,7 @@ ends, deletes or reports is never refused here. Counts stand for bytes: transiti
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.records import ORIGINAL_UNTIL, FieldRecord, RecordsFullError, StaleAttemptError, UnreadableRecordError
+from regnf_state.records import FieldRecord, RecordsFullError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
 from regnf_state.redis.counters import Owners
 from regnf_state.redis.jobs import RecordStore
@@ -25,7 +25,7 @@ from regnf_state.settings import Settings
 
 # Uploads that stay for a while after their import: a question of the import is then answered without a second upload.
 #
-# The record says until when, in its error or its report; the bytes count towards the caller's quota, and go for a new
+# The record says until when; the bytes count towards the caller's quota, and go for a new
 # upload that needs their room. Of each caller so many bytes are kept at most, the latest.
 
 QUESTIONS = frozenset(
@@ -91,11 +91,10 @@ class Originals:
         self._kept_s = settings.keep_originals_s
         self._most_bytes = settings.keep_originals_bytes
 
-    def keep_with(self, values: Mapping[str, Any], rejected: bool) -> dict[str, Any]:
-        """A field's error (``rejected``) or report, saying until when its upload is kept, if it is."""
-        kept = self._choice == "all" if not rejected else self._choice != "none" and values.get("reason") in QUESTIONS
-        plain = {name: value for name, value in values.items() if name != ORIGINAL_UNTIL}
-        return plain | {ORIGINAL_UNTIL: round(self._records.now() + self._kept_s, 3)} if kept else plain
+    def kept_until(self, rejection: str | None) -> float | None:
+        """Until when the upload of a field is kept that was rejected for this reason, or (None) is ready now."""
+        kept = self._choice == "all" if rejection is None else self._choice != "none" and rejection in QUESTIONS
+        return round(self._records.now() + self._kept_s, 3) if kept else None
 
     def trim(self, owner: str) -> int:
         """Let go of those whose time is over, and of the oldest beyond what is kept; how many."""
@@ -117,17 +116,14 @@ class Originals:
         return sum(field.upload_bytes for field in self._kept(owner))
 
     def _kept(self, owner: str) -> list[FieldRecord]:
-        """Those whose time is over first, first."""
         return self._records.fields_with_original(owner)
 
     def drop(self, field: FieldRecord) -> bool:
         """Let go of the upload of a field whose import has ended; False when it has changed meanwhile.
 
         The record first: what it says is kept is there. An upload of the same bytes in between keeps its own."""
-        holder, said = ("error", field.error) if field.state == "rejected" else ("report", field.report)
-        without = {name: value for name, value in (said or {}).items() if name != ORIGINAL_UNTIL}
         try:
-            self._records.update_field(field.sha256, attempt=field.attempt, **{holder: without})
+            self._records.update_field(field.sha256, attempt=field.attempt, original_until=None)
         except StaleAttemptError:
             return False
         now = self._records.get_field(field.sha256)
@@ -195,7 +191,6 @@ class Room:
 
         How many jobs went.
         """
-        self._owners.find()
         evicted = 0
         for owner in self._owners.all():
             self._originals.trim(owner)
@@ -219,7 +214,6 @@ class Room:
         return 0 if owner is None else self._evict(owner, most, confirm)
 
     def _evict(self, owner: str, most: int, confirm: Callable[[], None] = lambda: None) -> int:
-        """Forget a caller's oldest finished jobs, ``most`` at most, results included."""
         gone = 0
         for job_id in self._owners.oldest_finished(owner, most):
             confirm()
@@ -236,7 +230,6 @@ class Room:
         return gone
 
     def _drop_rejected(self, owner: str) -> None:
-        """Forget a caller's oldest rejected fields beyond those that are kept."""
         for reference in self._records.rejected_beyond(owner, _REJECTED_KEPT, _AT_ONCE):
             field = self._records.get_field(reference)
             if field is None or field.state == "rejected":

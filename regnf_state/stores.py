@@ -35,5 +35,5 @@ def open_stores(settings: Settings, *, retries: int | None, storage_wait_s: floa
     url = redis_address(settings)
     redis = connect_bounded(url) if retries is None else connect(url, retries=retries)
     blobs = open_blobs(settings, storage_wait_s, existing)
-    queue = JobQueue(redis, settings.queue_key, settings.caller_weights, settings.worker_reserve_s)
-    return Stores(redis, JournaledRecordStore(redis, settings.job_retention_s, blobs), blobs, queue)
+    records = JournaledRecordStore(redis, settings.job_retention_s, blobs)
+    return Stores(redis, records, blobs, JobQueue(redis, settings.queue_key))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from regnf_state.records import ACTIVE, DRAWINGS, FINISHED, VIEWS, FieldRecord, JobRecord, QuotaError, StaleAttemptError
+from regnf_state.records import ACTIVE, FINISHED, FieldRecord, JobRecord, QuotaError, StaleAttemptError
 
 MAX_WEBHOOKS = 16
 """How many addresses one job tells of its end."""
@@ -19,9 +19,9 @@ _MOVES: dict[str, frozenset[str]] = {
 }
 _TOLD_BY_RESULT = frozenset({"verdict", "object_found"})
 _CHANGEABLE_IN_JOB = _TOLD_BY_RESULT | {"status", "phase", "progress", "engine", "error", "inputs", "worker"}
-_IN_REPORT = frozenset({VIEWS, DRAWINGS})
-"""What is changed by itself and stands in a field's report."""
-_CHANGEABLE_IN_FIELD = _IN_REPORT | {"state", "label", "description", "report", "error", "bytes", "symmetry"}
+_CHANGEABLE_IN_FIELD = frozenset(
+    {"state", "label", "description", "report", "error", "bytes", "symmetry", "original_until", "views", "drawings"}
+)
 
 
 def _refuse_unknown(changes: dict[str, Any], allowed: frozenset[str]) -> None:
@@ -152,17 +152,8 @@ def changed_field(record: FieldRecord, attempt: int | None, changes: dict[str, A
         _require_attempt(record, attempt)
     if "state" in changes and record.state != "validating":
         raise StaleAttemptError(f"a field that is {record.state} cannot become {changes['state']}")
-    return replace(record, version=record.version + 1, updated=now, **_with_report(record, changes))
-
-
-def _with_report(record: FieldRecord, changes: dict[str, Any]) -> dict[str, Any]:
-    """The changes with those that stand in the report within it."""
-    said = {name: value for name, value in changes.items() if name in _IN_REPORT}
-    plain = {name: value for name, value in changes.items() if name not in _IN_REPORT}
-    if not said and "report" not in plain:
-        return plain
-    held = {name: value for name, value in record.report.items() if name in _IN_REPORT}
-    return plain | {"report": plain.get("report", record.report) | held | said}
+    views = {"views": "pending"} if changes.get("state") == "ready" else {}
+    return replace(record, version=record.version + 1, updated=now, **(views | changes))
 
 
 def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldRecord | None:

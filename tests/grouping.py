@@ -1,8 +1,8 @@
 """How `--dist loadgroup` spreads the tests over processes: what stays together, and what begins first.
 
 A file's tests run in one process, so that what they share is made once. Some folders are one group: their processes
-have deadlines, and only one of them at a time shall have the machine. Files that are long and share nothing are taken
-apart. A mark `xdist_group` of a test's own goes before all that.
+have deadlines, and only one of them at a time shall have the machine, or they share a browser and a service. Files that
+are long and share nothing are taken apart. A mark `xdist_group` of a test's own goes before all that.
 """
 
 from __future__ import annotations
@@ -12,16 +12,9 @@ from pathlib import Path
 import pytest
 
 _TESTS = Path(__file__).parent
-_TOGETHER = ("faults", "serve")
-_APART = (
-    "core/fields/test_onnx.py",
-    "core/robust/test_covariance.py",
-    "core/robust/test_observed_scene.py",
-    "core/robust/test_register.py",
-    "core/test_batch.py",
-    "core/test_library.py",
-)
-_FIRST = ("faults", "live", "serve", "packaging", "ui/test_view.py", "contract/test_fuzz.py")
+_TOGETHER = ("faults", "serve", "ui")
+_APART = ("core/fields/test_onnx.py",)
+_FIRST = ("faults", "ui", "live", "serve", "packaging", "contract/test_fuzz.py")
 """The longest groups, longest first: whoever began with one of them last would keep the others waiting."""
 
 

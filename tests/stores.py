@@ -77,11 +77,11 @@ class WatchedQueue(JobQueue):
     def lose(self) -> None:
         """Forget everything, as a queue that was never told."""
         for work in self.waiting:
-            self.fair.remove(work.name)
+            self.remove(work.name)
 
     def take(self, job_id: str, attempt: int) -> None:
         """What a worker does first with a registration: it leaves the queue."""
-        self.fair.remove(Work("registration", job_id, attempt).name)
+        self.remove(Work("registration", job_id, attempt).name)
 
     def stop(self, job_id: str, attempt: int) -> None:
         self.stopped.append((job_id, attempt))

@@ -27,7 +27,7 @@ _ON_EVERY_ANSWER = ("x-content-type-options", "cross-origin-resource-policy", "c
 
 def attack_http(folder: Path, inputs: int, seed: int, tokens: bool) -> Outcome:
     """Send ``inputs`` requests, eight at a time. ``tokens``: the attacker is a second caller; else there are none."""
-    settings: dict[str, object] = {"threads": 1, "quota_calls_per_s": 0, "write_limit_per_s": 0}
+    settings: dict[str, object] = {"threads": 1, "quota_calls_per_s": 0}
     if tokens:
         settings["api_tokens"] = f'["honest:{_HONEST}", "greedy:{_GREEDY}"]'
     outcome = Outcome()

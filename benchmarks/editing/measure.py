@@ -23,12 +23,13 @@ from benchmarks.random_worlds.mesh import ExactScene, ExactView, Mesh
 from benchmarks.robust.cases import Pair
 from benchmarks.robust.symmetries import declared
 from regnf_core import Insertion, Removal, RenderOptions, SdfField, Sim3, Substitution, compose, open_field
-from regnf_core.editing.region import without_unseen
+from regnf_core.editing.edited_scene import without_unseen
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.metrics import mssd
-from regnf_core.rendering.camera import Camera, Orbit
+from regnf_core.rendering.camera import Camera, orbit_cameras
 from regnf_core.rendering.render import render, render_frames
+from regnf_core.rendering.request import OrbitRequest
 from scripts import make_demo_fields as demo
 
 SIZE = (160, 120)
@@ -103,7 +104,9 @@ def substituted(fields: Path, meshes: Path, rooms: Path, views: int) -> Iterator
             one = found(pair, scene)
             edited = compose(scene, [Substitution(one.obj, one.T_object_scene, one.residual)])
             truth, diameter = truth_of(one, meshes, rooms), pair.diameter / float(pair.truth.scale)
-            cameras = Orbit(frames=views, elevation_deg=30.0, start_deg=45.0).cameras(edited.places[0], SIZE)
+            cameras = orbit_cameras(
+                OrbitRequest(frames=views, elevation_deg=30.0, start_deg=45.0), edited.places[0], SIZE
+            )
             views_of = [seen(edited, 1, truth, camera, diameter) for camera in cameras]
             shown = [one_view for one_view in views_of if one_view is not None]
             error, iou = (np.median([getattr(s, name) for s in shown]) for name in ("error", "iou"))
@@ -123,7 +126,7 @@ def unseen_back(fields: Path, meshes: Path, rooms: Path, views: int) -> Iterator
         truth, diameter = truth_of(one, meshes, rooms), pair.diameter / float(pair.truth.scale)
         rows: list[tuple[float, float]] = []
         options = RenderOptions(cut_away=True)
-        for camera in Orbit(frames=views, elevation_deg=30.0).cameras(edited.places[0], SIZE):
+        for camera in orbit_cameras(OrbitRequest(frames=views, elevation_deg=30.0), edited.places[0], SIZE):
             depth = truth.depth(camera)
             on = depth > 0
             errors = []

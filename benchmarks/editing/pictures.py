@@ -31,10 +31,11 @@ from regnf_core import (
     compose,
     open_field,
 )
-from regnf_core.editing.region import without_unseen
-from regnf_core.rendering.camera import Camera, Orbit
+from regnf_core.editing.edited_scene import without_unseen
+from regnf_core.rendering.camera import Camera, orbit_cameras
 from regnf_core.rendering.job import strip
 from regnf_core.rendering.render import render
+from regnf_core.rendering.request import OrbitRequest
 
 ROOMS = ("ac-room", "atbl-room", "mix-room")
 OPTIONS = RenderOptions(antialias=2, cut_away=True)
@@ -129,7 +130,7 @@ def _near(one: Found, scene: SdfField, size: Size) -> Camera:
     box = one.pair.detection
     wide = OrientedBox(box.center, box.size * 1.7, box.rotation)
     shown = compose(scene, [Insertion(one.obj, one.T_object_scene)])
-    cameras = Orbit(frames=8, elevation_deg=28.0, start_deg=22.0).cameras(wide, size)
+    cameras = orbit_cameras(OrbitRequest(frames=8, elevation_deg=28.0, start_deg=22.0), wide, size)
     low, high = scene.bounds
     within = [camera for camera in cameras if bool(((camera.position > low) & (camera.position < high)).all())]
     seen = [int((render(shown, one.resized((40, 30)), _QUICK).part == 1).sum()) for one in within or cameras]
@@ -137,7 +138,7 @@ def _near(one: Found, scene: SdfField, size: Size) -> Camera:
 
 
 def _round(box: OrientedBox, size: Size, views: int) -> list[Camera]:
-    return Orbit(frames=views, elevation_deg=22.0, start_deg=45.0).cameras(box, size)
+    return orbit_cameras(OrbitRequest(frames=views, elevation_deg=22.0, start_deg=45.0), box, size)
 
 
 def _shots(before: SdfField, after: SdfField, cameras: Sequence[Camera]) -> list[list[np.ndarray]]:

@@ -13,7 +13,7 @@ import torch
 from benchmarks.gpu.deadline import Deadline
 from benchmarks.gpu.pairs import Pair, batch_of, field_at, model_at
 from benchmarks.gpu.report import Section
-from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, WarmStart
+from regnf_core import RegistrationOptions, RegistrationResult, RegnfError
 from regnf_core.batch import BatchOutcome, ModeledObject, register_batch
 from regnf_core.library import register
 
@@ -195,9 +195,9 @@ def _right(pairs: Sequence[Pair]) -> list[Pair]:
 
 def _registered(pair: Pair, device: torch.device, seed: int) -> RegistrationResult | RegnfError:
     scene, obj = (field_at(path, str(device)) for path in (pair.room, pair.object))
-    start = WarmStart(object_model=model_at(pair.object, str(device)))
+    model = model_at(pair.object, str(device))
     try:
-        return register(scene, obj, pair.detection, ALONE, seed, warm_start=start, clouds=False)
+        return register(scene, obj, pair.detection, ALONE, seed, object_model=model, clouds=False)
     except RegnfError as error:
         return error
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from regnf_core import OrientedBox, WarmStart, open_field
+from regnf_core import OrientedBox, open_field
 from regnf_core.batch import register_batch
 from regnf_core.library import LibraryObject, register, search_library
 from regnf_core.robust.model import model_object
@@ -69,7 +69,7 @@ def _box(folder: Path, name: str = "detection") -> OrientedBox:
 
 def _kept(room: str, thing: str, folder: Path) -> Callable[[int], Any]:
     scene, obj, box, model = _field(folder, room), _field(folder, thing), _box(folder), _model(folder, thing)
-    return lambda seed: register(scene, obj, box, seed=seed, warm_start=_as_read(model), clouds=False)
+    return lambda seed: register(scene, obj, box, seed=seed, object_model=_as_read(model), clouds=False)
 
 
 def _cold(room: str, thing: str, folder: Path) -> Callable[[int], Any]:
@@ -79,12 +79,12 @@ def _cold(room: str, thing: str, folder: Path) -> Callable[[int], Any]:
 
 def _clouds(room: str, thing: str, folder: Path) -> Callable[[int], Any]:
     scene, obj, box, model = _field(folder, room), _field(folder, thing), _box(folder), _model(folder, thing)
-    return lambda seed: register(scene, obj, box, seed=seed, warm_start=_as_read(model))
+    return lambda seed: register(scene, obj, box, seed=seed, object_model=_as_read(model))
 
 
-def _as_read(model: Any) -> WarmStart:
+def _as_read(model: Any) -> Any:
     """The model as its file gives it: what it makes of its samples when asked is made again."""
-    return WarmStart(object_model=replace(model))
+    return replace(model)
 
 
 def _evaluator(room: str, folder: Path) -> Callable[[int], Any]:

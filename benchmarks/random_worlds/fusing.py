@@ -15,10 +15,9 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from benchmarks.random_worlds.mesh import Array, ExactScene, ExactView
-from regnf_data.fusing import BlockGrid, DepthImages, fuse_blocks, import_own, open3d
+from benchmarks.worlds.rendering import Size, intrinsics_of, jumps
+from regnf_data.fusing import BlockGrid, fuse_blocks, import_own, open3d
 from regnf_data.posed_images import PosedImages
-from regnf_data.rendering import Size, intrinsics_of
-from regnf_data.sensor import jumps
 
 # Errors of the camera's estimated poses, and where they carry what was measured.
 
@@ -189,7 +188,7 @@ def draw_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSen
 
 
 def rendered_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSensor:
-    """The camera of a simulated dataset: exact, or with the errors of ``regnf_data.sensor.DepthSensor``.
+    """The camera of a simulated dataset: exact, or with the errors of ``benchmarks.worlds.rendering.DepthSensor``.
 
     It misses no matter. size: instead of a random one.
     """
@@ -351,7 +350,7 @@ def fuse(taken: Capture, fusion: Fusion, bounds: Array, path: Path) -> None:
     if fusion.volume == "blocks":
         intrinsics = np.tile(taken.sensor.intrinsics, (len(taken.poses), 1, 1))
         grid = BlockGrid(fusion.voxel_m, fusion.truncation, fusion.farthest_m)
-        fuse_blocks(DepthImages(taken.depths, intrinsics, taken.estimated), grid, path)
+        fuse_blocks(taken.depths, intrinsics, taken.estimated, grid, path)
         return
     source = path.with_suffix(".npz")
     with warnings.catch_warnings():

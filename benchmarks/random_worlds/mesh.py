@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from regnf_data.rendering import Size, camera_rays
+from benchmarks.worlds.rendering import Size, camera_rays
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]

@@ -15,8 +15,8 @@ from benchmarks.random_worlds import tables
 from benchmarks.random_worlds.mesh import Array, ExactScene, Mesh, box, standing, turn_about_z
 from benchmarks.random_worlds.models import Catalog, Model
 from benchmarks.random_worlds.placing import GAP_M, Placed, rest, resting_turns, touching
+from benchmarks.worlds.trajectories import CLEARANCE_M, WalkingGround, long_walk, look_at, short_walk
 from regnf_core.errors import DatasetError
-from regnf_data.trajectories import CLEARANCE_M, WalkingGround, long_walk, look_at, short_walk
 
 # Random rooms, table tops and shelves, furnished: one seed, one world.
 

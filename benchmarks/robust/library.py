@@ -14,10 +14,9 @@ from benchmarks.robust.cases import HELD_OUT, MAIN, Case, Pair, load_pairs, open
 from benchmarks.robust.judging import judge
 from benchmarks.robust.report import Bar, Section, Table, by_group, failures_of, median, share_bar
 from benchmarks.robust.runs import ROBUST, Context, Run
-from regnf_core import WarmStart, register
 from regnf_core import open_field as open_safe_field
-from regnf_core.library import LibraryObject, LibrarySearch, read_object_model, search_library
-from regnf_core.robust.library_search import rank_by_signature
+from regnf_core import register
+from regnf_core.library import LibraryObject, LibrarySearch, rank_by_signature, read_object_model, search_library
 from regnf_core.robust.scene import view_scene
 
 NAME = "library"
@@ -98,7 +97,7 @@ def _search(kind: str, pair: Pair, library: dict[str, LibraryObject], size: int,
         case.detection,
         ROBUST,
         seed,
-        warm_start=WarmStart(object_model=right.model),
+        object_model=right.model,
     )
     alone = time.perf_counter() - begun
     place = 1 + [one.name for one in found.ranking].index(pair.instance)

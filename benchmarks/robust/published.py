@@ -11,7 +11,8 @@ import torch
 from benchmarks.robust.cases import Case
 from benchmarks.robust.runs import Run
 from regnf_core import RegistrationResult, Sim3
-from regnf_core.geometry.metrics import Symmetries, euler_rmse, scale_error, surface_displacement, translation_rmse
+from regnf_core.geometry import metrics
+from regnf_core.geometry.metrics import Symmetries, surface_displacement
 
 _POINTS = 500
 """Surface points, about, by which the nearest of the equal poses is chosen."""
@@ -67,7 +68,7 @@ def nearest_equal(estimate: Sim3, truth: Sim3, points: torch.Tensor, symmetries:
 
 def errors_between(estimate: Sim3, truth: Sim3) -> Errors:
     """The paper's three numbers."""
-    return Errors(translation_rmse(estimate, truth), euler_rmse(estimate, truth), scale_error(estimate, truth))
+    return Errors(*metrics.paper_errors(estimate, truth).values())
 
 
 def mean_errors(runs: Sequence[Run]) -> Errors | None:

@@ -462,7 +462,6 @@ def measure(folder: Path, name: str | None, seconds: float, connections: int) ->
             "webhook_hosts": json.dumps([f"http://127.0.0.1:{receiver}"]),
             "webhook_secrets": json.dumps([f"alice:{SECRET}"]),
             "quota_stored_bytes": 300 << 20,
-            "write_limit_per_s": 100,
         }
         with running_house(folder, 2, _TOKENS["carol"], threads=1, preload=True, **settings) as house:
             told = uploaded(house, pair, "alice") | {"receiver": receiver, "fields": furnish(house)[:8]}

@@ -1,4 +1,4 @@
-"""The covariance's two factors (regnf_core/robust/constants/verdict.py), fitted to the errors of right poses.
+"""The covariance's two factors (regnf_core/robust/constants.py), fitted to the errors of right poses.
 
 The covariance of a pose is one part that the residuals tell and one that follows from the surfaces' offset, each times
 a factor. ``register`` keeps the error of each right pose in coordinates in which both parts are diagonal. So other

@@ -131,7 +131,7 @@ def _described(
     features, evidence = held_out.features, held_out.evidence
     errors = _errors(problem, candidates.T, known)
     elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    rivals = choose(problem, candidates, features, evidence.scores, _OPTIONS.robust.rival_margin).rivals
+    rivals = choose(problem, candidates, features, evidence.numbers["score"], _OPTIONS.robust.rival_margin).rivals
     for number in range(len(candidates)):
         yield {
             "mssd": errors[number],
@@ -140,7 +140,7 @@ def _described(
             "winner": number == winner,
             "found": True,
             "others": (elsewhere[number].nonzero()[:, 0] - number).tolist(),
-            "score": float(evidence.scores[number]),
+            "score": float(evidence.numbers["score"][number]),
             "features": {name: float(values[number]) for name, values in features.items()},
         }
 

@@ -16,12 +16,12 @@ from benchmarks.random_worlds.mesh import Array, ExactScene
 from benchmarks.random_worlds.models import Model
 from benchmarks.random_worlds.symmetries import measure_symmetries
 from benchmarks.random_worlds.walks import World
+from benchmarks.worlds.composing import half_view
 from benchmarks.worlds.recipe import Seen, orbit_sensor, see
+from benchmarks.worlds.trajectories import orbit
 from regnf_core.errors import RegnfError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import SdfField
-from regnf_data.composing import half_view
-from regnf_data.trajectories import orbit
 
 ObjectKind = Literal["mesh", "orbit", "cut"]
 OBJECT_KINDS: tuple[ObjectKind, ...] = ("mesh", "orbit", "cut")

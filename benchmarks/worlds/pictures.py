@@ -10,8 +10,8 @@ from PIL import Image
 
 from benchmarks.random_worlds.mesh import Array, ExactScene
 from benchmarks.random_worlds.walks import World
-from regnf_data.rendering import Size, intrinsics_of
-from regnf_data.trajectories import look_at
+from benchmarks.worlds.rendering import Size, intrinsics_of
+from benchmarks.worlds.trajectories import look_at
 
 _SIZE: Size = (480, 640)
 _FIELD_OF_VIEW_DEG = 72.0

@@ -22,8 +22,8 @@ from benchmarks.random_worlds.fusing import (
 )
 from benchmarks.random_worlds.mesh import Array, ExactScene
 from benchmarks.random_worlds.walks import LENGTHS, Length, World, walk
+from benchmarks.worlds.rendering import Size
 from regnf_core.errors import DatasetError
-from regnf_data.rendering import Size
 
 Scene = Literal["tsdf", "rendered", "fused", "rendered-fused", "fit", "rendered-fit", "under-trained", "mesh", "bent"]
 SCENES: tuple[Scene, ...] = get_args(Scene)

@@ -94,8 +94,8 @@ def from_truth(kept: Recording, truth: Sim3, points: Tensor, symmetries: Symmetr
     return {
         "truth_mssd": float(nearest.errors(T[None])[0]),
         "truth_score": evaluation.metrics["score"],
-        "truth_verdict": evaluation.verdict,
-        "truth_reason": evaluation.reason,
+        "truth_verdict": evaluation.found.verdict,
+        "truth_reason": evaluation.found.reason,
         "chosen_score": chosen.metrics["score"],
     }
 

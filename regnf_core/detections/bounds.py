@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from regnf_core.errors import InvalidDetectionError
@@ -30,21 +30,25 @@ class Detection:
     label: str | None = None
     score: float | None = None
 
+    def normal(self) -> Detection:
+        """The same box in its one spelling: equal boxes are equal, however they were written."""
+        x, y, z = self.center
+        quaternion = normal_quaternion(self.rotation_quaternion_xyzw)
+        # adding zero turns -0.0 into 0.0
+        return replace(self, center=(x + 0.0, y + 0.0, z + 0.0), rotation_quaternion_xyzw=quaternion)
+
+    def values(self) -> dict[str, Any]:
+        """Its members as plain (JSON) values."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+
     def canonical(self) -> dict[str, Any]:
-        """Plain values for job records: equal boxes have equal values, however they were written."""
-        return {
-            # adding zero turns -0.0 into 0.0
-            "center": [value + 0.0 for value in self.center],
-            "size": list(self.size),
-            "rotation_quaternion_xyzw": list(normal_quaternion(self.rotation_quaternion_xyzw)),
-            "label": self.label,
-            "score": self.score,
-        }
+        """The plain values of its one spelling, for requests."""
+        return self.normal().values()
 
 
 Bounds = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner."""
-_UNITS = ((1000.0, "millimeters"), (100.0, "centimeters"), (39.37, "inches"))
+_UNITS = {1000.0: "millimeters", 100.0: "centimeters", 39.37: "inches"}
 _WORLD: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _MAX_SIZE_RATIO = 10.0
 """A box whose shortest edge is longer than this many times the scene's longest is of another unit."""
@@ -100,12 +104,13 @@ def _separating_axes(columns: tuple[Vector, Vector, Vector]) -> Iterator[Vector]
 def _hint(box: Detection, scene: Bounds, obj: Bounds | None) -> str:
     if obj is not None and _fits(box, obj):
         return "The box lies within the object's bounds: are scene and object swapped?"
-    if small := [(unit, f"{factor:g}") for factor, unit in _UNITS if _fits(_scaled(box, 1 / factor), scene)]:
-        units, factors = (" or ".join(words) for words in zip(*small, strict=True))
-        return f"Is the box in {units}? Divided by {factors} it fits. Write it in the scene's units."
-    if large := [(unit, f"{factor:g}") for factor, unit in _UNITS if _fits(_scaled(box, factor), scene)]:
-        units, factors = (" or ".join(words) for words in zip(*large, strict=True))
-        return f"Is the scene in {units}? Times {factors} the box fits. Write it in the scene's units."
+    for inverse, said in (
+        (True, "Is the box in {}? Divided by {} it fits. Write it in the scene's units."),
+        (False, "Is the scene in {}? Times {} the box fits. Write it in the scene's units."),
+    ):
+        fitting = [f for f in _UNITS if _fits(_scaled(box, 1 / f if inverse else f), scene)]
+        if fitting:
+            return said.format(" or ".join(_UNITS[f] for f in fitting), " or ".join(f"{f:g}" for f in fitting))
     return "Write the box in the scene field's own frame and units; `regnf inspect` shows the field's bounds."
 
 
@@ -116,10 +121,8 @@ def _fits(box: Detection, bounds: Bounds) -> bool:
 
 
 def _scaled(box: Detection, factor: float) -> Detection:
-    def times(values: Vector) -> Vector:
-        return values[0] * factor, values[1] * factor, values[2] * factor
-
-    return Detection(times(box.center), times(box.size), box.rotation_quaternion_xyzw)
+    center, size = (tuple(value * factor for value in values) for values in (box.center, box.size))
+    return Detection(center, size, box.rotation_quaternion_xyzw)  # type: ignore[arg-type]  # of three, as they were
 
 
 def _edges(bounds: Bounds) -> list[float]:
@@ -149,13 +152,9 @@ _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,40}")
 
 
 def fault(place: Place, message: str, hint: str | None = None) -> InvalidDetectionError:
-    """The error for the member at ``place``; the message begins with the member's name."""
-    return InvalidDetectionError(f"{said(place)} {message}", hint=hint or _HINT, place=place)
-
-
-def said(place: Place) -> str:
-    """A place as people write it: detection.center[0]."""
-    return "detection" + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
+    """The error for the member at ``place``; the message begins with its name: detection.center[0]."""
+    name = "detection" + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place)
+    return InvalidDetectionError(f"{name} {message}", hint=hint or _HINT, place=place)
 
 
 def shown(value: Any) -> str:
@@ -184,11 +183,8 @@ def number(value: Any, place: Place, limit: float = MAX_COORDINATE) -> float:
         hint = "Remove the quotation marks." if isinstance(value, str) else None
         raise fault(place, f"is {shown(value)}, expected a number", hint)
     if isinstance(value, float) and not math.isfinite(value):
-        raise fault(
-            place,
-            f"is {shown(value)}, expected a finite number",
-            "A detector writes this for a box that it could not place: leave such boxes out.",
-        )
+        hint = "A detector writes this for a box that it could not place: leave such boxes out."
+        raise fault(place, f"is {shown(value)}, expected a finite number", hint)
     if abs(value) > limit:
         message = f"is {shown(value)}, expected at most {limit:g} either way"
         raise fault(place, message, "Move the origin of scene and box nearer.")
@@ -197,14 +193,16 @@ def number(value: Any, place: Place, limit: float = MAX_COORDINATE) -> float:
 
 def numbers(value: Any, place: Place, axes: str, limit: float = MAX_COORDINATE) -> tuple[float, ...]:
     """As many numbers as ``axes`` has letters: a list, or an object with these letters as members."""
+    letters = ", ".join(axes)
     if isinstance(value, Mapping):
         if set(value) != set(axes):
-            raise fault(place, f"has other members than {', '.join(axes)}", f"Write {written(axes)}.")
+            raise fault(place, f"has other members than {letters}", f"Write [{letters}].")
         return tuple(number(value[axis], (*place, axis), limit) for axis in axes)
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise fault(place, f"is {shown(value)}, expected {len(axes)} numbers", f"Write {written(axes)}.")
+        raise fault(place, f"is {shown(value)}, expected {len(axes)} numbers", f"Write [{letters}].")
     if len(value) != len(axes):
-        raise fault(place, f"has {_count(len(value))}, expected {len(axes)}", f"Write {written(axes)}.")
+        count = {0: "no entries", 1: "1 number"}.get(len(value), f"{len(value)} entries")
+        raise fault(place, f"has {count}, expected {len(axes)}", f"Write [{letters}].")
     return tuple(number(part, (*place, i), limit) for i, part in enumerate(value))
 
 
@@ -220,19 +218,8 @@ def edges(value: Any, place: Place) -> Vector:
     for i, edge in enumerate((x, y, z)):
         if edge <= 0:
             part: str | int = "xyz"[i] if isinstance(value, Mapping) else i
-            raise fault((*place, part), f"is {edge:g}, expected an edge length above 0", _edge_hint(edge))
+            hint = "Sizes are full edge lengths. If these are corners, write `min` and `max`."
+            if edge == 0:
+                hint = "A box needs an extent along every axis; make a flat one as thick as the surface is noisy."
+            raise fault((*place, part), f"is {edge:g}, expected an edge length above 0", hint)
     return x, y, z
-
-
-def written(axes: str) -> str:
-    return f"[{', '.join(axes)}]"
-
-
-def _edge_hint(edge: float) -> str:
-    if edge == 0:
-        return "A box needs an extent along every axis; make a flat one as thick as the surface is noisy."
-    return "Sizes are full edge lengths. If these are corners, write `min` and `max`."
-
-
-def _count(count: int) -> str:
-    return "1 number" if count == 1 else f"{count} entries" if count != 0 else "no entries"

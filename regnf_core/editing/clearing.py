@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import torch
@@ -13,7 +14,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from regnf_core.editing.region import GridDistance, Mask, RegionGrid, box_distance
 from regnf_core.editing.support import PlacedObject, SupportPlane, support_planes
 from regnf_core.fields.observation import SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
@@ -43,8 +43,8 @@ class Ground:
     heights: Tensor
     missing: Tensor
 
-    def distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(N,) of points (N, 3) to the support's matter, about, and the gradient (N, 3)."""
+    def distance(self, points: Tensor) -> Solid:
+        """Of points (N, 3) to the support's matter, about."""
         at = (points - self.origin.to(points)) @ self.axes.to(points).T / self.cell
         height, slope = _sampled(self.heights, at)
         missing, away = _sampled(self.missing, at)
@@ -81,7 +81,7 @@ def ground_of(
     free = (distance > tolerance) & ~own
     there = binary_fill_holes(~free) & ~outside
     heights = _membrane(np.where(known, -distance, 0.0), known)
-    missing = np.full(counts, -1e3 * cell) if there.all() else _signed(there, cell)
+    missing = np.full(counts, -1e3 * cell) if there.all() else signed_distance_to(there, cell)
     tensors = (torch.from_numpy(values.astype(np.float32)) for values in (heights, missing))
     return Ground(plane, origin, axes, cell, *tensors)
 
@@ -98,11 +98,6 @@ def _rectangle(plane: SupportPlane, box: OrientedBox) -> tuple[Tensor, Tensor, f
     low, high = low - 2 * cell, high + 2 * cell
     a, b = (int(count) + 1 for count in ((high - low) / cell).ceil().tolist())
     return plane.offset * n + low @ axes, axes, cell, (a, b)
-
-
-def _signed(there: Mask, cell: float) -> Heights:
-    signed: Heights = (distance_transform_edt(~there) - distance_transform_edt(there)) * cell
-    return signed - 0.5 * cell * np.sign(signed)
 
 
 def _membrane(values: Heights, known: Mask) -> Heights:
@@ -177,11 +172,19 @@ def kept_neighbors(
         matter &= grid.cube(plane.height(points)) > max(thickness, 4.0 * plane.roughness)
     if of_thing is not None:
         matter &= ~_mask(grid, of_thing(points))
-    measured = _measured(scene, grid, points)
-    if measured is not None:
-        matter &= measured
+    observation = observation_of(scene)
+    if observation is not None:
+        reach = max(1, round(observation.voxel / grid.cell))
+        matter &= binary_dilation(_mask(grid, observation.at(points) == SURFACE), iterations=reach)
     inside = _mask(grid, box_distance(box, points) < 0.0)
-    kept = _going_out(matter, inside, 1e-9 if of_thing is not None else _LEAST_OUTSIDE)
+    # the components of matter of which at least this share lies outside of the box
+    least_outside = 1e-9 if of_thing is not None else _LEAST_OUTSIDE
+    labels, count = label(matter, structure=np.ones((3, 3, 3)))
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    outside = np.bincount(labels[~inside], minlength=count + 1)
+    neighbor = (sizes >= _LEAST_CELLS) & (outside >= np.maximum(1, least_outside * sizes))
+    neighbor[0] = False
+    kept = neighbor[labels]
     if not (kept & inside).any():
         return None
     return grid.distance_to(binary_dilation(kept, iterations=_KEPT_AROUND))
@@ -192,31 +195,6 @@ def _mask(grid: RegionGrid, values: Tensor) -> Mask:
     return found
 
 
-def _measured(scene: SdfField, grid: RegionGrid, points: Tensor) -> Mask | None:
-    """Cells near a place where a surface was measured; None where that is not known."""
-    observation = observation_of(scene)
-    if observation is None:
-        return None
-    near = _mask(grid, observation.at(points) == SURFACE)
-    reach = max(1, round(observation.voxel / grid.cell))
-    return np.asarray(binary_dilation(near, iterations=reach))
-
-
-def _going_out(matter: Mask, inside: Mask, least_outside: float) -> Mask:
-    """The components of ``matter`` of which at least this share lies outside of the box."""
-    labels, count = label(matter, structure=np.ones((3, 3, 3)))
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    outside = np.bincount(labels[~inside], minlength=count + 1)
-    neighbor = (sizes >= _LEAST_CELLS) & (outside >= np.maximum(1, least_outside * sizes))
-    neighbor[0] = False
-    return np.asarray(neighbor[labels])
-
-
-def near_thing(thing: SdfField, margin: float) -> Callable[[Tensor], Tensor]:
-    """Tells of points (N, 3) whether they are in ``thing`` or nearer to it than ``margin``."""
-    return lambda points: thing.signed_distance(points.to(thing.device)).to(points.device) < margin
-
-
 _BOX_MARGIN = 0.05
 """How far beyond a thing's box its copy in the scene may reach, as a share of the box's diagonal."""
 _OWN_MARGIN = 0.015
@@ -225,25 +203,25 @@ _OVERLAP = 0.004
 """Of the box's diagonal: the continued ground reaches so far into the matter round it, and leaves no gap."""
 
 
+Solid = tuple[Tensor, Tensor]
+"""Signed distances (N,) to a solid, and their gradients (N, 3)."""
+Place = PlacedObject | OrientedBox
+
+
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What a clearing makes of a scene's distances (N,): min(max(distance, least), most), with gradients (N, 3).
+    """What a clearing makes of a scene's distances: min(max(distance, least), most).
 
     As solids: the scene less the box (but for what is kept), and the ground. most: None without ground.
     """
 
-    least: Tensor
-    least_slope: Tensor
-    most: Tensor | None
-    most_slope: Tensor | None
+    least: Solid
+    most: Solid | None
 
-    def apply(self, distance: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """The distance (N,) of the cleared scene where the scene's own is ``distance``, and its gradient (N, 3)."""
-        distance, gradient = _larger(distance, gradient, self.least, self.least_slope)
-        if self.most is None or self.most_slope is None:
-            return distance, gradient
-        distance, gradient = _larger(-distance, -gradient, -self.most, -self.most_slope)
-        return -distance, -gradient
+    def apply(self, scene: Solid) -> Solid:
+        """The cleared scene."""
+        found = _larger(scene, self.least)
+        return found if self.most is None else _smaller(found, self.most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,38 +234,24 @@ class Clearing:
 
     def reaches(self, points: Tensor) -> Tensor:
         """(N,) distance to what may be changed, negative within, less the overlap."""
-        return box_distance(self.box, points) - self._overlap
+        return box_distance(self.box, points) - _OVERLAP * self.box.diagonal
 
     def limits(self, points: Tensor, with_gradient: bool) -> Limits:
         """Between which the cleared scene's distance lies at points (N, 3), whatever the scene's own is.
 
         Without gradients the slopes mean nothing.
         """
-        box, outward = self._box(points)
-        removed, away = box, outward
+        distance, outward = removed = self._box(points)
         if self.kept is not None:
             kept, slope = self.kept.at_with_gradient(points) if with_gradient else (self.kept.at(points), outward)
-            removed, away = _larger(box, outward, -kept, -slope)
+            removed = _larger(removed, (-kept, -slope))
+        least = -removed[0], -removed[1]
         if not self.grounds:
-            return Limits(-removed, -away, None, None)
-        ground, slope = self._ground(points)
-        filled, slope = _larger(ground, slope, box - self._overlap, outward)
-        return Limits(-removed, -away, filled, slope)
+            return Limits(least, None)
+        ground = reduce(_smaller, (each.distance(points) for each in self.grounds))
+        return Limits(least, _larger(ground, (distance - _OVERLAP * self.box.diagonal, outward)))
 
-    @property
-    def _overlap(self) -> float:
-        return _OVERLAP * self.box.diagonal
-
-    def _ground(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        distance, gradient = self.grounds[0].distance(points)
-        for ground in self.grounds[1:]:
-            other, slope = ground.distance(points)
-            distance, gradient = _larger(-distance, -gradient, -other, -slope)
-            distance, gradient = -distance, -gradient
-        return distance, gradient
-
-    def _box(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The box's signed distance (N,) and its gradient (N, 3)."""
+    def _box(self, points: Tensor) -> Solid:
         local = self.box.to_local(points)
         beyond = local.abs() - self.box.size.to(points) / 2.0
         out = beyond.clamp_min(0.0)
@@ -296,32 +260,149 @@ class Clearing:
         inward = torch.nn.functional.one_hot(axis, 3).to(points)
         slope = torch.where((deepest > 0)[:, None], out / outside.clamp_min(1e-12)[:, None], inward)
         slope = slope * torch.where(local < 0, -1.0, 1.0)
-        distance = torch.where(deepest > 0, outside, deepest)
-        return distance, slope @ self.box.rotation.to(points).T
+        return torch.where(deepest > 0, outside, deepest), slope @ self.box.rotation.to(points).T
 
 
-def clear_thing(scene: SdfField, thing: PlacedObject, residual: float, generator: torch.Generator) -> Clearing:
-    """Clear the scene's copy of a thing. residual: of its registration, scene units."""
-    own = _OWN_MARGIN * thing.box.diagonal + 3.0 * residual
-    margin = _BOX_MARGIN * thing.box.diagonal + residual
-    box = OrientedBox(thing.box.center, thing.box.size + 2.0 * margin, thing.box.rotation)
-    planes = support_planes(scene, thing.box, generator)
-    belongs = near_thing(thing, own)
+@dataclass(frozen=True, eq=False)
+class Unseen:
+    """All of the scene is cleared, but for what is near surface that was measured. shell: the distance to that."""
+
+    shell: GridDistance
+
+    def reaches(self, points: Tensor) -> Tensor:
+        """(N,): everywhere."""
+        return torch.full_like(points[:, 0], -torch.inf)
+
+    def limits(self, points: Tensor, with_gradient: bool) -> Limits:
+        """As of a :class:`Clearing`."""
+        if with_gradient:
+            return Limits(self.shell.at_with_gradient(points), None)
+        return Limits((self.shell.at(points), torch.zeros_like(points)), None)
+
+
+def clear(scene: SdfField, removed: Place, residual: float, generator: torch.Generator) -> Clearing:
+    """Clear the scene's copy of a thing, or a box in which nobody knows the thing's surface.
+
+    residual: of the thing's registration, scene units.
+    """
+    of_thing = removed.box if isinstance(removed, PlacedObject) else removed
+    margin = _BOX_MARGIN * of_thing.diagonal + residual
+    box = OrientedBox(of_thing.center, of_thing.size + 2.0 * margin, of_thing.rotation)
+    planes = support_planes(scene, of_thing, generator)
+    own = _OWN_MARGIN * of_thing.diagonal + 3.0 * residual
+    thing = removed if isinstance(removed, PlacedObject) else None
+
+    def near_thing(points: Tensor) -> Tensor:
+        assert thing is not None
+        return thing.signed_distance(points.to(thing.device)).to(points.device) < own
+
+    belongs = None if thing is None else near_thing
     kept = kept_neighbors(scene, box, planes, belongs)
     grounds = (ground_of(scene, plane, box, belongs) for plane in planes)
     return Clearing(box, kept, [ground for ground in grounds if ground is not None])
 
 
-def clear_box(scene: SdfField, box: OrientedBox, generator: torch.Generator) -> Clearing:
-    """Clear a box in which nobody knows the thing's surface."""
-    grown = OrientedBox(box.center, box.size + 2.0 * _BOX_MARGIN * box.diagonal, box.rotation)
-    planes = support_planes(scene, box, generator)
-    kept = kept_neighbors(scene, grown, planes, None)
-    grounds = (ground_of(scene, plane, grown, None) for plane in planes)
-    return Clearing(grown, kept, [ground for ground in grounds if ground is not None])
+def _larger(one: Solid, other: Solid) -> Solid:
+    """What both solids share."""
+    first = one[0] >= other[0]
+    return torch.where(first, one[0], other[0]), torch.where(first[:, None], one[1], other[1])
 
 
-def _larger(a: Tensor, slope_a: Tensor, b: Tensor, slope_b: Tensor) -> tuple[Tensor, Tensor]:
-    """The larger of two distances (N,), with its gradient (N, 3): what both solids share."""
-    first = a >= b
-    return torch.where(first, a, b), torch.where(first[:, None], slope_a, slope_b)
+def _smaller(one: Solid, other: Solid) -> Solid:
+    """Both solids together."""
+    first = one[0] <= other[0]
+    return torch.where(first, one[0], other[0]), torch.where(first[:, None], one[1], other[1])
+
+
+# A grid of points in and round a box, in the box's own axes.
+
+Mask = NDArray[np.bool_]
+
+
+def signed_distance_to(mask: Mask, cell: float) -> NDArray[np.float64]:
+    """To the edge of the cells of ``mask``, negative in them; where there are none, or only these, about as far as the
+    grid is wide."""
+    most = float(np.linalg.norm(mask.shape))
+    outside = distance_transform_edt(~mask) if mask.any() else most
+    inside = distance_transform_edt(mask) if not mask.all() else most
+    signed = np.clip(outside, 0.0, most) - np.clip(inside, 0.0, most)
+    found: NDArray[np.float64] = (signed - 0.5 * np.sign(signed)) * cell
+    return found
+
+
+def box_distance(box: OrientedBox, points: Tensor) -> Tensor:
+    """(N,) exact signed distance of points (N, 3) to a solid box, negative inside."""
+    beyond = box.to_local(points).abs() - box.size.to(points) / 2.0
+    outside: Tensor = beyond.clamp_min(0.0).norm(dim=-1)
+    return outside + beyond.amax(-1).clamp_max(0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RegionGrid:
+    """Cells of edge ``cell`` along the axes of ``box``, which they cover. shape: (3,) how many along each."""
+
+    box: OrientedBox
+    cell: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, box: OrientedBox, along_longest: int) -> RegionGrid:
+        cell = float(box.size.max()) / along_longest
+        x, y, z = (max(1, int(n)) for n in (box.size / cell).ceil().tolist())
+        return cls(box, cell, (x, y, z))
+
+    def points(self) -> Tensor:
+        """(X * Y * Z, 3) float32, the cells' middles, frame of the box."""
+        axes = [(torch.arange(n, dtype=torch.float64) + 0.5 - n / 2.0) * self.cell for n in self.shape]
+        return (self.box.center + torch.cartesian_prod(*axes) @ self.box.rotation.T).float()
+
+    def cube(self, values: Tensor) -> NDArray[np.float32]:
+        """Values (X * Y * Z,) of the cells as (X, Y, Z)."""
+        cube: NDArray[np.float32] = values.float().cpu().numpy().reshape(self.shape)
+        return cube
+
+    def distance_to(self, mask: Mask) -> GridDistance:
+        """The signed distance to the cells of ``mask`` (X, Y, Z), negative in them."""
+        return GridDistance(self, torch.from_numpy(signed_distance_to(mask, self.cell).astype(np.float32)))
+
+
+@dataclass(frozen=True, eq=False)
+class GridDistance:
+    """Values at a grid's middles, interpolated between them and constant beyond. values: (X, Y, Z) float32."""
+
+    grid: RegionGrid
+    values: Tensor
+
+    def at(self, points: Tensor) -> Tensor:
+        """(N,) at points (N, 3) of the frame of the grid's box."""
+        return self._sampled(self._places(points))
+
+    def at_with_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(N,) and the gradient (N, 3), by differences of half a cell."""
+        places, step = self._places(points), 0.5
+        slopes = []
+        for axis in range(3):
+            move = torch.zeros(3, device=places.device)
+            move[axis] = step
+            slopes.append((self._sampled(places + move) - self._sampled(places - move)) / (2 * step * self.grid.cell))
+        local = torch.stack(slopes, dim=-1)
+        return self._sampled(places), local @ self.grid.box.rotation.to(local).T
+
+    def _places(self, points: Tensor) -> Tensor:
+        half = torch.tensor(self.grid.shape, device=points.device) / 2.0
+        return self.grid.box.to_local(points) / self.grid.cell + half - 0.5
+
+    def _sampled(self, places: Tensor) -> Tensor:
+        values = self.values.to(places.device)
+        most = torch.tensor(values.shape, device=places.device) - 1
+        places = places.clamp_min(0.0).minimum(most.to(places))
+        low = places.floor().long().minimum((most - 1).clamp_min(0))
+        share = places - low
+        total = torch.zeros(len(places), device=places.device)
+        for corner in range(8):
+            bit = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=places.device)
+            index = (low + bit).minimum(most)
+            weight = torch.where(bit == 1, share, 1.0 - share).prod(-1)
+            x, y, z = index.unbind(-1)
+            total = total + weight * values[x, y, z]
+        return total

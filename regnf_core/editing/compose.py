@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from regnf_core.editing.clearing import Clearing, clear_box, clear_thing
+from regnf_core.editing.clearing import Clearing, Place, clear
 from regnf_core.editing.edited_scene import EditedScene
 from regnf_core.editing.edits import (
     Edit,
@@ -33,10 +32,6 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_core.surface.sphere_tracing import axis_vector, surface_bounds
 
-if TYPE_CHECKING:
-    from regnf_core.editing.edited_scene import EditedScene
-
-
 # What counts as observed after the edits: there, everything does.
 
 
@@ -44,7 +39,8 @@ def observation_after(known: Observation, edited: EditedScene) -> Observation:
     """``known`` with the voxels of cleared places and of objects told from the edited scene: surface, free, or within
     matter, which nobody sees."""
     states = known.states.clone()
-    boxes = [clearing.box for clearing in edited.clearings] + [thing.box for _, thing in edited.objects]
+    boxes = [clearing.box for clearing in edited.clearings if isinstance(clearing, Clearing)]
+    boxes += [thing.box for _, thing in edited.objects]
     for box in boxes:
         index = _voxels_of(known, box)
         if not len(index):
@@ -79,6 +75,24 @@ def _middles(known: Observation, index: Tensor) -> Tensor:
     return points if known.T_grid_frame is None else known.T_grid_frame.inverse().apply(points)
 
 
+@dataclass(frozen=True, eq=False)
+class _Planned:
+    """What an edit comes to. removed: the known thing that goes, or a box · placed: what comes."""
+
+    removed: Place | None
+    placed: PlacedObject | None
+    residual: float = 0.0
+    tint: Tint | None = None
+    name: str | None = None
+
+    @property
+    def place(self) -> OrientedBox:
+        """The box of what comes, or else of what goes."""
+        thing = self.placed or self.removed
+        assert thing is not None
+        return _box_of(thing)
+
+
 # Edits of one scene must not meddle with each other: each changes a place of its own.
 
 _POINTS = 12
@@ -88,69 +102,44 @@ _MOST_COMMON = 0.05
 _MOST_OF_BOX = 0.5
 """Share of a thing's matter that may lie in a box that another edit clears."""
 
-Place = PlacedObject | OrientedBox
 
-
-@dataclass(frozen=True, eq=False)
-class Occupied:
-    """What one edit takes away and what it puts in."""
-
-    removed: Place | None
-    placed: PlacedObject | None
-
-
-def require_apart(edits: Sequence[Occupied]) -> None:
-    """Raises InvalidInputError (EDITS_OVERLAP): two edits take away the same thing, or put matter in one place."""
+def _require_apart(edits: Sequence[_Planned]) -> None:
+    """Raises InvalidInputError (EDIT_INVALID): two edits take away the same thing, or put matter in one place."""
     for (first, one), (second, other) in combinations(enumerate(edits), 2):
-        for a, b in _rivals(one, other):
+        for a, b in ((one.removed, other.removed), (one.placed, other.placed)):
+            if a is None or b is None:
+                continue
             most = _MOST_COMMON if isinstance(a, PlacedObject) and isinstance(b, PlacedObject) else _MOST_OF_BOX
             if _common(a, b) > most:
                 message = f"edits {first} and {second} change the same place"
                 hint = "Leave one of them out, or make one after the other: an edited scene can be edited again."
-                raise InvalidInputError(message, reason="EDITS_OVERLAP", hint=hint)
-
-
-def _rivals(one: Occupied, other: Occupied) -> Iterator[tuple[Place, Place]]:
-    if one.removed is not None and other.removed is not None:
-        yield one.removed, other.removed
-    if one.placed is not None and other.placed is not None:
-        yield one.placed, other.placed
+                raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)
 
 
 def _common(a: Place, b: Place) -> float:
     """The larger of the shares of each one's matter that lies in the other."""
-    if not _near(a, b):
+    one, other = _box_of(a), _box_of(b)
+    if float((one.center - other.center).norm()) > 0.5 * (one.diagonal + other.diagonal):
         return 0.0
     return max(_share_within(a, b), _share_within(b, a))
 
 
 def _share_within(a: Place, b: Place) -> float:
-    points = _points(a)
-    return float(_within(b, points).float().mean()) if len(points) else 0.0
-
-
-def _points(place: Place) -> Tensor:
-    """Points (N, 3) spread over the matter of an object, or over a box."""
-    box = place.box if isinstance(place, PlacedObject) else place
+    box = _box_of(a)
     steps = (torch.arange(_POINTS, dtype=torch.float64) + 0.5) / _POINTS - 0.5
     points = (box.center + (torch.cartesian_prod(steps, steps, steps) * box.size) @ box.rotation.T).float()
-    if isinstance(place, OrientedBox):
-        return points
-    distance = place.signed_distance(points).cpu()
-    thin = float((box.size / _POINTS).norm()) / 2.0  # legs and plates fall between the points
-    return points[distance < (0.0 if int((distance < 0).sum()) >= _POINTS else thin)]
+    if isinstance(a, PlacedObject):
+        distance = a.signed_distance(points).cpu()
+        thin = float((box.size / _POINTS).norm()) / 2.0  # legs and plates fall between the points
+        points = points[distance < (0.0 if int((distance < 0).sum()) >= _POINTS else thin)]
+    if not len(points):
+        return 0.0
+    within = b.contains(points) if isinstance(b, OrientedBox) else b.signed_distance(points).cpu() < 0.0
+    return float(within.float().mean())
 
 
-def _within(place: Place, points: Tensor) -> Tensor:
-    if isinstance(place, OrientedBox):
-        return place.contains(points)
-    return place.signed_distance(points).cpu() < 0.0
-
-
-def _near(a: Place, b: Place) -> bool:
-    boxes = [place.box if isinstance(place, PlacedObject) else place for place in (a, b)]
-    distance = float((boxes[0].center - boxes[1].center).norm())
-    return distance <= 0.5 * (boxes[0].diagonal + boxes[1].diagonal)
+def _box_of(place: Place) -> OrientedBox:
+    return place.box if isinstance(place, PlacedObject) else place
 
 
 # Where a replacement stands: on the base of what stood there, upright, turned alike, as large.
@@ -187,24 +176,6 @@ def _upright(up: str) -> Tensor:
     return torch.stack([first, torch.linalg.cross(vertical, first), vertical], dim=1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Planned:
-    """What an edit comes to. removed: the known thing that goes, or a box · placed: what comes."""
-
-    removed: PlacedObject | OrientedBox | None
-    placed: PlacedObject | None
-    residual: float = 0.0
-    tint: Tint | None = None
-    name: str | None = None
-
-    @property
-    def place(self) -> OrientedBox:
-        """The box of what comes, or else of what goes."""
-        thing = self.placed or self.removed
-        assert thing is not None
-        return thing.box if isinstance(thing, PlacedObject) else thing
-
-
 def compose(
     scene: SdfField, edits: Sequence[Edit], seed: int = 0, progress: Callable[[float], None] | None = None
 ) -> EditedScene:
@@ -212,15 +183,15 @@ def compose(
 
     Distances are in scene units. Deterministic for a seed. ``progress`` is called with the share done, 0..1, before
     each edit; it may raise CancelledError to stop the work.
-    Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID, EDITS_OVERLAP (two edits change the same place),
-    EDIT_OUTSIDE_SCENE, FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
+    Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID (also for two edits of one place, and beyond the scene),
+    FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
     surfaces: dict[int, OrientedBox] = {}
     scene, origin = near_origin(scene)
     planned = [_planned(_moved(edit, origin), number, surfaces) for number, edit in enumerate(edits)]
     for number, plan in enumerate(planned):
         _require_in_scene(scene, plan, number)
-    require_apart([Occupied(plan.removed, plan.placed) for plan in planned])
+    _require_apart(planned)
     before = scene.parts if isinstance(scene, PartedField) else (Part(scene, None),)
     clearings: list[Clearing] = []
     objects: list[tuple[int, PlacedObject]] = []
@@ -229,10 +200,8 @@ def compose(
         if progress is not None:
             progress(number / len(planned))
         generator = torch.Generator().manual_seed(seed + number)
-        if isinstance(plan.removed, PlacedObject):
-            clearings.append(clear_thing(scene, plan.removed, plan.residual, generator))
-        elif plan.removed is not None:
-            clearings.append(clear_box(scene, plan.removed, generator))
+        if plan.removed is not None:
+            clearings.append(clear(scene, plan.removed, plan.residual, generator))
         if plan.placed is not None:
             objects.append((len(parts), plan.placed))
             parts.append(Part(plan.placed.obj, plan.placed.T_object_scene, plan.tint, plan.name))
@@ -258,55 +227,39 @@ def _moved(edit: Edit, origin: Tensor) -> Edit:
 
 
 def _planned(edit: Edit, number: int, surfaces: dict[int, OrientedBox]) -> _Planned:
+    """surfaces: the boxes of fields' surfaces by the fields' ids, each found once."""
+
+    def surface(field: SdfField) -> OrientedBox:
+        if id(field) not in surfaces:
+            surfaces[id(field)] = surface_bounds(field)
+        return surfaces[id(field)]
+
+    tint = None if isinstance(edit, Removal) else edit.tint
     try:
-        match edit:
-            case Substitution():
-                thing = _placed(edit.obj, edit.T_object_scene, surfaces)
-                return _Planned(thing, thing, _scene_units(edit.residual, thing), edit.tint, edit.name)
-            case Replacement():
-                thing = _placed(edit.obj, edit.T_object_scene, surfaces)
-                here, other = (_surface(field, surfaces) for field in (edit.obj, edit.replacement))
-                T_other_thing = edit.T_replacement_object
-                if T_other_thing is None:
-                    verticals = edit.up_object, edit.up_replacement
-                    T_other_thing = standing_alike(here, other, *verticals, edit.match)
-                placed = PlacedObject(edit.replacement, T_other_thing @ edit.T_object_scene, other)
-                return _Planned(thing, placed, _scene_units(edit.residual, thing), edit.tint, edit.name)
-            case Removal():
-                if edit.obj is None or edit.T_object_scene is None:
-                    return _Planned(edit.detection, None, name=edit.name)
-                thing = _placed(edit.obj, edit.T_object_scene, surfaces)
-                return _Planned(thing, None, _scene_units(edit.residual, thing), name=edit.name)
-            case Insertion():
-                return _Planned(None, _placed(edit.obj, edit.T_object_scene, surfaces), tint=edit.tint, name=edit.name)
+        if edit.obj is None or edit.T_object_scene is None:
+            return _Planned(edit.detection, None, name=edit.name)
+        thing = PlacedObject(edit.obj, edit.T_object_scene, surface(edit.obj))
+        if isinstance(edit, Insertion):
+            return _Planned(None, thing, tint=tint, name=edit.name)
+        placed = thing if isinstance(edit, Substitution) else None
+        if isinstance(edit, Replacement):
+            other, T_other_thing = surface(edit.replacement), edit.T_replacement_object
+            if T_other_thing is None:
+                T_other_thing = standing_alike(thing.surface, other, edit.up_object, edit.up_replacement, edit.match)
+            placed = PlacedObject(edit.replacement, T_other_thing @ edit.T_object_scene, other)
+        return _Planned(thing, placed, (edit.residual or 0.0) / thing.scale, tint, edit.name)
     except NoSurfaceError as error:
         raise NoSurfaceError(f"edit {number}: {error}", reason=error.reason) from error
 
 
-def _placed(field: SdfField, T_object_scene: Sim3, surfaces: dict[int, OrientedBox]) -> PlacedObject:
-    return PlacedObject(field, T_object_scene, _surface(field, surfaces))
-
-
-def _surface(field: SdfField, surfaces: dict[int, OrientedBox]) -> OrientedBox:
-    """The box of a field's surface, found once a field."""
-    if id(field) not in surfaces:
-        surfaces[id(field)] = surface_bounds(field)
-    return surfaces[id(field)]
-
-
-def _scene_units(residual: float | None, thing: PlacedObject) -> float:
-    return (residual or 0.0) / thing.scale
-
-
 def _require_in_scene(scene: SdfField, plan: _Planned, number: int) -> None:
-    """Raises InvalidInputError (EDIT_OUTSIDE_SCENE): nothing of the thing lies within the scene's bounds."""
+    """Raises InvalidInputError (EDIT_INVALID): nothing of the thing lies within the scene's bounds."""
     low, high = scene.bounds
     for thing in (plan.removed, plan.placed):
-        box = thing.box if isinstance(thing, PlacedObject) else thing
-        if box is None:
+        if thing is None:
             continue
-        corners = box.corners()
+        corners = _box_of(thing).corners()
         if bool((corners.amin(0) > high).any()) or bool((corners.amax(0) < low).any()):
             message = f"edit {number}: what it changes lies outside of the scene's bounds"
             hint = "T_object_scene takes scene coordinates to object coordinates. Check its direction and the units."
-            raise InvalidInputError(message, reason="EDIT_OUTSIDE_SCENE", hint=hint)
+            raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from scipy.ndimage import binary_dilation
 from torch import Tensor
 
-from regnf_core.editing.clearing import Clearing
+from regnf_core.editing.clearing import Clearing, RegionGrid, Unseen
 from regnf_core.editing.edits import SCENE_PART, Part, PartedField
 from regnf_core.editing.support import PlacedObject
-from regnf_core.fields.observation import Observation, SdfField, has_color, inverse_deviation_of
+from regnf_core.fields.composite import near_origin
+from regnf_core.fields.observation import Observation, SdfField, has_color, inverse_deviation_of, observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.schema.description import SURFACE
 
 _PLAIN = 0.8
 """Color of a part that has none, where another has."""
@@ -53,7 +57,7 @@ class EditedScene:
     def __init__(
         self,
         scene: SdfField,
-        clearings: Sequence[Clearing],
+        clearings: Sequence[Clearing | Unseen],
         objects: Sequence[tuple[int, PlacedObject]],
         parts: Sequence[Part],
         places: Sequence[OrientedBox] = (),
@@ -72,12 +76,8 @@ class EditedScene:
 
     def moved(self, shift: Tensor) -> EditedScene:
         """The same where ``shift`` (3,) is subtracted from all places."""
-        return self._with(self.scene, self.objects, self._parts, self.origin - shift)
-
-    def _with(
-        self, scene: SdfField, objects: Sequence[tuple[int, PlacedObject]], parts: Sequence[Part], origin: Tensor
-    ) -> EditedScene:
-        return EditedScene(scene, self.clearings, objects, parts, self._places, self._observation, origin)
+        origin, same = self.origin - shift, (self._places, self._observation)
+        return EditedScene(self.scene, self.clearings, self.objects, self._parts, *same, origin)
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -120,7 +120,8 @@ class EditedScene:
         """The same with all parameters on another device."""
         moved = [(number, thing.to(device)) for number, thing in self.objects]
         parts = [replace(part, field=part.field.to(device)) for part in self._parts]
-        return self._with(self.scene.to(device), moved, parts, self.origin)
+        same = self._places, self._observation, self.origin
+        return EditedScene(self.scene.to(device), self.clearings, moved, parts, *same)
 
     def _near(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the field's frame in that of its parts, single precision."""
@@ -176,7 +177,7 @@ class EditedScene:
         for clearing in self.clearings:
             limits = clearing.limits(points, with_gradient)
             for bound in (empty, full):
-                bound.distance, bound.gradient = limits.apply(bound.distance, bound.gradient)
+                bound.distance, bound.gradient = limits.apply((bound.distance, bound.gradient))
         self._add_objects(empty, points, full.distance.clamp_min(0.0), with_gradient)
         return empty, empty.distance <= full.distance
 
@@ -190,8 +191,8 @@ class EditedScene:
         found.distance = distance.to(points)
         for clearing in self.clearings:
             near = (clearing.reaches(points) < found.distance.abs()).nonzero().squeeze(-1)
-            changed = clearing.limits(points[near], with_gradient).apply(found.distance[near], found.gradient[near])
-            found.distance[near], found.gradient[near] = changed
+            limits = clearing.limits(points[near], with_gradient)
+            found.distance[near], found.gradient[near] = limits.apply((found.distance[near], found.gradient[near]))
         self._add_objects(found, points, found.distance.clamp_min(0.0), with_gradient)
         return found
 
@@ -218,12 +219,33 @@ class EditedScene:
         directions = directions.to(points)
         colors = torch.full_like(points, _PLAIN)
         for number in torch.unique(numbers).tolist():
-            part = self._parts[number]
-            if has_color(part.field):
-                chosen = (numbers == number).nonzero().squeeze(-1)
-                at, along = points[chosen], directions[chosen]
-                if part.T_field_scene is not None:
-                    at = part.T_field_scene.apply(at.double()).float()
-                    along = along @ part.T_field_scene.rotation.to(along).T
-                colors[chosen] = part.field.color(at, along).to(points)
+            chosen = (numbers == number).nonzero().squeeze(-1)
+            own = self._parts[number].color(points[chosen], directions[chosen])
+            if own is not None:
+                colors[chosen] = own
         return colors
+
+
+# A scene without the matter that nobody saw: invented behind things, and in the way of cameras there.
+
+_AROUND = 2
+"""Voxels round measured surface whose matter stays."""
+
+
+def without_unseen(scene: SdfField) -> SdfField:
+    """The scene without unobserved matter; itself where it does not know what was observed."""
+    near, origin = near_origin(scene)
+    known = observation_of(near)
+    if known is None:
+        return scene
+    shape = torch.tensor(known.states.shape, dtype=torch.float64)
+    box = OrientedBox(known.low + known.voxel * shape / 2, known.voxel * shape, torch.eye(3, dtype=torch.float64))
+    cell = known.voxel
+    if known.T_grid_frame is not None:
+        back = known.T_grid_frame.inverse()
+        box = OrientedBox(back.apply(box.center[None])[0], box.size * back.scale, back.rotation)
+        cell = cell * float(back.scale)
+    x, y, z = known.states.shape
+    measured = np.asarray(binary_dilation((known.states == SURFACE).numpy(), iterations=_AROUND))
+    shell = RegionGrid(box, cell, (x, y, z)).distance_to(measured)
+    return EditedScene(near, [Unseen(shell)], [], [Part(near, None)], (), known, origin)

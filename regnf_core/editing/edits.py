@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from regnf_core.detections import Detection
-from regnf_core.editing.request import (
-    EditRequest,
-    InsertionRequest,
-    RemovalRequest,
-    ReplacementRequest,
-    SubstitutionRequest,
-)
+from regnf_core.editing.request import EditRequest
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.observation import SdfField
+from regnf_core.fields.observation import SdfField, has_color
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 
@@ -38,6 +32,16 @@ class Part:
     T_field_scene: Sim3 | None
     tint: Tint | None = None
     name: str | None = None
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor | None:
+        """The field's own (N, 3), of points (N, 3) of the scene seen along unit directions (N, 3), if it has any."""
+        if not has_color(self.field):
+            return None
+        if self.T_field_scene is not None:
+            places = self.T_field_scene.apply(points.double()).float()
+            directions = directions @ self.T_field_scene.rotation.to(directions).T
+            return self.field.color(places, directions).to(points)
+        return self.field.color(points, directions).to(points)
 
 
 @runtime_checkable
@@ -66,20 +70,24 @@ def invalid_edit(message: str) -> InvalidInputError:
     return InvalidInputError(message, reason="EDIT_INVALID")
 
 
-def _checked(transform: Sim3) -> None:
-    """Raises InvalidInputError (INVALID_TRANSFORM) for what is no single similarity of float64 numbers."""
-    if transform.scale.shape != ():
-        raise InvalidInputError("an edit has one transform, not a batch", reason="INVALID_TRANSFORM")
-    Sim3.from_matrix(transform.matrix())
+class _Checked:
+    """What all edits are refused for. Raises InvalidInputError (INVALID_TRANSFORM, EDIT_INVALID)."""
 
-
-def _check_residual(residual: float | None) -> None:
-    if residual is not None and not 0.0 <= residual < math.inf:
-        raise invalid_edit("a residual is a length in object units, 0 or more")
+    def __post_init__(self) -> None:
+        for name in ("T_object_scene", "T_replacement_object"):
+            transform: Sim3 | None = getattr(self, name, None)
+            if transform is None:
+                continue
+            if transform.scale.shape != ():
+                raise InvalidInputError("an edit has one transform, not a batch", reason="INVALID_TRANSFORM")
+            Sim3.from_matrix(transform.matrix())
+        residual = getattr(self, "residual", None)
+        if residual is not None and not 0.0 <= residual < math.inf:
+            raise invalid_edit("a residual is a length in object units, 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
-class Substitution:
+class Substitution(_Checked):
     """The object's own field where the scene shows the object: as a registration has found it.
 
     T_object_scene: scene to object coordinates · residual: of the registration, in object units (``residual_rms`` times
@@ -92,13 +100,9 @@ class Substitution:
     tint: Tint | None = None
     name: str | None = None
 
-    def __post_init__(self) -> None:
-        _checked(self.T_object_scene)
-        _check_residual(self.residual)
-
 
 @dataclass(frozen=True, eq=False)
-class Replacement:
+class Replacement(_Checked):
     """Another object in place of one that was registered.
 
     obj, T_object_scene, residual: as in a substitution, of what stands there now · replacement: what will
@@ -119,16 +123,13 @@ class Replacement:
     name: str | None = None
 
     def __post_init__(self) -> None:
-        for transform in (self.T_object_scene, self.T_replacement_object):
-            if transform is not None:
-                _checked(transform)
-        _check_residual(self.residual)
+        super().__post_init__()
         if self.match not in ("height", "diagonal"):
             raise invalid_edit(f"a replacement matches height or diagonal, not {str(self.match)[:20]!r}")
 
 
 @dataclass(frozen=True, eq=False)
-class Removal:
+class Removal(_Checked):
     """What stands in a box is taken away; floor and walls go on, and what reaches in from outside stays.
 
     detection: all of the thing, scene frame · obj, T_object_scene: what was registered there, where it is known: then
@@ -142,17 +143,15 @@ class Removal:
     name: str | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.obj is None) != (self.T_object_scene is None):
             raise invalid_edit("a removal has an object and its transform, or neither")
         if self.detection is None and self.obj is None:
             raise invalid_edit("a removal needs a detection, or an object and its transform")
-        _check_residual(self.residual)
-        if self.T_object_scene is not None:
-            _checked(self.T_object_scene)
 
 
 @dataclass(frozen=True, eq=False)
-class Insertion:
+class Insertion(_Checked):
     """An object where nothing of the scene is removed. T_object_scene: any similarity, scene to object coordinates."""
 
     obj: SdfField
@@ -160,65 +159,27 @@ class Insertion:
     tint: Tint | None = None
     name: str | None = None
 
-    def __post_init__(self) -> None:
-        _checked(self.T_object_scene)
-
 
 Edit = Substitution | Replacement | Removal | Insertion
-
-
-# From a request's edits, with names, to edits with fields.
+_EDITS: dict[str, type[Edit]] = {
+    "substitution": Substitution, "replacement": Replacement, "removal": Removal, "insertion": Insertion
+}  # fmt: skip
 
 
 def open_edits(requests: Sequence[EditRequest], open_object: Callable[[str], SdfField]) -> list[Edit]:
-    """The edits in the same order; ``open_object`` opens each named field once. Raises what it raises."""
-    opened: dict[str, SdfField] = {}
-
-    def field(name: str) -> SdfField:
-        if name not in opened:
-            opened[name] = open_object(name)
-        return opened[name]
-
-    return [_opened(request, field) for request in requests]
-
-
-def _opened(request: EditRequest, field: Callable[[str], SdfField]) -> Edit:
-    match request:
-        case SubstitutionRequest():
-            return Substitution(field(request.object), _transform(request.T_object_scene), **_common(request))
-        case ReplacementRequest():
-            known = request.T_replacement_object
-            return Replacement(
-                field(request.object),
-                _transform(request.T_object_scene),
-                field(request.replacement),
-                None if known is None else _transform(known),
-                request.match,
-                request.up_object,
-                request.up_replacement,
-                **_common(request),
-            )
-        case RemovalRequest():
-            known = request.T_object_scene
-            return Removal(
-                _box(request.detection),
-                None if request.object is None else field(request.object),
-                None if known is None else _transform(known),
-                request.residual,
-                request.name,
-            )
-        case InsertionRequest():
-            placed = _transform(request.T_object_scene)
-            return Insertion(field(request.object), placed, request.tint, request.name)
-
-
-def _common(request: SubstitutionRequest | ReplacementRequest) -> dict[str, Any]:
-    return {"residual": request.residual, "tint": request.tint, "name": request.name}
-
-
-def _transform(rows: list[list[float]]) -> Sim3:
-    return Sim3.from_matrix(rows)
-
-
-def _box(detection: Detection | None) -> OrientedBox | None:
-    return None if detection is None else OrientedBox.from_detection(detection)
+    """A request's edits, with names, as edits with fields, in the same order; ``open_object`` opens each named field
+    once. Raises what it raises."""
+    opened = cache(open_object)
+    read: dict[str, Callable[[Any], Any]] = {
+        "object": opened,
+        "replacement": opened,
+        "detection": OrientedBox.from_detection,
+        "T_object_scene": Sim3.from_matrix,
+        "T_replacement_object": Sim3.from_matrix,
+    }
+    edits = []
+    for request in requests:
+        said = {each.name: getattr(request, each.name) for each in fields(request)}
+        made = {n: read[n](value) if n in read and value is not None else value for n, value in said.items()}
+        edits.append(_EDITS[made.pop("kind")](obj=made.pop("object"), **made))
+    return edits

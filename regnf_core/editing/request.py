@@ -1,7 +1,6 @@
 """Edits as a request says them, in plain (JSON) values. Torch-free: checked before any work begins.
 
-Objects and detections have names here; :mod:`regnf_core.editing.edits` turns a request's edits into those of
-:mod:`regnf_core.editing.edits`.
+Objects and detections have names here; ``open_edits`` turns them into fields and boxes.
 """
 
 from __future__ import annotations
@@ -122,12 +121,15 @@ class InsertionRequest:
     name: Name | None = None
 
 
-def _kind_of(value: Any) -> Any:
-    return value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-
-
 EditRequest = SubstitutionRequest | ReplacementRequest | RemovalRequest | InsertionRequest
-_KINDS = ("substitution", "replacement", "removal", "insertion")
+_ADAPTERS: dict[str, TypeAdapter[Any]] = {
+    "substitution": TypeAdapter(SubstitutionRequest),
+    "replacement": TypeAdapter(ReplacementRequest),
+    "removal": TypeAdapter(RemovalRequest),
+    "insertion": TypeAdapter(InsertionRequest),
+}
+AnyEdit = Annotated[EditRequest, Discriminator("kind")]
+"""For models that hold edits: told apart by ``kind``."""
 
 
 def read_edits(values: Any) -> list[EditRequest]:
@@ -140,33 +142,21 @@ def read_edits(values: Any) -> list[EditRequest]:
         raise InvalidInputError(f"edits: expected a list of {MOST_EDITS} at most", reason="EDIT_INVALID")
     found: list[EditRequest] = []
     for index, value in enumerate(values):
-        kind = _kind_of(value)
-        if kind not in _KINDS:
-            raise InvalidInputError(f"edits[{index}].kind: expected one of {', '.join(_KINDS)}", reason="EDIT_INVALID")
+        kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+        if kind not in list(_ADAPTERS):
+            message = f"edits[{index}].kind: expected one of {', '.join(_ADAPTERS)}"
+            raise InvalidInputError(message, reason="EDIT_INVALID")
         try:
             found.append(_ADAPTERS[kind].validate_python(value))
         except ValidationError as error:
-            raise _fault(index, error) from error
+            first = error.errors(include_url=False, include_input=False)[0]
+            member = ".".join(str(part) for part in first["loc"])
+            reason = "EDIT_INVALID"
+            if first["type"] == "value_error" and member.startswith("T_"):
+                reason = "INVALID_TRANSFORM"
+            if first["type"] == "value_error" and member == "detection":
+                reason = "INVALID_DETECTION"
+            where = f"edits[{index}]" + (f".{member}" if member else "")
+            message = f"{where}: {first['msg'].removeprefix('Value error, ')}"
+            raise InvalidInputError(message, reason=reason) from error
     return found
-
-
-def _fault(index: int, error: ValidationError) -> InvalidInputError:
-    first = error.errors(include_url=False, include_input=False)[0]
-    member = ".".join(str(part) for part in first["loc"])
-    reason = "EDIT_INVALID"
-    if first["type"] == "value_error" and member.startswith("T_"):
-        reason = "INVALID_TRANSFORM"
-    if first["type"] == "value_error" and member == "detection":
-        reason = "INVALID_DETECTION"
-    where = f"edits[{index}]" + (f".{member}" if member else "")
-    return InvalidInputError(f"{where}: {first['msg'].removeprefix('Value error, ')}", reason=reason)
-
-
-_ADAPTERS: dict[str, TypeAdapter[Any]] = {
-    kind: TypeAdapter(model)
-    for kind, model in zip(
-        _KINDS, (SubstitutionRequest, ReplacementRequest, RemovalRequest, InsertionRequest), strict=True
-    )
-}
-AnyEdit = Annotated[EditRequest, Discriminator("kind")]
-"""For models that hold edits: told apart by ``kind``."""

@@ -52,7 +52,22 @@ def write_field(field: SdfField, path: Path, resolution: int) -> tuple[int, int,
             colors[rows] = _colors(field, points, near).reshape(len(rows), y, z, 3)
     if not np.isfinite(values).all():
         raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
-    _write(field, path, lattice, values, colors, origin.tolist())
+    bounds = [lattice.low.tolist(), (lattice.low + lattice.step * (lattice.counts - 1)).tolist()]
+    description: dict[str, Any] = {
+        "kind": "voxel_grid", "origin": bounds[0], "spacing": [lattice.step] * 3, "bounds": bounds
+    }  # fmt: skip
+    if origin.any():
+        placed = shift_rows(origin.tolist())
+        description |= {"placement": {"transform": placed, "bounds": bounds}, "bounds": moved_box(placed, bounds)}
+    tensors: dict[str, Any] = {"values": values}
+    known = observation_of(field)
+    if known is not None and (known := known.without_shift()).T_grid_frame is None:
+        grid, tensors[OBSERVATION] = known.stored()
+        description[OBSERVATION] = {"low": list(grid.low), "voxel": grid.voxel, "counts": list(grid.counts)}
+    if colors is not None:
+        description[COLOR] = asdict(ValueColor("values"))
+        tensors |= color_tensors({VALUES: colors})
+    write_safe_field(path, description, tensors)
     return x, y, z
 
 
@@ -66,35 +81,3 @@ def _colors(field: ColoredField, points: Tensor, chosen: Tensor) -> NDArray[np.f
         found = field.color(places + distance[:, None] * inward, inward)
         colors[chosen.numpy()] = found.cpu().clamp(0.0, 1.0).half().numpy()
     return colors
-
-
-def _write(
-    field: SdfField,
-    path: Path,
-    lattice: Lattice,
-    values: NDArray[np.float32],
-    colors: NDArray[np.float16] | None,
-    origin: list[float],
-) -> None:
-    """origin: (3,), what was subtracted from all places."""
-    top = lattice.low + lattice.step * (lattice.counts - 1)
-    description: dict[str, Any] = {
-        "kind": "voxel_grid",
-        "origin": lattice.low.tolist(),
-        "spacing": [lattice.step] * 3,
-        "bounds": [lattice.low.tolist(), top.tolist()],
-    }
-    if any(origin):
-        rows = shift_rows(origin)
-        description["placement"] = {"transform": rows, "bounds": description["bounds"]}
-        description["bounds"] = moved_box(rows, description["bounds"])
-    tensors: dict[str, Any] = {"values": values}
-    known = observation_of(field)
-    if known is not None and (known := known.without_shift()).T_grid_frame is None:
-        grid, words = known.stored()
-        description["observation"] = {"low": list(grid.low), "voxel": grid.voxel, "counts": list(grid.counts)}
-        tensors[OBSERVATION] = words
-    if colors is not None:
-        description[COLOR] = asdict(ValueColor("values"))
-        tensors |= color_tensors({VALUES: colors})
-    write_safe_field(path, description, tensors)

@@ -75,30 +75,24 @@ def _surface_around(scene: SdfField, box: OrientedBox, generator: torch.Generato
 def _best(
     points: Tensor, normals: Tensor, box: OrientedBox, generator: torch.Generator
 ) -> tuple[SupportPlane | None, Tensor]:
+    def near_plane(n: Tensor, offset: float) -> Tensor:
+        return ((points @ n - offset).abs() <= _THICKNESS * box.diagonal) & (normals @ n >= _FACING)
+
     picks = torch.randperm(len(points), generator=generator)[:_CANDIDATES]
     best, best_near, most = None, torch.zeros(len(points), dtype=torch.bool), 0
     for n, p in zip(normals[picks], points[picks], strict=True):
-        near = _near(points, normals, n, float(n @ p), box)
+        near = near_plane(n, float(n @ p))
         if int(near.sum()) <= max(most, 8):
             continue
-        n, offset = _fitted(points[near], n)
-        near = _near(points, normals, n, offset, box)
+        middle = points[near].mean(0)  # the plane of least squares, its normal on the side of ``n``
+        thinnest = torch.linalg.eigh((points[near] - middle).T @ (points[near] - middle))[1][:, 0]
+        n = thinnest * torch.sign(thinnest @ n)
+        offset = float(n @ middle)
+        near = near_plane(n, offset)
         if int(near.sum()) > most and _supports(n, offset, points[near], box):
             heights = points[near] @ n - offset
             best, best_near, most = SupportPlane(n, offset, float(heights.abs().median())), near, int(near.sum())
     return best, best_near
-
-
-def _near(points: Tensor, normals: Tensor, n: Tensor, offset: float, box: OrientedBox) -> Tensor:
-    return ((points @ n - offset).abs() <= _THICKNESS * box.diagonal) & (normals @ n >= _FACING)
-
-
-def _fitted(points: Tensor, n: Tensor) -> tuple[Tensor, float]:
-    """The plane of least squares, its normal on the side of ``n``."""
-    middle = points.mean(0)
-    thinnest = torch.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
-    thinnest = thinnest * torch.sign(thinnest @ n)
-    return thinnest, float(thinnest @ middle)
 
 
 def _supports(n: Tensor, offset: float, on_plane: Tensor, box: OrientedBox) -> bool:

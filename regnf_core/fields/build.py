@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import torch
 from safetensors import safe_open
@@ -17,12 +18,13 @@ from regnf_core.fields.mlp import build_mlp
 from regnf_core.fields.neural_points import build_neural_points
 from regnf_core.fields.neus_facto import build_neus_facto
 from regnf_core.fields.observation import (
+    ColoredField,
     ColorFunction,
+    FieldView,
     Observation,
     ObservedField,
+    OnDevice,
     SdfField,
-    color_in_unit,
-    has_color,
     inverse_deviation_of,
     observation_of,
     stored_observation,
@@ -52,69 +54,55 @@ from regnf_core.schema.safe_format import read_header
 # A field in another unit, or with the opposite sign.
 
 
-class ScaledField:
+class ScaledField(FieldView):
     """S(x) = sign * scale * f(x / scale): ``scale`` is the length of one unit of f's coordinates, in the new unit.
 
     Coordinates and distances scale together, so the gradient's norm stays what it was.
     """
 
-    color: ColorFunction
-    """Only where the field has color."""
-
     def __init__(self, field: SdfField, scale: float = 1.0, sign: int = 1) -> None:
-        self.field = field
-        self.scale = scale
-        self.sign = sign
-        if has_color(field):
-            self.color = color_in_unit(field, scale)
+        self.scale, self.sign = scale, sign
+        super().__init__(field)
+
+    def _color_of(self, field: ColoredField) -> ColorFunction:
+        return partial(_color_in_unit, field, self.scale)
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, new unit."""
         return self.field.bounds * self.scale
 
     @property
-    def device(self) -> torch.device:
-        """That of the field."""
-        return self.field.device
-
-    @property
     def observation(self) -> Observation | None:
-        """What was observed, new unit; None where it is not known."""
         seen = observation_of(self.field)
-        return None if seen is None else seen.seen_in(_scaling(1.0 / self.scale))
+        identity = torch.eye(3, dtype=torch.float64)
+        scaling = Sim3(torch.tensor(1.0 / self.scale, dtype=torch.float64), identity, identity.new_zeros(3))
+        return None if seen is None else seen.seen_in(scaling)
 
     @property
     def inverse_deviation(self) -> float | None:
-        """NeuS's s, per new unit; None where the field has none."""
         inverse = inverse_deviation_of(self.field)
         return None if inverse is None else inverse / self.scale
 
     def to(self, device: torch.device | str) -> ScaledField:
-        """The same field with its parameters on another device."""
         return ScaledField(self.field.to(device), self.scale, self.sign)
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3), new unit."""
         return self.field.signed_distance(points / self.scale) * (self.sign * self.scale)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3), new unit."""
         distance, gradient = self.field.signed_distance_and_gradient(points / self.scale)
         return distance * (self.sign * self.scale), gradient * self.sign
 
 
-def _scaling(scale: float) -> Sim3:
-    return Sim3(
-        torch.tensor(scale, dtype=torch.float64), torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    )
+def _color_in_unit(field: ColoredField, scale: float, points: Tensor, directions: Tensor) -> Tensor:
+    return field.color(points / scale, directions)
 
 
 # A field known at the nodes of a regular grid, interpolated between them.
 
 
 @dataclass(frozen=True)
-class VoxelGridFunction:
+class VoxelGridFunction(OnDevice):
     """Trilinear interpolation of values (X, Y, Z), float32 or float16; node (i, j, k) is at origin + spacing (i, j, k).
 
     origin, spacing: (3,) float32. Points are taken to be within the grid.
@@ -128,22 +116,10 @@ class VoxelGridFunction:
 
     @property
     def device(self) -> torch.device:
-        """Where the values live."""
         return self.values.device
-
-    def to(self, device: torch.device | str) -> VoxelGridFunction:
-        """The same function with its values on another device."""
-        return replace(
-            self,
-            values=self.values.to(device),
-            origin=self.origin.to(device),
-            spacing=self.spacing.to(device),
-            colors=None if self.colors is None else self.colors.to(device),
-        )
 
     @property
     def has_color(self) -> bool:
-        """Whether :meth:`color` may be asked."""
         return self.colors is not None
 
     def color(self, points: Tensor, directions: Tensor) -> Tensor:
@@ -154,19 +130,17 @@ class VoxelGridFunction:
         return interpolate_colors(self.colors.view(-1, 3)[index], weights)
 
     def value(self, points: Tensor) -> Tensor:
-        """Value (N,) at points (N, 3)."""
-        return interpolate(*self._corners(points))
+        index, weights = self._cells(points)
+        return interpolate(self._values(index), weights)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Value (N,) at points (N, 3) and its gradient (N, 3); on a cell's border, that of the cell beyond."""
-        value, derivative = interpolate_with_derivative(*self._corners(points))
+        index, weights = self._cells(points)
+        value, derivative = interpolate_with_derivative(self._values(index), weights)
         return value, derivative.T / self.spacing
 
-    def _corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The values (2, 2, 2, N) at the corners of the points' cells, and the weights (3, N) of the upper ones."""
-        index, weights = self._cells(points)
-        values = self.values.view(-1).index_select(0, index.view(-1)).float()
-        return values.view(2, 2, 2, -1), weights
+    def _values(self, index: Tensor) -> Tensor:
+        return self.values.view(-1).index_select(0, index.view(-1)).float().view(2, 2, 2, -1)
 
     def _cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The corners (8, N) of the points' cells among all nodes, and the weights (3, N) of the upper ones."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.hash_encoding import HashEncoding
+from regnf_core.fields.observation import OnDevice
 from regnf_core.schema.description import TABLE, NetworkColor
 from regnf_core.schema.hash_grid_config import PositionalEncodingDescription
 from regnf_core.schema.tensor_check import count_layers
@@ -125,7 +126,7 @@ class Appearance:
 
 
 @dataclass(frozen=True)
-class ColorHead:
+class ColorHead(OnDevice):
     """[position, direction, gradient, grid, hidden] -> layers, ReLU between -> sigmoid -> color within [0, 1].
 
     weights[i]: (out_i, in_i) · biases[i]: (out_i,) · form: which inputs there are, and how they are encoded.
@@ -136,12 +137,6 @@ class ColorHead:
     biases: tuple[Tensor, ...]
     grid: HashEncoding | None = None
     """The color's own."""
-
-    def to(self, device: torch.device | str) -> ColorHead:
-        """The same on another device."""
-        weights, biases = (tuple(tensor.to(device) for tensor in part) for part in (self.weights, self.biases))
-        grid = None if self.grid is None else HashEncoding(self.grid.config, self.grid.table.to(device))
-        return ColorHead(self.form, weights, biases, grid)
 
     def __call__(self, appearance: Appearance, directions: Tensor) -> Tensor:
         """Color (N, 3) along unit ``directions`` (N, 3)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -12,10 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.fields.observation import (
+    ColoredField,
     ColorFunction,
+    FieldView,
     Observation,
     SdfField,
-    color_in_frame,
     field_repr,
     has_color,
     inverse_deviation_of,
@@ -53,20 +55,16 @@ class BoxField:
 
     @property
     def device(self) -> torch.device:
-        """Always the CPU."""
         return torch.device("cpu")
 
     def to(self, device: torch.device | str) -> BoxField:
-        """This field."""
         del device
         return self
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         return self.signed_distance_and_gradient(points)[0]
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) float32 at points (N, 3) and its gradient (N, 3)."""
         lower, upper = self.bounds
         offset = points.cpu().double() - (lower + upper) / 2.0
         beyond = offset.abs() - (upper - lower) / 2.0  # (N, 3)
@@ -139,7 +137,6 @@ class UnionField:
         )
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         return self.signed_distance_and_gradient(points)[0]
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,68 +195,57 @@ class UnionField:
 # A field seen in another frame: the same surface after a similarity, distances in the other frame's units.
 
 
-class TransformedField:
+class TransformedField(FieldView):
     """S_frame(x) = S_field(T x) / s for T = ``T_field_frame``, which carries the new frame's points to the field's own.
 
     The bounds are the axis-aligned box round the field's own bounds, in the new frame.
     """
 
-    color: ColorFunction
-    """Only where the field has color."""
-
     def __init__(self, field: SdfField, T_field_frame: Sim3) -> None:
         if isinstance(field, TransformedField):  # one transform in float64: two would lose the digits between them
             T_field_frame = field.T_field_frame @ T_field_frame
             field = field.field
-        self.field: SdfField = field
         self.T_field_frame: Sim3 = T_field_frame
-        if has_color(field):
-            self.color = color_in_frame(field, T_field_frame)
+        super().__init__(field)
+
+    def _color_of(self, field: ColoredField) -> ColorFunction:
+        return partial(_color_in_frame, field, self.T_field_frame)
 
     def __repr__(self) -> str:
         return field_repr(self)
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, new frame."""
         low, high = self.field.bounds
         corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))  # (8, 3)
         moved = self.T_field_frame.inverse().apply(corners)
         return torch.stack([moved.amin(0), moved.amax(0)])
 
     @property
-    def device(self) -> torch.device:
-        """That of the field."""
-        return self.field.device
-
-    @property
     def observation(self) -> Observation | None:
-        """What was observed, new frame; None where it is not known."""
         seen = observation_of(self.field)
         return None if seen is None else seen.seen_in(self.T_field_frame)
 
     @property
     def inverse_deviation(self) -> float | None:
-        """NeuS's s, per unit of the new frame; None where the field has none."""
         inverse = inverse_deviation_of(self.field)
         return None if inverse is None else inverse * float(self.T_field_frame.scale)
 
     def to(self, device: torch.device | str) -> TransformedField:
-        """The same field with its parameters on another device."""
         return TransformedField(self.field.to(device), self.T_field_frame)
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3) of the new frame, its units."""
-        distance = self.field.signed_distance(self._moved(points))
+        distance = self.field.signed_distance(self.T_field_frame.apply(points.double()))
         return distance / float(self.T_field_frame.scale)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3) of the new frame."""
-        distance, gradient = self.field.signed_distance_and_gradient(self._moved(points))
+        distance, gradient = self.field.signed_distance_and_gradient(self.T_field_frame.apply(points.double()))
         return distance / float(self.T_field_frame.scale), gradient @ self.T_field_frame.rotation.to(gradient)
 
-    def _moved(self, points: Tensor) -> Tensor:
-        return self.T_field_frame.apply(points.double())
+
+def _color_in_frame(field: ColoredField, T_field_frame: Sim3, points: Tensor, directions: Tensor) -> Tensor:
+    moved = T_field_frame.apply(points.double())
+    return field.color(moved, directions @ T_field_frame.rotation.to(directions).T).float()
 
 
 @runtime_checkable

@@ -98,6 +98,10 @@ class HashEncoding:
         self.entries = self._column(torch.tensor(entries[active]))
         self.offsets = self._column(torch.tensor(offsets[active]))
 
+    def to(self, device: torch.device | str) -> HashEncoding:
+        """The same with its table on another device."""
+        return HashEncoding(self.config, self.table.to(device), self.active_levels)
+
     @property
     def width(self) -> int:
         """Number of features of an encoded point."""

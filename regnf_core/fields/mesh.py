@@ -67,7 +67,6 @@ class MeshField:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, own frame."""
         if self._bounds is not None:
             return self._bounds
         used = self.vertices[np.unique(self.faces)]
@@ -80,7 +79,6 @@ class MeshField:
 
     @property
     def device(self) -> torch.device:
-        """Always the CPU."""
         return torch.device("cpu")
 
     def to(self, device: torch.device | str) -> MeshField:
@@ -89,7 +87,6 @@ class MeshField:
         return self
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         return self.signed_distance_and_gradient(points)[0]
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from regnf_core.fields.color_head import Appearance, ColorHead, PositionalEncoding
+from regnf_core.fields.observation import OnDevice
 from regnf_core.fields.user_fields import FunctionField
 from regnf_core.schema.kinds import LEAKY_SLOPE, MlpDescription
 from regnf_core.schema.tensor_check import count_layers
@@ -88,7 +89,7 @@ ACTIVATIONS = {
 
 
 @dataclass(frozen=True)
-class LayerNorm:
+class LayerNorm(OnDevice):
     """(a - mean) / sqrt(variance + 1e-5) * weight + bias, over the last axis. weight, bias: (width,)."""
 
     weight: Tensor
@@ -107,13 +108,9 @@ class LayerNorm:
         along = (g * standard).mean(dim=-1, keepdim=True)
         return scale * (g - g.mean(dim=-1, keepdim=True) - standard * along)
 
-    def to(self, device: torch.device | str) -> LayerNorm:
-        """The same on another device."""
-        return LayerNorm(self.weight.to(device), self.bias.to(device))
-
 
 @dataclass(frozen=True)
-class Layer:
+class Layer(OnDevice):
     """W [h, input] + b, then perhaps a layer normalization. weight: (out, in), bias: (out,)."""
 
     weight: Tensor
@@ -121,14 +118,9 @@ class Layer:
     sees_input: bool = False
     norm: LayerNorm | None = None
 
-    def to(self, device: torch.device | str) -> Layer:
-        """The same on another device."""
-        norm = None if self.norm is None else self.norm.to(device)
-        return Layer(self.weight.to(device), self.bias.to(device), self.sees_input, norm)
-
 
 @dataclass(frozen=True)
-class MlpFunction:
+class MlpFunction(OnDevice):
     """x -> [x, sines and cosines of x] -> layers, activation between -> tanh, ``output_tanh`` times -> distance.
 
     Of the last layer the first row is evaluated: the signed distance.
@@ -143,21 +135,13 @@ class MlpFunction:
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.layers[0].weight.device
-
-    def to(self, device: torch.device | str) -> MlpFunction:
-        """The same function with its parameters on another device."""
-        head = None if self.head is None else self.head.to(device)
-        return replace(self, layers=tuple(layer.to(device) for layer in self.layers), head=head)
 
     @property
     def has_color(self) -> bool:
-        """Whether :meth:`color` may be asked."""
         return self.head is not None
 
     def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3)."""
         inputs = self._inputs(points)
         activate = self.activation.value
         h = inputs
@@ -167,7 +151,6 @@ class MlpFunction:
         return self._squashed(_linear(self.layers[-1], h, inputs).squeeze(-1))[0]
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
         distance, gradient, _ = self._evaluated(points)
         return distance, gradient
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from regnf_core.fields.neus_facto_function import GeometryMlp
+from regnf_core.fields.observation import OnDevice
 from regnf_core.fields.user_fields import FunctionField
 from regnf_core.fields.voxel_blocks import CellIndex
 from regnf_core.geometry.exponential_map import matrix_from_quaternion
@@ -19,7 +20,7 @@ _EPSILON = 1e-15
 
 
 @dataclass(frozen=True)
-class PointTable:
+class PointTable(OnDevice):
     """At most one point a cell, found as the trainer finds it: by the cell's number in a buffer that may be too small.
 
     keys: (M,) int64, the taken numbers, ascending · rows: (M,), the point of each · offsets: (C,) the numbers of the
@@ -44,10 +45,6 @@ class PointTable:
         around = around[around.square().sum(-1) < reach * reach]
         return cls(keys[last], order[last], _number(around, buffer_size), cell_size, buffer_size)
 
-    def to(self, device: torch.device | str) -> PointTable:
-        """The same table on another device."""
-        return replace(self, keys=self.keys.to(device), rows=self.rows.to(device), offsets=self.offsets.to(device))
-
     def around(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """The points (N, C) in the cells round places (N, 3), and whether there is one in each."""
         own = _number((places / self.cell_size).floor().long(), self.buffer_size)
@@ -67,7 +64,7 @@ class _Blend:
 
 
 @dataclass(frozen=True)
-class NeuralPointsFunction:
+class NeuralPointsFunction(OnDevice):
     """[feature, relative position] of the nearest points, blended by inverse square distance, into a ReLU network.
 
     points: (P, 3) · features: (P, F) · rotations: (P, 3, 3), which turn a relative position into a point's own frame,
@@ -89,18 +86,9 @@ class NeuralPointsFunction:
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.points.device
 
-    def to(self, device: torch.device | str) -> NeuralPointsFunction:
-        """The same function with its parameters on another device."""
-        names = ("points", "features", "table", "cells", "cell_points", "mlp")
-        moved = {name: getattr(self, name).to(device) for name in names}
-        rotations = None if self.rotations is None else self.rotations.to(device)
-        return replace(self, rotations=rotations, **moved)
-
     def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3)."""
         return self.value_and_gradient(points)[0]
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from regnf_core.fields.color_head import Appearance, ColorHead, PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.fields.mlp import ACTIVATIONS
+from regnf_core.fields.observation import OnDevice
 from regnf_core.schema.kinds import Contraction
 from regnf_core.schema.tensor_check import count_layers
 
@@ -71,7 +72,6 @@ class GeometryMlp:
         return cls(weights, biases, skip_at, activation)
 
     def to(self, device: torch.device | str) -> GeometryMlp:
-        """The same network on another device."""
         weights, biases = ([t.to(device) for t in tensors] for tensors in (self.weights, self.biases))
         return GeometryMlp(weights, biases, self.skip_at, self.activation)
 
@@ -132,7 +132,7 @@ class GeometryMlp:
 
 
 @dataclass(frozen=True)
-class NeusFactoFunction:
+class NeusFactoFunction(OnDevice):
     """x -> z -> [z, sines and cosines of z, hash features of (z + r) / 2r] -> network -> signed distance.
 
     Differentiable with respect to the table and the layers (not the points), so that fitting and evaluation share it.
@@ -150,24 +150,13 @@ class NeusFactoFunction:
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.mlp.weights[0].device
-
-    def to(self, device: torch.device | str) -> NeusFactoFunction:
-        """The same function with its parameters on another device."""
-        grid = self.hash_encoding
-        if grid is not None:
-            grid = HashEncoding(grid.config, grid.table.to(device), grid.active_levels)
-        head = None if self.head is None else self.head.to(device)
-        return replace(self, mlp=self.mlp.to(device), hash_encoding=grid, head=head)
 
     @property
     def has_color(self) -> bool:
-        """Whether :meth:`color` may be asked."""
         return self.head is not None
 
     def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3)."""
         return self.mlp(self.encode(points))
 
     def encode(self, points: Tensor) -> Tensor:
@@ -181,7 +170,6 @@ class NeusFactoFunction:
         return torch.cat(parts, dim=-1)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
         parts, jacobian = self._encode_with_derivative(points)
         distance, by_feature = self.mlp.with_gradient(torch.cat(parts, dim=-1))
         gradient = self._by_position(points, parts, jacobian, by_feature)
@@ -223,19 +211,13 @@ class NeusFactoFunction:
 
     def gradient_by_level(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Value (N,) at points (N, 3), its gradient (N, 3) but for the grid's part, and each level's part (A, N, 3)."""
-        if self.hash_encoding is None:
-            raise ValueError("a function without a hash grid")
-        z, grid_points = self.coordinates(points)
-        parts = [z]
-        if self.positional_encoding is not None:
-            parts.append(self.positional_encoding.encode(z))
-        encoded, jacobian = self.hash_encoding.encode_with_derivative(self.to_unit(grid_points))
-        distance, by_feature = self.mlp.with_gradient(torch.cat((*parts, encoded), dim=-1))
-        by_part = torch.split(by_feature, [*(part.shape[1] for part in parts), encoded.shape[1]], dim=-1)
-        rest = by_part[0]
-        if self.positional_encoding is not None:
-            rest = rest + self.positional_encoding.pull_back(parts[1], by_part[1])
-        levels = self.hash_encoding.by_level(jacobian * by_part[-1]) / (2.0 * self.grid_radius)
+        parts, jacobian = self._encode_with_derivative(points)
+        assert self.hash_encoding is not None
+        assert jacobian is not None
+        distance, by_feature = self.mlp.with_gradient(torch.cat(parts, dim=-1))
+        rest = self._by_position(points, parts, None, by_feature)
+        by_grid = by_feature[:, -parts[-1].shape[1] :]
+        levels = self.hash_encoding.by_level(jacobian * by_grid) / (2.0 * self.grid_radius)
         if self.contraction != "none":
             levels = torch.stack([pull_back_linf(points, level) for level in levels])
         return distance, pull_back_linf(points, rest) if self.contraction == "linf" else rest, levels

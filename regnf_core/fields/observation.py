@@ -7,9 +7,8 @@ can say which is which; those that cannot have no observation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Protocol, TypeGuard, runtime_checkable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol, Self, TypeGuard, runtime_checkable
 
 import numpy as np
 import torch
@@ -118,23 +117,19 @@ def inverse_deviation_of(field: SdfField) -> float | None:
     return field.inverse_deviation if isinstance(field, HasInverseDeviation) else None
 
 
-def color_in_frame(field: ColoredField, T_field_frame: Sim3) -> ColorFunction:
-    """The color of ``field`` for points and directions of another frame, which T_field_frame takes to the field's."""
-    return partial(_color_in_frame, field, T_field_frame)
+class OnDevice:
+    """For dataclasses: ``to`` gives a copy with all that has a device, also within tuples, on another one."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on another device."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **{name: _moved(value, device) for name, value in values.items()})  # type: ignore[type-var]
 
 
-def color_in_unit(field: ColoredField, scale: float) -> ColorFunction:
-    """The color of ``field`` for points in a unit, of which ``scale`` make up one unit of the field's coordinates."""
-    return partial(_color_in_unit, field, scale)
-
-
-def _color_in_frame(field: ColoredField, T_field_frame: Sim3, points: Tensor, directions: Tensor) -> Tensor:
-    moved = T_field_frame.apply(points.double())
-    return field.color(moved, directions @ T_field_frame.rotation.to(directions).T).float()
-
-
-def _color_in_unit(field: ColoredField, scale: float, points: Tensor, directions: Tensor) -> Tensor:
-    return field.color(points / scale, directions)
+def _moved(value: Any, device: torch.device | str) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_moved(one, device) for one in value)
+    return value.to(device) if hasattr(value, "to") else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,44 +196,57 @@ class Observed(Protocol):
         ...
 
 
-class ObservedField:
-    """A field with another observation than its own; with None, one that nothing is known of."""
+class FieldView:
+    """A field seen through something: what a class does not say anew is the field's own."""
 
     color: ColorFunction
     """Only where the field has color."""
 
-    def __init__(self, field: SdfField, observation: Observation | None) -> None:
+    def __init__(self, field: SdfField) -> None:
         self.field = field
-        self.observation = observation
         if has_color(field):
-            self.color = field.color
+            self.color = self._color_of(field)
+
+    def _color_of(self, field: ColoredField) -> ColorFunction:
+        return field.color
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, own frame."""
         return self.field.bounds
 
     @property
     def device(self) -> torch.device:
-        """That of the field."""
         return self.field.device
 
     @property
+    def observation(self) -> Observation | None:
+        return observation_of(self.field)
+
+    @property
     def inverse_deviation(self) -> float | None:
-        """That of the field."""
         return inverse_deviation_of(self.field)
 
-    def to(self, device: torch.device | str) -> ObservedField:
-        """The same field with its parameters on another device; the observation stays on the CPU."""
-        return ObservedField(self.field.to(device), self.observation)
-
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         return self.field.signed_distance(points)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         return self.field.signed_distance_and_gradient(points)
+
+
+class ObservedField(FieldView):
+    """A field with another observation than its own; with None, one that nothing is known of."""
+
+    def __init__(self, field: SdfField, observation: Observation | None) -> None:
+        super().__init__(field)
+        self._observation = observation
+
+    @property
+    def observation(self) -> Observation | None:
+        return self._observation
+
+    def to(self, device: torch.device | str) -> ObservedField:
+        """The same field with its parameters on another device; the observation stays on the CPU."""
+        return ObservedField(self.field.to(device), self._observation)
 
 
 def stored_observation(grid: ObservationGrid, words: Tensor) -> Observation:
@@ -252,27 +260,15 @@ def observation_of(field: SdfField) -> Observation | None:
     return field.observation if isinstance(field, Observed) else None
 
 
-# A field that counts its evaluations.
+class CountingField(FieldView):
+    """A field that counts the points at which it is evaluated. A value with its gradient counts as one evaluation.
 
-
-class CountingField:
-    """A field that counts the points at which it is evaluated. A value with its gradient counts as one evaluation."""
+    It has no color.
+    """
 
     def __init__(self, field: SdfField) -> None:
         self.field = field
         self.evaluations = 0
-
-    @property
-    def bounds(self) -> Tensor:
-        return self.field.bounds
-
-    @property
-    def device(self) -> torch.device:
-        return self.field.device
-
-    @property
-    def observation(self) -> Observation | None:
-        return observation_of(self.field)
 
     def to(self, device: torch.device | str) -> CountingField:
         moved = CountingField(self.field.to(device))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, Protocol, Self, TypeVar, runtime_checkable
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.observation import ColorFunction, SdfField, field_repr
+from regnf_core.fields.observation import ColorFunction, FieldView, OnDevice, SdfField, field_repr
 
 PointFunction = Callable[[Tensor], Any]
 """Signed distance (N,) or (N, 1) at points (N, 3) float32: a tensor or a numpy array of real numbers."""
@@ -25,17 +25,16 @@ _HINT = (
 )
 
 
-class UserField:
+class UserField(FieldView):
     """An SdfField of the user's own: it is given float32 points on its device, and what it returns is checked.
 
     Raises FieldFormatError (FUNCTION_UNUSABLE) where a value is missing, no number or of another shape.
     """
 
     def __init__(self, field: SdfField) -> None:
-        self.field = field
-        for name in ("color", "observation", "inverse_deviation", "part_at"):
-            if hasattr(field, name):
-                setattr(self, name, getattr(field, name))
+        super().__init__(field)
+        if hasattr(field, "part_at"):
+            self.part_at = field.part_at
         self._bounds = checked_bounds(field.bounds)
 
     def __repr__(self) -> str:
@@ -43,25 +42,20 @@ class UserField:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU."""
         return self._bounds
 
     @property
     def device(self) -> torch.device:
-        """That of the field."""
         return torch.device(self.field.device)
 
     def to(self, device: torch.device | str) -> UserField:
-        """The same field on another device."""
         return UserField(self.field.to(device))
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         given = points.to(device=self.device, dtype=torch.float32)
         return _values("signed_distance", self.field.signed_distance(given), (len(points),), self.device)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         given, name = points.to(device=self.device, dtype=torch.float32), "signed_distance_and_gradient"
         found = self.field.signed_distance_and_gradient(given)
         if not isinstance(found, tuple | list) or len(found) != 2:
@@ -100,7 +94,6 @@ class FunctionOfPoints:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU."""
         return self._bounds
 
     def to(self, device: torch.device | str) -> FunctionOfPoints:
@@ -111,13 +104,11 @@ class FunctionOfPoints:
 
     @torch.no_grad()
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         given = points.to(device=self.device, dtype=torch.float32)
         parts = [self._asked(part) for part in torch.split(given, _CHUNK)]
         return torch.cat(parts) if parts else given.new_zeros(0)
 
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         given = points.to(device=self.device, dtype=torch.float32).detach()
         parts = [self._with_gradient(part) for part in torch.split(given, _CHUNK)]
         distance, gradient = (torch.cat(some) for some in zip(*parts, strict=True))
@@ -181,7 +172,8 @@ def _values(name: str, found: Any, shape: tuple[int, ...], device: torch.device)
     """Real numbers of this shape as float32; a column of one counts as a row."""
     if not isinstance(found, Tensor | np.ndarray):
         raise _unusable(f"{name} returns a {type(found).__name__}, expected a tensor or an array of numbers")
-    values = torch.from_numpy(np.array(found)) if _is_plain(found) else found
+    plain = isinstance(found, np.ndarray) and found.dtype.kind in "fiu"
+    values = torch.from_numpy(np.array(found)) if plain else found
     if not isinstance(values, Tensor) or values.is_complex() or values.dtype == torch.bool:
         raise _unusable(f"{name} returns numbers of the kind {found.dtype}, expected real ones")
     if tuple(values.shape) == (*shape, 1):
@@ -189,10 +181,6 @@ def _values(name: str, found: Any, shape: tuple[int, ...], device: torch.device)
     if tuple(values.shape) != shape:
         raise _unusable(f"{name} returns the shape {tuple(values.shape)} for {shape[0]} points, expected {shape}")
     return values.to(device=device, dtype=torch.float32)
-
-
-def _is_plain(found: Any) -> bool:
-    return isinstance(found, np.ndarray) and found.dtype.kind in "fiu"
 
 
 def _device_of(function: PointFunction) -> torch.device | str:
@@ -211,8 +199,20 @@ _FUNCTION_CHUNK = 1 << 10  # the layers' outputs at so many points fit a core's 
 _CHUNK_ACCELERATOR = 1 << 18
 
 
-class SdfFunction(Protocol):
-    """What a kind of field has to write: the distance, its gradient in closed form, and a move to another device."""
+class Evaluator(Protocol):
+    """What evaluates a function's present parameters, without a graph."""
+
+    def value(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) at points (N, 3) float32, both on the function's device."""
+        ...
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
+        ...
+
+
+class SdfFunction(Evaluator, Protocol):
+    """What a kind of field has to write."""
 
     @property
     def device(self) -> torch.device:
@@ -221,26 +221,6 @@ class SdfFunction(Protocol):
 
     def to(self, device: torch.device | str) -> Self:
         """The same function with its parameters on another device."""
-        ...
-
-    def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3) float32, both on ``device``."""
-        ...
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them."""
-        ...
-
-
-class Evaluator(Protocol):
-    """What evaluates a function's present parameters, without a graph."""
-
-    def value(self, points: Tensor) -> Tensor:
-        """As :meth:`SdfFunction.value`."""
-        ...
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`SdfFunction.value_and_gradient`."""
         ...
 
 
@@ -287,16 +267,13 @@ class FunctionField(Generic[F]):
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, own frame."""
         return self._bounds
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.function.device
 
     def to(self, device: torch.device | str) -> Self:
-        """The same field with its parameters on another device."""
         return type(self)(self.function.to(device), self._bounds, self.chunk, self.inverse_deviation)
 
     def with_inverse_deviation(self, inverse_deviation: float | None) -> Self:
@@ -305,7 +282,6 @@ class FunctionField(Generic[F]):
 
     @torch.no_grad()
     def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
         distance, evaluator = self._empty(len(points)), self._evaluator()
         for at, part in _chunks(points, self.chunk, self.device):
             distance[at] = evaluator.value(part)
@@ -313,7 +289,6 @@ class FunctionField(Generic[F]):
 
     @torch.no_grad()
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
         distance, gradient, evaluator = self._empty(len(points)), self._empty(len(points), 3), self._evaluator()
         for at, part in _chunks(points, self.chunk, self.device):
             distance[at], gradient[at] = evaluator.value_and_gradient(part)
@@ -349,7 +324,7 @@ def _chunked_color(
 
 
 @dataclass(frozen=True)
-class BoxExtension(Generic[F]):
+class BoxExtension(OnDevice, Generic[F]):
     """g in the box; outside, g at the box's nearest point plus the distance to it. Continuous and finite everywhere.
 
     What lies outside is taken for free space: the true distance is at most so large, and at least the distance to the
@@ -364,12 +339,7 @@ class BoxExtension(Generic[F]):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
         return self.function.device
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same function with its parameters on another device."""
-        return replace(self, function=self.function.to(device), low=self.low.to(device), high=self.high.to(device))
 
     def value(self, points: Tensor) -> Tensor:
         """g (N,) at points (N, 3), extended."""
@@ -390,7 +360,6 @@ class BoxExtension(Generic[F]):
 
     @property
     def has_color(self) -> bool:
-        """Whether :meth:`color` may be asked."""
         return isinstance(self.function, ColoredFunction) and self.function.has_color
 
     def color(self, points: Tensor, directions: Tensor) -> Tensor:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.fields.observation import OnDevice
 from regnf_core.fields.user_fields import FunctionField
 from regnf_core.schema.kinds import VoxelBlocksDescription
 
@@ -23,7 +24,7 @@ _NEIGHBORS = 4
 
 
 @dataclass(frozen=True)
-class CellIndex:
+class CellIndex(OnDevice):
     """Finds the rows of occupied cells. Its memory follows the number of cells, not the space between them.
 
     low, size: (3,) int64, the box round the cells · keys: (N,), the cells' numbers within it, ascending · rows: (N,),
@@ -46,19 +47,17 @@ class CellIndex:
         """
         cells = cells.long()
         if cells.shape[0] == 0 or int(cells.max()) >= _FARTHEST or int(cells.min()) <= -_FARTHEST:
-            raise _invalid("there are no cells, or one is too far from the origin")
+            message = "there are no cells, or one is too far from the origin"
+            raise FieldFormatError(message, reason="FIELD_INDEX_INVALID")
         low, high = cells.amin(0), cells.amax(0)
         size = high - low + 1
         keys, rows = _cell_number(cells - low, size).sort()
         if bool((keys.diff() == 0).any()):
-            raise _invalid("a cell occurs twice")
-        step = _step([int(extent) for extent in size])
+            raise FieldFormatError("a cell occurs twice", reason="FIELD_INDEX_INVALID")
+        step = 1  # the least edge of the table's cells that keeps the table small
+        while math.prod(math.ceil(int(extent) / step) for extent in size) > _TABLE_CELLS:
+            step += max(1, step // 4)
         return cls(low, size, keys, rows, _nearest_rows(cells, low, size, step).to(cells.device), step)
-
-    def to(self, device: torch.device | str) -> CellIndex:
-        """The same index on another device."""
-        moved = {name: getattr(self, name).to(device) for name in ("low", "size", "keys", "rows", "table")}
-        return replace(self, **moved)
 
     def find(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Of cells (..., 3) the row, and whether there is one; the row means nothing where there is none."""
@@ -78,14 +77,6 @@ def _cell_number(offset: Tensor, size: Tensor) -> Tensor:
     return (offset[..., 0] * size[1] + offset[..., 1]) * size[2] + offset[..., 2]
 
 
-def _step(size: list[int]) -> int:
-    """The least edge of the table's cells that keeps the table small."""
-    step = 1
-    while math.prod(math.ceil(extent / step) for extent in size) > _TABLE_CELLS:
-        step += max(1, step // 4)
-    return step
-
-
 def _nearest_rows(cells: Tensor, low: Tensor, size: Tensor, step: int) -> Tensor:
     """The table: for the middle of every ``step``^3 cells of the box the rows of the nearest of ``cells`` (N, 3)."""
     axes = [torch.arange(math.ceil(int(extent) / step), dtype=torch.float64) for extent in size]
@@ -93,10 +84,6 @@ def _nearest_rows(cells: Tensor, low: Tensor, size: Tensor, step: int) -> Tensor
     count = min(_NEIGHBORS, cells.shape[0])
     _, rows = cKDTree(cells.cpu().numpy()).query(middles.numpy(), k=range(1, count + 1))
     return torch.from_numpy(rows).view(*[len(axis) for axis in axes], count)
-
-
-def _invalid(message: str) -> FieldFormatError:
-    return FieldFormatError(message, reason="FIELD_INDEX_INVALID")
 
 
 # Trilinear interpolation from a cell's eight corners, and its derivative.
@@ -141,7 +128,7 @@ def corner_offsets(device: torch.device) -> Tensor:
 
 
 @dataclass(frozen=True)
-class VoxelBlocksFunction:
+class VoxelBlocksFunction(OnDevice):
     """Trilinear interpolation on an endless lattice of nodes; node q is at origin + voxel_size q.
 
     A node in a block has the block's value. Any other has the least that a block nearby allows: the value of the
@@ -162,23 +149,10 @@ class VoxelBlocksFunction:
 
     @property
     def device(self) -> torch.device:
-        """Where the values live."""
         return self.values.device
-
-    def to(self, device: torch.device | str) -> VoxelBlocksFunction:
-        """The same function with its values on another device."""
-        return replace(
-            self,
-            values=self.values.to(device),
-            blocks=self.blocks.to(device),
-            index=self.index.to(device),
-            origin=self.origin.to(device),
-            colors=None if self.colors is None else self.colors.to(device),
-        )
 
     @property
     def has_color(self) -> bool:
-        """Whether :meth:`color` may be asked."""
         return self.colors is not None
 
     def color(self, points: Tensor, directions: Tensor) -> Tensor:
@@ -192,7 +166,6 @@ class VoxelBlocksFunction:
         return interpolate_colors(self.colors.view(-1, 3)[self._nearest_numbers(nodes)], weights)
 
     def value(self, points: Tensor) -> Tensor:
-        """Value (N,) at points (N, 3)."""
         return interpolate(*self._corners(points))
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from regnf_core.detections import Detection, parse_detection
-from regnf_core.detections.parsing import open3d_detection
+from regnf_core.detections.parsing import detection_of, open3d_names
 from regnf_core.errors import InvalidDetectionError
 from regnf_core.geometry.exponential_map import matrix_from_quaternion
 from regnf_core.rotations import quaternion_of
@@ -94,7 +94,10 @@ class OrientedBox:
     @classmethod
     def from_open3d(cls, box: Any, label: str | None = None, score: float | None = None) -> OrientedBox:
         """A box from Open3D's OrientedBoundingBox or AxisAlignedBoundingBox. Raises InvalidDetectionError."""
-        return cls.from_detection(replace(open3d_detection(box), label=label, score=score))
+        if not open3d_names(box):
+            hint = "Give an OrientedBoundingBox or an AxisAlignedBoundingBox; from_dict takes a detection's JSON."
+            raise InvalidDetectionError(f"a {type(box).__name__} is no box of Open3D", hint=hint)
+        return cls.from_detection(replace(detection_of(box), label=label, score=score))
 
     @classmethod
     def from_quaternion(

@@ -156,6 +156,11 @@ class Symmetries:
         return Sim3.cat([turn @ fixed for fixed in discrete for turn in turned])
 
 
+def _three(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
 def _turn(symmetry: ContinuousSymmetry, angle: float) -> Sim3:
     axis = torch.tensor(list(symmetry.axis), dtype=torch.float64)
     offset: Tensor = torch.tensor(list(symmetry.offset), dtype=torch.float64)
@@ -165,29 +170,7 @@ def _turn(symmetry: ContinuousSymmetry, angle: float) -> Sim3:
     return Sim3.from_translation(offset) @ Sim3.exp(tangent) @ Sim3.from_translation(-offset)
 
 
-def _three(values: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
 _CHUNK = 64  # symmetries treated at once by MSSD
-
-
-def translation_rmse(estimate: Sim3, truth: Sim3) -> float:
-    """Root mean square over x, y, z of the difference of the translations, object units."""
-    return float((estimate.translation - truth.translation).square().mean().sqrt())
-
-
-def euler_rmse(estimate: Sim3, truth: Sim3) -> float:
-    """Root mean square over roll, pitch, yaw of their differences, each wrapped to +-pi, radians."""
-    difference = euler_from_rotation(estimate.rotation) - euler_from_rotation(truth.rotation)
-    wrapped = torch.remainder(difference + math.pi, 2 * math.pi) - math.pi
-    return float(wrapped.square().mean().sqrt())
-
-
-def scale_error(estimate: Sim3, truth: Sim3) -> float:
-    """|s - s_true|."""
-    return float((estimate.scale - truth.scale).abs())
 
 
 def rotation_error(estimate: Sim3, truth: Sim3, symmetries: Symmetries | None = None) -> float:
@@ -225,21 +208,20 @@ def add_s(estimate: Sim3, truth: Sim3, points: Tensor) -> float:
 
 
 def paper_errors(estimate: Sim3, truth: Sim3) -> dict[str, float]:
-    """The paper's errors by name. The translation's grows with the distance of the scene's origin from the object: it
-    holds the rotation's lever arm."""
+    """The paper's errors by name, root mean squares: of x, y, z, object units; of roll, pitch, yaw, each wrapped to
+    +-pi. The translation's grows with the distance of the scene's origin from the object: it holds the rotation's lever
+    arm."""
+    turned = euler_from_rotation(estimate.rotation) - euler_from_rotation(truth.rotation)
+    wrapped = torch.remainder(turned + math.pi, 2 * math.pi) - math.pi
     return {
-        "translation_rmse": translation_rmse(estimate, truth),
-        "euler_rmse_rad": euler_rmse(estimate, truth),
-        "scale_error": scale_error(estimate, truth),
+        "translation_rmse": float((estimate.translation - truth.translation).square().mean().sqrt()),
+        "euler_rmse_rad": float(wrapped.square().mean().sqrt()),
+        "scale_error": float((estimate.scale - truth.scale).abs()),
     }
 
 
 def errors_against_truth(
-    estimate: Sim3,
-    truth: Sim3,
-    points: Tensor,
-    symmetries: Symmetries | None = None,
-    center: Tensor | None = None,
+    estimate: Sim3, truth: Sim3, points: Tensor, symmetries: Symmetries | None = None, center: Tensor | None = None
 ) -> dict[str, float]:
     """The errors by name that do not depend on where the scene's origin is, the smallest over the symmetries.
 
@@ -256,7 +238,7 @@ def errors_against_truth(
         "center_error": off / float(truth.scale),
         "center_error_share": off / size,
         "rotation_error_rad": rotation_error(estimate, truth, known),
-        "scale_error_share": scale_error(estimate, truth) / float(truth.scale),
+        "scale_error_share": float((estimate.scale - truth.scale).abs()) / float(truth.scale),
         "mssd": largest,
         "mssd_share": largest / size,
         "add_s": nearest,

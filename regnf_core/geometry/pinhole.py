@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
+
 
 @dataclass(frozen=True, eq=False)
-class PinholeCameras:
+class PinholeCameras(Bundle):
     """N cameras of one frame. Image coordinates are shares of the image's width and height, from 0 to 1.
 
     positions: (N, 3) · axes: (N, 3, 3), rotations whose columns are right, down and forward · focal: (N, 2), focal
@@ -24,10 +26,6 @@ class PinholeCameras:
 
     def __len__(self) -> int:
         return int(self.positions.shape[0])
-
-    def __getitem__(self, index: Tensor) -> PinholeCameras:
-        parts = (self.positions, self.axes, self.focal, self.middle, self.aspect)
-        return PinholeCameras(*(part[index] for part in parts))
 
     def moved(self, transform: Tensor) -> PinholeCameras:
         """The same cameras in another frame; transform: (4, 4), a similarity from this frame to the other."""

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
+from regnf_core.geometry.bundle import Bundle, over_tensors
 from regnf_core.geometry.exponential_map import (
     exp_parts,
     log_parts,
@@ -36,7 +37,7 @@ def _numbers(values: Any) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Sim3:
+class Sim3(Bundle):
     """A similarity transform, or a batch of them: x -> scale * rotation @ x + translation.
 
     scale: (...) > 0 · rotation: (..., 3, 3) proper · translation: (..., 3). float64 unless made otherwise.
@@ -152,16 +153,13 @@ class Sim3:
         """How many transforms a batch holds."""
         return len(self.scale)
 
-    def __getitem__(self, index: Tensor | slice | int | None) -> Sim3:
-        """The transforms that ``index`` (numbers, bools or a slice) names, in its order."""
-        return Sim3(self.scale[index], self.rotation[index], self.translation[index])
-
     def __iter__(self) -> Iterator[Sim3]:
         return (self[i] for i in range(len(self)))
 
     def expand(self, count: int) -> Sim3:
         """One transform ``count`` times, as a batch."""
-        return Sim3(*(part.expand(count, *part.shape) for part in (self.scale, self.rotation, self.translation)))
+        found: Sim3 = over_tensors(lambda part: part.expand(count, *part.shape), self)
+        return found
 
     def log(self) -> Tensor:
         """The tangent (..., 7) whose :meth:`exp` is this transform; its rotation angle is at most pi."""
@@ -181,7 +179,7 @@ class Sim3:
         return Sim3(
             self.scale * other.scale,
             self.rotation @ other.rotation,
-            self._linear(other.translation) + self.translation,
+            self.scale.unsqueeze(-1) * (self.rotation @ other.translation.unsqueeze(-1)).squeeze(-1) + self.translation,
         )
 
     def inverse(self) -> Sim3:
@@ -212,13 +210,10 @@ class Sim3:
         """The same transform in the dtype and on the device of another tensor."""
         return Sim3(self.scale.to(like), self.rotation.to(like), self.translation.to(like))
 
-    def on(self, device: torch.device | str) -> Sim3:
-        """The same transform on another device."""
-        return Sim3(self.scale.to(device), self.rotation.to(device), self.translation.to(device))
-
     def detach(self) -> Sim3:
         """The same transform, cut from any autograd graph."""
-        return Sim3(self.scale.detach(), self.rotation.detach(), self.translation.detach())
+        found: Sim3 = over_tensors(Tensor.detach, self)
+        return found
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values: ``matrix`` (row-major 4x4), ``scale``, ``rotation_quaternion_xyzw``, ``translation``."""
@@ -228,7 +223,3 @@ class Sim3:
             "rotation_quaternion_xyzw": self.quaternion_xyzw().tolist(),
             "translation": self.translation.tolist(),
         }
-
-    def _linear(self, vectors: Tensor) -> Tensor:
-        """scale * rotation @ v for vectors (..., 3), without the translation."""
-        return self.scale.unsqueeze(-1) * (self.rotation @ vectors.unsqueeze(-1)).squeeze(-1)

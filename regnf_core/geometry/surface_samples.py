@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceSamples:
+class SurfaceSamples(Bundle):
     """Points on a field's zero level and the unit normals there. points, normals: (N, 3), field frame; points of a
     result are float64: a field may lie far from the origin."""
 
@@ -21,14 +21,6 @@ class SurfaceSamples:
 
     def __len__(self) -> int:
         return len(self.points)
-
-    def __getitem__(self, index: Tensor) -> SurfaceSamples:
-        return SurfaceSamples(self.points[index], self.normals[index])
-
-    @classmethod
-    def cat(cls, parts: Sequence[SurfaceSamples]) -> SurfaceSamples:
-        """All samples of several clouds in one frame."""
-        return cls(torch.cat([part.points for part in parts]), torch.cat([part.normals for part in parts]))
 
     def subsample(self, limit: int, generator: torch.Generator) -> SurfaceSamples:
         """At most ``limit`` of the samples, chosen at random by the (CPU) generator, in their order."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
-from regnf_core.importing.containers.legacy_container import Entry
+from regnf_core.importing.containers.legacy_container import TorchArchive
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder, StorageRef, TensorRef
 
 _STORED: dict[str, np.dtype[Any]] = {
@@ -25,19 +25,6 @@ _DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
 _ALIGNMENT = 16
 
 
-class Archive(Protocol):
-    """A container of torch.save: its storages' bytes under ``data/<key>``."""
-
-    @property
-    def entries(self) -> Mapping[str, Entry]:
-        """Where the entries lie, by name."""
-        ...
-
-    def read(self, name: str) -> memoryview:
-        """An entry's bytes. Raises FieldFormatError where they are damaged."""
-        ...
-
-
 class TensorSource:
     """Materializes tensors of one archive. Float32 tensors are views of the map where they lie aligned, as torch writes
     them; nothing else of the file is touched.
@@ -45,7 +32,7 @@ class TensorSource:
     ``budget`` caps the bytes of all tensors together, as float32.
     """
 
-    def __init__(self, archive: Archive, budget: int) -> None:
+    def __init__(self, archive: TorchArchive, budget: int) -> None:
         self._archive = archive
         self._budget = budget
 
@@ -69,15 +56,17 @@ class TensorSource:
 
     def _values(self, name: str, ref: TensorRef, stored: np.dtype[Any]) -> npt.NDArray[Any]:
         count = math.prod(ref.shape)
-        self._spend(name, 4 * count)
-        raw = self._storage(name, ref.storage, stored, count)
-        _check_dense(name, ref, count)
-        return _in_shape(_aligned(np.frombuffer(raw, dtype=stored)), ref)
-
-    def _spend(self, name: str, size: int) -> None:
-        self._budget -= size
+        self._budget -= 4 * count
         if self._budget < 0:
             raise tensor_error(f"with {name} the tensors exceed the limit", "TENSOR_TOO_LARGE")
+        raw = self._storage(name, ref.storage, stored, count)
+        _check_dense(name, ref, count)
+        flat = np.frombuffer(raw, dtype=stored)
+        if flat.ctypes.data % _ALIGNMENT:  # torch crashes over the odd addresses that other writers' entries have
+            flat = flat.copy()
+        order = sorted(range(len(ref.shape)), key=lambda axis: (-ref.strides[axis], ref.shape[axis] == 1))
+        in_file = flat.reshape([ref.shape[axis] for axis in order])
+        return in_file.transpose(np.argsort(order)) if order else in_file
 
     def _storage(self, name: str, storage: StorageRef, stored: np.dtype[Any], count: int) -> memoryview:
         entry = self._archive.entries.get(f"data/{storage.key}")
@@ -128,14 +117,3 @@ def _check_dense(name: str, ref: TensorRef, count: int) -> None:
         expected *= extent
     if ref.offset:
         raise tensor_error(f"{name} begins at element {ref.offset} of its storage", "TENSOR_STORAGE_MISMATCH")
-
-
-def _aligned(flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The array where wide loads may read it: torch crashes over the odd addresses that other writers' entries have."""
-    return flat.copy() if flat.ctypes.data % _ALIGNMENT else flat
-
-
-def _in_shape(flat: npt.NDArray[Any], ref: TensorRef) -> npt.NDArray[Any]:
-    order = sorted(range(len(ref.shape)), key=lambda axis: (-ref.strides[axis], ref.shape[axis] == 1))
-    stored = flat.reshape([ref.shape[axis] for axis in order])
-    return stored.transpose(np.argsort(order)) if order else stored

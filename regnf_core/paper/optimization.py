@@ -15,7 +15,7 @@ from regnf_core.fields.observation import SdfField, differentiable_signed_distan
 from regnf_core.geometry.metrics import NearestNeighbors, euler_from_rotation, rotation_from_euler
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
-from regnf_core.options import OptimizationOptions, RegistrationOptions, ResamplingOptions
+from regnf_core.options import RegistrationOptions, ResamplingOptions
 
 # Barron's general and adaptive robust kernel ("A General and Adaptive Robust Loss Function", CVPR 2019).
 #
@@ -188,7 +188,9 @@ def resample(
     distance to the old samples >= rho / 10, |S_own(x)| <= omega_1, |S_other(T x)| <= omega_2, r(x) <= xi.
     """
     rho = options.radius_fraction * field_radius(own)
-    candidates = samples.points + rho * _uniform(samples.points, generator)
+    # U[-1, 1]^3 for each, drawn on the CPU, so that every device sees the same numbers
+    shifts = 2.0 * torch.rand(samples.points.shape, generator=generator) - 1.0
+    candidates = samples.points + rho * shifts.to(samples.points)
     spacing, _ = samples.neighbors.query(candidates)
     candidates = candidates[spacing >= rho / _SPACING]
     own_distance = own.signed_distance(candidates).to(candidates)
@@ -203,11 +205,6 @@ def resample(
         kept = torch.randperm(points.shape[0], generator=generator)[: options.max_samples].to(points.device)
         points, distance = points[kept], distance[kept]
     return SampleSet.from_distances(points, distance)
-
-
-def _uniform(like: Tensor, generator: torch.Generator) -> Tensor:
-    """U[-1, 1]^3 for each of the points (N, 3); drawn on the CPU, so that every device sees the same numbers."""
-    return (2.0 * torch.rand(like.shape, generator=generator) - 1.0).to(like)
 
 
 _MIN_SCALE = 1e-3  # the published scale is additive and may step over zero, which would mirror the object
@@ -236,16 +233,8 @@ class PoseParameters:
 
     def snapshot(self) -> Sim3:
         """The transform of the present numbers, cut from the graph and from later steps."""
-        return Sim3(
-            self.scale.detach().clone(),
-            rotation_from_euler(self.angles.detach()),
-            self.translation.detach().clone(),
-        )
-
-    def keep_valid(self) -> None:
-        """Hold the scale above zero."""
-        with torch.no_grad():
-            self.scale.clamp_(min=_MIN_SCALE)
+        angles = self.angles.detach()
+        return Sim3(self.scale.detach().clone(), rotation_from_euler(angles), self.translation.detach().clone())
 
 
 def refine(
@@ -265,7 +254,14 @@ def refine(
     """
     A, B = SampleSet.of(scene, scene_samples.points), SampleSet.of(obj, object_samples.points)
     pose, kernel = PoseParameters(T_object_scene_initial), AdaptiveKernel()
-    adam = _adam(pose, kernel, options.optimization)
+    rates = options.optimization
+    learned = {
+        pose.translation: rates.translation_rate,
+        pose.angles: rates.rotation_rate,
+        pose.scale: rates.scale_rate,
+        kernel.latents: rates.kernel_rate,
+    }
+    adam = torch.optim.Adam([{"params": [parameter], "lr": rate} for parameter, rate in learned.items()])
     trace: list[IterationRecord] = []
     for iteration in range(options.optimization.iterations):
         T = pose.transform()
@@ -278,23 +274,15 @@ def refine(
         terms = bidirectional_loss(scene, obj, batch_A, batch_B, T, kernel, options.optimization.regularizer_weight)
         trace.append(_record(iteration, terms, kernel, pose.snapshot(), (A, B)))
         on_iteration(trace[-1])
-        if _converged(trace[-1], options.optimization):
+        # the paper's early stopping, asked of both directions
+        if max(trace[-1].residual_scene, trace[-1].residual_object) <= options.optimization.stop_residual:
             return Refinement(pose.snapshot(), trace, converged=True)
         adam.zero_grad()
         terms.total.backward()  # type: ignore[no-untyped-call]
         adam.step()
-        pose.keep_valid()
+        with torch.no_grad():
+            pose.scale.clamp_(min=_MIN_SCALE)
     return Refinement(pose.snapshot(), trace, converged=False)
-
-
-def _adam(pose: PoseParameters, kernel: AdaptiveKernel, options: OptimizationOptions) -> torch.optim.Adam:
-    groups: list[tuple[Tensor, float]] = [
-        (pose.translation, options.translation_rate),
-        (pose.angles, options.rotation_rate),
-        (pose.scale, options.scale_rate),
-        (kernel.latents, options.kernel_rate),
-    ]
-    return torch.optim.Adam([{"params": [parameter], "lr": rate} for parameter, rate in groups])
 
 
 def _record(
@@ -315,8 +303,3 @@ def _record(
         object_samples=sets[1].points.shape[0],
         T_object_scene=T,
     )
-
-
-def _converged(record: IterationRecord, options: OptimizationOptions) -> bool:
-    """The paper's early stopping, asked of both directions."""
-    return max(record.residual_scene, record.residual_object) <= options.stop_residual

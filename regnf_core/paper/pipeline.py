@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from regnf_core.document import STARTS, IterationRecord, RegistrationResult, Run, Verdict
+from regnf_core.document import IterationRecord, RegistrationResult, Verdict
 from regnf_core.errors import InitializationError, NoSurfaceError
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import CountingField, SdfField
@@ -18,8 +18,9 @@ from regnf_core.geometry.metrics import diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, InitializationOptions, RegistrationOptions, SamplingOptions
-from regnf_core.paper.optimization import Refinement, refine
+from regnf_core.paper.optimization import refine
 from regnf_core.paper.sampling import in_detection, sample_object, sample_scene
+from regnf_core.progress import Run
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
 from regnf_core.surface.result_clouds import mean_residual, object_residuals, scene_residuals
 from regnf_core.surface.sphere_tracing import surface_bounds
@@ -173,18 +174,8 @@ def _inlier_share(residuals: Tensor) -> float:
     return float((residuals.abs() <= INLIER_DISTANCE).double().mean())
 
 
-_SCORING_SAMPLES = 400
+_SCORING_SAMPLES = 400  # of each field, on which RANSAC's draws are compared
 _MAX_SCORING_RESIDUAL = 0.1  # object diameters; a residual beyond it says no more than "wrong"
-
-
-@dataclass(frozen=True, eq=False)
-class _Surfaces:
-    """Surface points of both fields, each in its own frame; the object's bounding box and diameter, object frame."""
-
-    scene: SurfaceSamples
-    object: SurfaceSamples
-    object_bounds: OrientedBox
-    object_diameter: float
 
 
 def register_paper(
@@ -204,30 +195,56 @@ def register_paper(
     object_field, object_origin = near_origin(object_field)
     detection = replace(detection, center=detection.center - scene_origin)
     scene, obj = CountingField(scene_field), CountingField(object_field)
-    generator = torch.Generator().manual_seed(seed)
+    generator, up_axis = torch.Generator().manual_seed(seed), options.up_axis or "z"
 
     # 1. Surface points of scene and object, as virtual cameras see them (section III-C.1).
     with run.phase("sampling"):
-        surfaces = _sample(scene, obj, detection, options, run)
-        A = surfaces.scene.subsample(options.resampling.max_samples, generator)
-        B = surfaces.object.subsample(options.resampling.max_samples, generator)
+        of_scene = sample_scene(scene, detection, options.sampling, up_axis=up_axis)
+        run.report("sampling", 0.08)
+        extent = surface_bounds(obj)
+        of_object = sample_object(obj, options.sampling, extent=extent, up_axis=up_axis)
+        size = diameter(of_object.points)
+        A, B = (one.subsample(options.resampling.max_samples, generator) for one in (of_scene, of_object))
 
     # 2. Initial transform from feature matches and ICP, scale 1 (section III-C.2).
     with run.phase("initializing"):
-        score = _scoring(scene, obj, A, B, _MAX_SCORING_RESIDUAL * surfaces.object_diameter, generator)
-        T_initial = initial_transform(surfaces.scene, surfaces.object, options.initialization, seed, score)
+        few_A, few_B = (one.subsample(_SCORING_SAMPLES, generator).points for one in (A, B))
+        cap = _MAX_SCORING_RESIDUAL * size
+        score: Callable[[Sim3], float] = lambda T: mean_residual(scene, obj, few_A, few_B, T, cap)  # noqa: E731
+        T_initial = initial_transform(of_scene, of_object, options.initialization, seed, score)
 
     # 3. to 6. Loss, robust kernel, optimizer and resampling (sections III-C to III-E, Algorithm 1).
     with run.phase("optimizing"):
-        refined = refine(scene, obj, A, B, T_initial, options, generator, _on_iteration(options, run))
+        steps = options.optimization.iterations
+        on_iteration: Callable[[IterationRecord], None] = lambda one: run.optimized((one.iteration + 1) / steps)  # noqa: E731
+        refined = refine(scene, obj, A, B, T_initial, options, generator, on_iteration)
 
     # 7. Verdict on fresh surface points. Ours: the paper has none.
     with run.phase("verifying"):
-        verification = _verify(scene, obj, detection, surfaces, refined.T_object_scene, options)
+        T = refined.T_object_scene
+        verification = verify(scene, obj, detection, extent, T, options.sampling, size, up_axis)
 
-    evaluations = scene.evaluations + obj.evaluations
-    found = _result(surfaces, T_initial, refined, verification, options, seed, evaluations)
-    return _moved_back(found, scene_origin, object_origin)
+    result = RegistrationResult(
+        verdict=verification.verdict,
+        verdict_reason=verification.reason,
+        T_object_scene=T,
+        T_object_scene_initial=T_initial,
+        scene_samples=of_scene,
+        object_samples=of_object,
+        metrics={
+            **verification.metrics,
+            "object_diameter": size,
+            "iterations": float(len(refined.trace)),
+            "converged": float(refined.converged),
+            "field_evaluations": float(scene.evaluations + obj.evaluations),
+        },
+        trace=refined.trace,
+        residuals={},
+        seed=seed,
+        options=options.to_dict(),
+        center_object=of_object.points.double().mean(0).cpu(),
+    )
+    return _moved_back(result, scene_origin, object_origin)
 
 
 def _moved_back(result: RegistrationResult, scene_origin: Tensor, object_origin: Tensor) -> RegistrationResult:
@@ -251,77 +268,4 @@ def _moved_back(result: RegistrationResult, scene_origin: Tensor, object_origin:
 
 def cloud_region(detection: OrientedBox, options: RegistrationOptions) -> Callable[[Tensor], Tensor]:
     """Tells which points (N, 3) of the scene may belong to a result's clouds, (N,) bool: those that step 1 keeps."""
-    return lambda points: in_detection(points, detection, options.sampling, _up_axis(options))
-
-
-def _sample(
-    scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions, run: Run
-) -> _Surfaces:
-    up_axis = _up_axis(options)
-    scene_samples = sample_scene(scene, detection, options.sampling, up_axis=up_axis)
-    run.report("sampling", 0.08)
-    object_bounds = surface_bounds(obj)
-    object_samples = sample_object(obj, options.sampling, extent=object_bounds, up_axis=up_axis)
-    return _Surfaces(scene_samples, object_samples, object_bounds, diameter(object_samples.points))
-
-
-def _verify(
-    scene: SdfField,
-    obj: SdfField,
-    detection: OrientedBox,
-    surfaces: _Surfaces,
-    T_object_scene: Sim3,
-    options: RegistrationOptions,
-) -> Verification:
-    bounds, size = surfaces.object_bounds, surfaces.object_diameter
-    return verify(scene, obj, detection, bounds, T_object_scene, options.sampling, size, _up_axis(options))
-
-
-def _result(
-    surfaces: _Surfaces,
-    T_initial: Sim3,
-    refined: Refinement,
-    verification: Verification,
-    options: RegistrationOptions,
-    seed: int,
-    evaluations: int,
-) -> RegistrationResult:
-    return RegistrationResult(
-        verdict=verification.verdict,
-        verdict_reason=verification.reason,
-        T_object_scene=refined.T_object_scene,
-        T_object_scene_initial=T_initial,
-        scene_samples=surfaces.scene,
-        object_samples=surfaces.object,
-        metrics={
-            **verification.metrics,
-            "object_diameter": surfaces.object_diameter,
-            "iterations": float(len(refined.trace)),
-            "converged": float(refined.converged),
-            "field_evaluations": float(evaluations),
-        },
-        trace=refined.trace,
-        residuals={},
-        seed=seed,
-        options=options.to_dict(),
-        center_object=surfaces.object.points.double().mean(0).cpu(),
-    )
-
-
-def _up_axis(options: RegistrationOptions) -> Axis:
-    return options.up_axis or "z"
-
-
-def _scoring(
-    scene: SdfField, obj: SdfField, A: SurfaceSamples, B: SurfaceSamples, cap: float, generator: torch.Generator
-) -> Callable[[Sim3], float]:
-    """The mean residual under a transform on a few samples of each field: what chooses among RANSAC's draws."""
-    few_A, few_B = A.subsample(_SCORING_SAMPLES, generator), B.subsample(_SCORING_SAMPLES, generator)
-    return lambda T: mean_residual(scene, obj, few_A.points, few_B.points, T, cap)
-
-
-def _on_iteration(options: RegistrationOptions, run: Run) -> Callable[[IterationRecord], None]:
-    span = STARTS["verifying"] - STARTS["optimizing"]
-    return lambda record: run.report(
-        "optimizing", STARTS["optimizing"] + span * (record.iteration + 1) / options.optimization.iterations
-    )
+    return lambda points: in_detection(points, detection, options.sampling, options.up_axis or "z")

@@ -14,7 +14,7 @@ from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, SamplingOptions
-from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
+from regnf_core.surface.requirements import require_box_in_scene, require_surface
 from regnf_core.surface.sphere_tracing import (
     Rays,
     axis_vector,
@@ -48,16 +48,12 @@ def sample_scene(
     positions = _camera_positions(detection, options.scene_camera_distance, options.views, turn, up_axis)
     points = _trace_views(scene, detection, positions, options)
     points = points[_above_ground(points, detection, options, up_axis)]
-    require_scene_surface(len(points))
+    require_surface(len(points), of_object=False)
     return _with_normals(scene, points)
 
 
 def sample_object(
-    obj: SdfField,
-    options: SamplingOptions,
-    turn: float = 0.0,
-    extent: OrientedBox | None = None,
-    up_axis: Axis = "z",
+    obj: SdfField, options: SamplingOptions, turn: float = 0.0, extent: OrientedBox | None = None, up_axis: Axis = "z"
 ) -> SurfaceSamples:
     """Points of the object's surface. Object frame, object units.
 
@@ -68,7 +64,7 @@ def sample_object(
     extent = extent or surface_bounds(obj)
     positions = _camera_positions(extent, options.object_camera_distance, options.views, turn, up_axis)
     points = _trace_views(obj, extent, positions, options)
-    require_object_surface(len(points))
+    require_surface(len(points), of_object=True)
     return _with_normals(obj, points)
 
 
@@ -89,25 +85,20 @@ def _trace_views(field: SdfField, box: OrientedBox, positions: Tensor, options: 
     step, tolerance = shortest_step(box.diagonal), _TOLERANCE_SHARE * box.diagonal
     found = []
     while group := list(islice(clipped, _PARTS_OF_A_GROUP)):
-        found.append(first_hits(field, *_joined(group), step, tolerance))
+        rays, entries, exits = zip(*group, strict=True)
+        found.append(first_hits(field, Rays.cat(rays), torch.cat(entries), torch.cat(exits), step, tolerance))
     points = points_in_order(found)
     return points[grown.contains(points)]
 
 
 def _within(field: SdfField, grown: OrientedBox, rays: Rays) -> tuple[Rays, Tensor, Tensor]:
     """The rays, and from where to where (N,) each is followed: a ray that misses the box, nowhere."""
-    rays = Rays(rays.origins.to(field.device), rays.directions.to(field.device))
+    rays = rays.on(field.device)
     entry, bounds_exit = clip_to_region(rays, field.bounds[0], field.bounds[1])
     local = Rays(grown.to_local(rays.origins), rays.directions @ grown.rotation.to(rays.directions))
     box_entry, box_exit = clip_to_region(local, -grown.size / 2, grown.size / 2)
     # A ray starts at the camera, since surface before the box occludes it, and ends where it leaves the box.
     return rays, entry, torch.where(box_exit > box_entry, torch.minimum(bounds_exit, box_exit), -1.0)
-
-
-def _joined(parts: list[tuple[Rays, Tensor, Tensor]]) -> tuple[Rays, Tensor, Tensor]:
-    rays, entries, exits = zip(*parts, strict=True)
-    joined = Rays(torch.cat([one.origins for one in rays]), torch.cat([one.directions for one in rays]))
-    return joined, torch.cat(entries), torch.cat(exits)
 
 
 def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions, up_axis: Axis = "z") -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,17 +17,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from regnf_core.editing.compose import compose
-from regnf_core.editing.edited_scene import EditedScene
+from regnf_core.editing.edited_scene import EditedScene, without_unseen
 from regnf_core.editing.edits import open_edits
-from regnf_core.editing.region import without_unseen
 from regnf_core.editing.storing import write_field
 from regnf_core.errors import CancelledError, atomic_path
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.rendering.camera import Camera, Frame, Orbit, Station
+from regnf_core.rendering.camera import Camera, Frame, orbit_cameras
 from regnf_core.rendering.render import Progress, render_frames
-from regnf_core.rendering.request import OrbitRequest, RenderOptions, RenderRequest
+from regnf_core.rendering.request import OrbitRequest, PoseRequest, RenderOptions, RenderRequest
 from regnf_core.rendering.volume_mode import Painter
 from regnf_core.surface.exporting import glb_of
 from regnf_core.surface.isosurface import extract_surface
@@ -37,23 +37,19 @@ _AT_ONCE = 1 << 16
 
 
 def write_colored_mesh(
-    field: SdfField,
-    path: Path,
-    resolution: int,
-    options: RenderOptions,
-    progress: Callable[[int], None] | None = None,
-) -> int:
-    """The zero level as .glb, in the field's frame and unit; returns how many triangles it has.
+    field: SdfField, path: Path, resolution: int, options: RenderOptions, progress: Callable[[int], None]
+) -> None:
+    """The zero level as .glb, in the field's frame and unit.
 
     A vertex has its part's own color, seen from before the surface, or its tint, or one plain color: no shading.
     Raises NoSurfaceError and InvalidInputError (FIELD_NOT_FINITE, COLORS_MISSING).
     """
     field, origin = near_origin(field)
     surface = extract_surface(field, resolution, progress)
-    painter = Painter.of(field, torch.tensor([0.0, 0.0, 1.0]), options)
+    painter = Painter.of(field, options)
     points, normals = (torch.from_numpy(part).float() for part in (surface.vertices, surface.normals))
     parts = zip(torch.split(points, _AT_ONCE), torch.split(normals, _AT_ONCE), strict=True)
-    colors = torch.cat([painter.flat_colors(p.to(field.device), -n.to(field.device)).cpu() for p, n in parts])
+    colors = torch.cat([painter.colors(p.to(field.device), -n.to(field.device))[0].cpu() for p, n in parts])
     levels = (colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
     shown = np.concatenate([levels, np.full((len(levels), 1), 255, np.uint8)], axis=1)
     mesh = trimesh.Trimesh(
@@ -61,34 +57,15 @@ def write_colored_mesh(
     )
     with atomic_path(path) as temporary:
         temporary.write_bytes(glb_of(mesh, origin.numpy()))
-    return len(surface.faces)
 
 
 # Frames as files.
 
 _GAP = 6
 """Pixels between the pictures of a strip."""
-_WHITE = 255
-_FRAMES_A_SECOND = 12
-
-
-def write_color(frame: Frame, path: Path) -> None:
-    """PNG, 8 bits a channel, sRGB."""
-    Image.fromarray(frame.color).save(path, format="PNG")
-
-
-def write_normal(frame: Frame, path: Path) -> None:
-    """PNG, 8 bits a channel: 0..255 for -1..1 along the scene's axes; (0, 0, 0) where nothing is met."""
-    levels = np.rint((frame.normal + 1.0) * 127.5).astype(np.uint8)
-    levels[frame.depth <= 0] = 0
-    Image.fromarray(levels).save(path, format="PNG")
-
-
-def write_depth(frame: Frame, png: Path, npy: Path, unit: float) -> None:
-    """The depths as .npy (float32, scene units), and as PNG of 16 bits in ``unit``; 0 where nothing is met."""
-    np.save(npy, frame.depth)
-    levels = np.clip(np.rint(frame.depth / unit), 0, 65535).astype(np.uint16)
-    Image.fromarray(levels).save(png, format="PNG")
+_FRAME_MS = round(1000 / 12)
+Picture = NDArray[np.uint8]
+"""(H, W, 3)"""
 
 
 def depth_unit(largest: float) -> float:
@@ -100,25 +77,20 @@ def depth_unit(largest: float) -> float:
     return float(next(factor * power for factor in (1, 2, 5, 10) if factor * power >= least))
 
 
-def write_animation(pictures: Sequence[NDArray[np.uint8]], path: Path) -> None:
-    """Animated WebP of pictures (H, W, 3), in a loop."""
-    first, *others = [Image.fromarray(picture) for picture in pictures]
-    duration = round(1000 / _FRAMES_A_SECOND)
-    first.save(path, format="WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=80)
+def _save(picture: NDArray[Any], path: Path) -> None:
+    Image.fromarray(picture).save(path, format="PNG")
 
 
-def strip(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Pictures (H, W, 3) of one height side by side."""
-    gap = np.full((pictures[0].shape[0], _GAP, 3), _WHITE, np.uint8)
-    parts = [part for picture in pictures for part in (gap, picture)][1:]
-    return np.concatenate(parts, axis=1)
+def _side_by_side(pictures: Sequence[Picture]) -> Picture:
+    gap = np.full((pictures[0].shape[0], _GAP, 3), 255, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
 
 
 _STAGES = {"composing": 0.0, "rendering": 0.1, "rendering before": 0.5, "mesh": 0.9, "field": 0.95, "done": 1.0}
 """The share done when each begins."""
 _PHASES = {"composing": 0.0, "rendering": 0.1, "exporting": 0.9}
 """What is told of a job: fewer than the stages."""
-_PNG, _NPY = "image/png", "application/octet-stream"
+_PNG, _BYTES = "image/png", "application/octet-stream"
 
 
 @dataclass(frozen=True)
@@ -166,51 +138,45 @@ def run_render(
     delete.
     """
     request.check()
-    work = _Work(request, directory, progress, cancelled, processes)
+    work = _Work(request.outputs, directory, progress, cancelled)
     with work.stage("composing"):
         scene = without_unseen(scene) if request.clear_unseen else scene
         edited = compose(scene, open_edits(request.edits, open_object), request.seed, work.tell)
     cameras = _cameras(request, edited)
-    unit = depth_unit(_farthest(edited, cameras))
+    corners = torch.cartesian_prod(*edited.bounds.T)  # no depth is larger than to one of them
+    unit = depth_unit(max(float((corners - camera.position).norm(dim=-1).max()) for camera in cameras))
+    cut_away = replace(request.options, cut_away=True)
+
+    def rendered(field: SdfField, options: RenderOptions) -> Iterator[Frame]:
+        return render_frames(field, cameras, options, work.tell, cancelled, processes)
+
     with work.stage("rendering"):
-        after = work.frames(edited, cameras, "frame", unit, _options(request))
-    before: list[NDArray[np.uint8]] = []
+        # nobody has chosen the places of an orbit: walls that they stand in are cut away
+        chosen = request.look_at is not None or request.poses is not None
+        after = work.frames(rendered(edited, request.options if chosen else cut_away), "frame", unit)
+    before: list[Picture] = []
     if request.before and request.edits:
         with work.stage("rendering before"):
             # what the edits put before a camera may have stood round it
-            shown = replace(request.options, cut_away=True)
-            before = work.frames(scene, cameras, "before", unit, shown)
+            before = work.frames(rendered(scene, cut_away), "before", unit)
     work.pictures(after, before)
     if "mesh" in request.outputs:
         with work.stage("mesh"):
-            path, count = directory / "composite.glb", request.mesh_resolution
-            write_colored_mesh(edited, path, count, request.options, lambda points: work.tell(0.0))
-            work.add("composite.glb", "mesh", "model/gltf-binary")
+            path = work.add("composite.glb", "mesh", "model/gltf-binary")
+            write_colored_mesh(edited, path, request.mesh_resolution, request.options, lambda _: work.tell(0.0))
     if "field" in request.outputs:
         with work.stage("field"):
-            write_field(edited, directory / "edited.safetensors", request.field_resolution)
-            work.add("edited.safetensors", "field", "application/octet-stream")
+            write_field(edited, work.add("edited.safetensors", "field", _BYTES), request.field_resolution)
     return work.finish(unit)
-
-
-def _options(request: RenderRequest) -> RenderOptions:
-    """The request's. Nobody has chosen the places of an orbit: walls that they stand in are cut away."""
-    chosen = request.look_at is not None or request.poses is not None
-    return request.options if chosen else replace(request.options, cut_away=True)
 
 
 class _Work:
     """The files as they come, and how far the work has come."""
 
     def __init__(
-        self,
-        request: RenderRequest,
-        directory: Path,
-        progress: Progress | None,
-        cancelled: Callable[[], bool] | None,
-        processes: int,
+        self, outputs: Sequence[str], directory: Path, progress: Progress | None, cancelled: Callable[[], bool] | None
     ) -> None:
-        self._request, self._directory, self._processes = request, directory, processes
+        self._outputs, self._directory = outputs, directory
         self._progress, self._cancelled = progress, cancelled
         self._done, self._share = 0.0, (0.0, 1.0)
         self._artifacts: list[RenderArtifact] = []
@@ -235,50 +201,42 @@ class _Work:
         if self._progress is not None:
             self._progress(self._done)
 
-    def add(self, name: str, kind: str, media_type: str, frame: int | None = None, before: bool = False) -> Path:
+    def add(self, name: str, kind: str, media_type: str = _PNG, frame: int | None = None, before: bool = False) -> Path:
         self._artifacts.append(RenderArtifact(name, kind, media_type, frame, before))
         return self._directory / name
 
-    def frames(
-        self,
-        scene: SdfField,
-        cameras: Sequence[Camera],
-        stem: str,
-        unit: float,
-        options: RenderOptions | None = None,
-    ) -> list[NDArray[np.uint8]]:
-        """Render and write them; their colors, where a strip or an animation needs them."""
-        wanted = {"strip": 1, "animation": len(cameras)}
-        keep = max((wanted.get(output, 0) for output in self._request.outputs), default=0)
-        kept = []
-        chosen = options or self._request.options
-        rendered = render_frames(scene, cameras, chosen, self.tell, self._cancelled, self._processes)
+    def frames(self, rendered: Iterator[Frame], stem: str, unit: float) -> list[Picture]:
+        """Write them; their colors, where a strip or an animation needs them."""
+        colors: list[Picture] = []
         for number, frame in enumerate(rendered):
             self._write(frame, number, stem, unit)
-            if number < keep:
-                kept.append(frame.color)
-        return kept
+            if "animation" in self._outputs or ("strip" in self._outputs and number == 0):
+                colors.append(frame.color)
+        return colors
 
     def _write(self, frame: Frame, number: int, stem: str, unit: float) -> None:
-        name, outputs, before = f"{stem}-{number:04d}", self._request.outputs, stem == "before"
-        if "color" in outputs:
-            write_color(frame, self.add(f"{name}.png", "color", _PNG, number, before))
-        if "depth" in outputs:
-            png = self.add(f"{name}-depth.png", "depth", _PNG, number, before)
-            write_depth(frame, png, self.add(f"{name}-depth.npy", "depth", _NPY, number, before), unit)
-        if "normal" in outputs:
-            write_normal(frame, self.add(f"{name}-normal.png", "normal", _PNG, number, before))
+        """Color as 8 bits a channel, sRGB; depths as .npy and as 16 bits in ``unit``; normals as 0..255 for -1..1 along
+        the scene's axes. 0 where nothing is met."""
+        name, which = f"{stem}-{number:04d}", (number, stem == "before")
+        if "color" in self._outputs:
+            _save(frame.color, self.add(f"{name}.png", "color", _PNG, *which))
+        if "depth" in self._outputs:
+            levels = np.clip(np.rint(frame.depth / unit), 0, 65535).astype(np.uint16)
+            _save(levels, self.add(f"{name}-depth.png", "depth", _PNG, *which))
+            np.save(self.add(f"{name}-depth.npy", "depth", _BYTES, *which), frame.depth)
+        if "normal" in self._outputs:
+            normals = np.rint((frame.normal + 1.0) * 127.5).astype(np.uint8)
+            normals[frame.depth <= 0] = 0
+            _save(normals, self.add(f"{name}-normal.png", "normal", _PNG, *which))
 
-    def pictures(self, after: list[NDArray[np.uint8]], before: list[NDArray[np.uint8]]) -> None:
-        from PIL import Image
-
-        outputs = self._request.outputs
-        if "strip" in outputs and before:
-            path = self.add("before-after.png", "strip", _PNG)
-            Image.fromarray(strip([before[0], after[0]])).save(path, format="PNG")
-        if "animation" in outputs:
-            both = [strip(list(pair)) for pair in zip(before, after, strict=True)] if before else after
-            write_animation(both, self.add("animation.webp", "animation", "image/webp"))
+    def pictures(self, after: list[Picture], before: list[Picture]) -> None:
+        if "strip" in self._outputs and before:
+            _save(_side_by_side([before[0], after[0]]), self.add("before-after.png", "strip"))
+        if "animation" in self._outputs:
+            both = [_side_by_side(pair) for pair in zip(before, after, strict=True)] if before else after
+            first, *others = [Image.fromarray(picture) for picture in both]
+            path, timing = self.add("animation.webp", "animation", "image/webp"), {"duration": _FRAME_MS, "loop": 0}
+            first.save(path, format="WEBP", save_all=True, append_images=others, quality=80, **timing)
 
     def finish(self, unit: float) -> RenderReport:
         self.add("render.json", "report", "application/json")
@@ -293,40 +251,21 @@ def _cameras(request: RenderRequest, edited: EditedScene) -> list[Camera]:
     size = request.image_size
     if request.look_at is not None:
         return [
-            Station(one.position, one.target, one.field_of_view_deg, one.up).camera(size) for one in request.look_at
+            Camera.look_at(one.position, one.target, size, one.field_of_view_deg, one.up) for one in request.look_at
         ]
     if request.poses is not None:
-        return [_posed(one.T_scene_camera, one.intrinsics, one.size).resized(size) for one in request.poses]
+        return [_posed(one).resized(size) for one in request.poses]
     orbit = request.orbit or OrbitRequest()
-    path = Orbit(
-        orbit.frames,
-        orbit.elevation_deg,
-        orbit.start_deg,
-        orbit.sweep_deg,
-        orbit.distance,
-        orbit.field_of_view_deg,
-        orbit.up,
-    )
-    return path.cameras(_looked_at(orbit, edited), size)
-
-
-def _looked_at(orbit: OrbitRequest, edited: EditedScene) -> OrientedBox:
     if orbit.detection is not None:
-        return OrientedBox.from_detection(orbit.detection)
-    if edited.places:
-        return edited.places[orbit.edit or 0]
-    low, high = edited.bounds.tolist()
-    return OrientedBox.from_corners(low, high)
+        looked_at = OrientedBox.from_detection(orbit.detection)
+    elif edited.places:
+        looked_at = edited.places[orbit.edit or 0]
+    else:
+        looked_at = OrientedBox.from_corners(*edited.bounds.tolist())
+    return orbit_cameras(orbit, looked_at, size)
 
 
-def _posed(rows: list[list[float]], intrinsics: list[float], size: tuple[int, int]) -> Camera:
-    matrix = torch.tensor(rows, dtype=torch.float64)
-    fx, fy, cx, cy = intrinsics
-    return Camera(matrix[:3, 3], matrix[:3, :3], size[0], size[1], (fx, fy), (cx, cy))
-
-
-def _farthest(field: SdfField, cameras: Sequence[Camera]) -> float:
-    """No depth of these cameras is larger."""
-    low, high = field.bounds
-    corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))
-    return max(float((corners - camera.position).norm(dim=-1).max()) for camera in cameras)
+def _posed(pose: PoseRequest) -> Camera:
+    matrix = torch.tensor(pose.T_scene_camera, dtype=torch.float64)
+    fx, fy, cx, cy = pose.intrinsics
+    return Camera(matrix[:3, 3], matrix[:3, :3], *pose.size, (fx, fy), (cx, cy))

@@ -195,7 +195,7 @@ def render_frames(
 
     ``cancelled`` is asked before each tile; CancelledError is raised once it says so. processes: forked copies of this
     process that share the tiles, where the system can and the field is on the CPU; the frames are the same.
-    Raises InvalidInputError: CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; NoSurfaceError
+    Raises InvalidInputError: CAMERA_INVALID, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; NoSurfaceError
     (NO_SURFACE_IN_SCENE); ProcessLostError (WORKER_LOST).
     """
     chosen = options or RenderOptions()
@@ -218,30 +218,18 @@ def render_frames(
         if cancelled is not None and cancelled():
             raise CancelledError("the rendering was cancelled")
 
-    done = _watched(_done(work, tasks, processes, check), len(tasks), check, progress)
+    def watched() -> Iterator[list[Part]]:
+        done = in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
+        for number in range(1, len(tasks) + 1):
+            check()
+            tile = next(done)
+            if progress is not None:
+                progress(number / len(tasks))
+            yield tile
+
+    done = watched()
     for camera, of_frame in zip(cameras, tiles, strict=True):
         yield _frame(camera, of_frame, done)
-
-
-def _done(
-    work: Callable[[tuple[int, int]], list[Part]],
-    tasks: Sequence[tuple[int, int]],
-    processes: int,
-    check: Callable[[], None],
-) -> Iterator[list[Part]]:
-    return in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
-
-
-def _watched(
-    tiles: Iterator[list[Part]], count: int, check: Callable[[], None], progress: Progress | None
-) -> Iterator[list[Part]]:
-    """The same, with ``check`` before each, and ``progress`` told once it is there."""
-    for number in range(1, count + 1):
-        check()
-        tile = next(tiles)
-        if progress is not None:
-            progress(number / count)
-        yield tile
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,16 +244,14 @@ class Renderer:
     @classmethod
     def of(cls, field: SdfField, options: RenderOptions) -> Renderer:
         """Raises InvalidInputError (FIELD_NOT_FINITE, COLORS_MISSING) and NoSurfaceError (NO_SURFACE_IN_SCENE)."""
-        up = torch.zeros(3)
-        up["xyz".index(options.up[-1])] = -1.0 if options.up.startswith("-") else 1.0
-        painter = Painter.of(field, up, options)
+        painter = Painter.of(field, options)
         grid = DistanceGrid.of(field)
         if bool((grid.bound > 0).all()):
             raise NoSurfaceError("the field has no surface within its bounds", reason="NO_SURFACE_IN_SCENE")
         return cls(field, grid, painter, options)
 
     def check(self, camera: Camera, position: Tensor) -> None:
-        """Raises InvalidInputError (CAMERA_IN_MATTER): the camera stands within the bounds and in matter.
+        """Raises InvalidInputError (CAMERA_INVALID): the camera stands within the bounds and in matter.
 
         position: where it is, as its user says it.
         """
@@ -276,7 +262,7 @@ class Renderer:
         if float(finite_distance(self.field, camera.position[None].float().to(self.field.device))[0]) <= 0.0:
             place = ", ".join(f"{value:.4g}" for value in position.tolist())
             hint = "Move it into free space, or let what is before it be cut away: option cut_away."
-            raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_IN_MATTER", hint=hint)
+            raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_INVALID", hint=hint)
 
     def tiles(self, camera: Camera, processes: int) -> list[Tensor]:
         """The pixels of the frame in rectangles that fit the memory, and are enough for the processes."""
@@ -303,8 +289,15 @@ class Renderer:
         """color (P, 3), normal (P, 3), opacity (P,), depth (P,), part (P,) of pixels (P,), on the CPU."""
         rays, cosine = camera.rays(pixels, at)
         rays = Rays(rays.origins.to(self.field.device), rays.directions.to(self.field.device))
-        samples = self._samples(rays, pixels // camera.width, pixels % camera.width)
-        colors, parts = self.painter.colors(samples, rays.directions[samples.ray])
+        rows, columns = (at.to(rays.origins.device) for at in (pixels // camera.width, pixels % camera.width))
+        region = Region.along(rays, self.field, self.grid, _TOLERANCE)
+        if self.options.mode == "surface":
+            samples = surface_samples(region, rays, free_start(region, rays, rows, columns))
+        else:
+            least = self.painter.least_sharpness
+            start = free_start(region, rays, rows, columns, 2.0 * CLEAR / least)
+            samples = volume_samples(region, rays, start, self.painter.distance_and_sharpness, least)
+        colors, parts = self.painter.colors(samples.points, rays.directions[samples.ray], samples.normals)
         blank = torch.zeros_like(rays.origins)
         color = blank.index_add(0, samples.ray, samples.weight[:, None] * colors)
         background = torch.tensor(self.options.background, device=color.device)
@@ -312,24 +305,12 @@ class Renderer:
         normal = blank.index_add(0, samples.ray, samples.weight[:, None] * samples.normals)
         seen = (samples.opacity >= _LEAST_SEEN).cpu()
         depth = torch.where(seen, samples.length.cpu() * cosine, 0.0)
-        part = torch.where(seen, _main_part(samples, parts, len(pixels), len(self.painter.parts)).cpu(), NOTHING)
+        count = len(self.painter.parts)
+        shares = samples.weight.new_zeros(len(pixels) * count)
+        shares.index_add_(0, samples.ray * count + parts, samples.weight)
+        # the part that gives most of a ray's color
+        part = torch.where(seen, shares.view(len(pixels), count).argmax(dim=-1).cpu(), NOTHING)
         return color.cpu(), normal.cpu(), samples.opacity.cpu(), depth, part.to(torch.int16)
-
-    def _samples(self, rays: Rays, rows: Tensor, columns: Tensor) -> TileSamples:
-        rows, columns = rows.to(rays.origins.device), columns.to(rays.origins.device)
-        region = Region.along(rays, self.field, self.grid, _TOLERANCE)
-        if self.options.mode == "surface":
-            return surface_samples(region, rays, free_start(region, rays, rows, columns))
-        least = self.painter.least_sharpness
-        start = free_start(region, rays, rows, columns, 2.0 * CLEAR / least)
-        return volume_samples(region, rays, start, self.painter.distance_and_sharpness, least)
-
-
-def _main_part(samples: TileSamples, parts: Tensor, rays: int, count: int) -> Tensor:
-    """(N,): the part that gives most of a ray's color."""
-    shares = samples.weight.new_zeros(rays * count)
-    shares.index_add_(0, samples.ray * count + parts, samples.weight)
-    return shares.view(rays, count).argmax(dim=-1)
 
 
 def _frame(camera: Camera, tiles: Sequence[Tensor], done: Iterator[list[Part]]) -> Frame:

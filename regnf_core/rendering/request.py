@@ -56,9 +56,14 @@ class RenderOptions:
         try:
             return _OPTIONS_ADAPTER.validate_python(values)
         except ValidationError as error:
-            first = error.errors(include_url=False, include_input=False)[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise InvalidOptionsError(f"options.{where}: {first['msg']}") from error
+            raise InvalidOptionsError(_first_of(error, "options")[1]) from error
+
+
+def _first_of(error: ValidationError, *within: str) -> tuple[str, str]:
+    """The first faulty member, and what is said of it."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(part) for part in (*within, *first["loc"]))
+    return where, f"{where}: {first['msg'].removeprefix('Value error, ')}"
 
 
 _OPTIONS_ADAPTER = TypeAdapter(RenderOptions)
@@ -66,16 +71,14 @@ _OPTIONS_ADAPTER = TypeAdapter(RenderOptions)
 
 def check_extent(frames: int, pixels: int) -> None:
     """Raises InvalidInputError (RENDER_TOO_LARGE): too many frames, or too many pixels in one (all of one size)."""
-    if frames > MOST_FRAMES:
-        raise _too_large(f"{frames} frames, at most {MOST_FRAMES} are rendered at once")
-    if pixels > MOST_PIXELS:
-        raise _too_large(f"a frame of {pixels} pixels, at most {MOST_PIXELS} are rendered")
-    if frames * pixels > MOST_PIXELS_IN_ALL:
-        raise _too_large(f"{frames * pixels} pixels in all frames, at most {MOST_PIXELS_IN_ALL} are rendered at once")
-
-
-def _too_large(message: str) -> InvalidInputError:
-    return InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Ask for fewer or smaller frames.")
+    for count, most, of in (
+        (frames, MOST_FRAMES, "frames"),
+        (pixels, MOST_PIXELS, "pixels in a frame"),
+        (frames * pixels, MOST_PIXELS_IN_ALL, "pixels in all frames"),
+    ):
+        if count > most:
+            message = f"{count} {of}, at most {most} are rendered at once"
+            raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Ask for fewer or smaller frames.")
 
 
 _CONFIG: dict[str, Any] = {"extra": "forbid"}
@@ -93,7 +96,9 @@ composite.glb · field: the edited scene as a field file."""
 @dataclass(frozen=True)
 class OrbitRequest:
     """Cameras round one thing. edit: the number of an edit, whose object is looked at · detection: a box instead;
-    neither: the first edit, or without edits the scene's bounds. The rest: regnf_core.rendering.camera.Orbit."""
+    neither: the first edit, or without edits the scene's bounds · elevation_deg: above the horizon · start_deg,
+    sweep_deg: the first camera's turn about the vertical, and how far the last one is turned from it · distance: from
+    the thing's middle, scene units; None: all of it is in view."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
@@ -179,7 +184,10 @@ class RenderRequest:
         try:
             request: RenderRequest = _ADAPTER.validate_python(values)
         except ValidationError as error:
-            raise _fault(error) from error
+            where, message = _first_of(error)
+            if where.split(".")[0] in ("orbit", "look_at", "poses", "size"):
+                raise InvalidInputError(message, reason="CAMERA_INVALID") from error
+            raise InvalidOptionsError(message) from error
         request.check()
         return request
 
@@ -202,8 +210,7 @@ class RenderRequest:
     def check(self) -> None:
         """Raises InvalidInputError: CAMERA_INVALID, RENDER_TOO_LARGE."""
         if sum(one is not None for one in (self.orbit, self.look_at, self.poses)) > 1:
-            message = "cameras: say one of orbit, look_at and poses"
-            raise InvalidInputError(message, reason="CAMERA_INVALID")
+            raise InvalidInputError("cameras: say one of orbit, look_at and poses", reason="CAMERA_INVALID")
         edit = self.orbit.edit if self.orbit is not None else None
         if edit is not None and edit >= len(self.edits):
             raise InvalidInputError(f"orbit.edit: there is no edit {edit}", reason="CAMERA_INVALID")
@@ -213,22 +220,16 @@ class RenderRequest:
     @property
     def rendered_pixels(self) -> int:
         """Rays to be cast in all, those of the scene before its edits included: the cost of the work, about."""
+        return self.pixels_in_all * self.options.antialias**2
+
+    @property
+    def pixels_in_all(self) -> int:
+        """Of all frames, those of the scene before its edits included."""
         width, height = self.image_size
-        times = 2 if self.before and self.edits else 1
-        return times * self.frames * width * height * self.options.antialias**2
-
-
-def _fault(error: ValidationError) -> InvalidInputError:
-    first = error.errors(include_url=False, include_input=False)[0]
-    where = ".".join(str(part) for part in first["loc"])
-    message = f"{where}: {first['msg'].removeprefix('Value error, ')}"
-    if where.split(".")[0] in ("orbit", "look_at", "poses", "size"):
-        return InvalidInputError(message, reason="CAMERA_INVALID")
-    return InvalidOptionsError(message)
+        return (2 if self.before and self.edits else 1) * self.frames * width * height
 
 
 _ADAPTER = TypeAdapter(RenderRequest)
-__all__ = ["MOST_FRAMES", "OrbitRequest", "PoseRequest", "RenderRequest", "StationRequest"]
 
 
 # What a rendering costs at most, estimated from its request alone: memory, seconds, and bytes of files. Torch-free.
@@ -260,47 +261,32 @@ class RenderCost(Cost):
 
 def estimate(request: RenderRequest) -> RenderCost:
     """The cost of a request whose extent has been checked."""
-    return RenderCost(tuple(_terms(request)), _file_bytes(request))
-
-
-def _terms(request: RenderRequest) -> list[Term]:
     width, height = request.image_size
     pixels, options = width * height, request.options
-    frames = request.frames * (2 if request.before and request.edits else 1)
+    cameras: Option = ("poses",) if request.poses is not None else ("orbit", "frames")
+    cameras = ("look_at",) if request.look_at is not None else cameras
     tile = min(options.memory_mb * 1_000_000, pixels * _RAY_BYTES)
     rays = request.rendered_pixels
-    where = *_SIZE, *_cameras(request), ("options", "antialias")
+    where = *_SIZE, cameras, ("options", "antialias")
     terms = [
         Term("rays", rays, where, 0, rays * _RAY_S[options.mode]),
         Term("pixels of a frame", pixels, _SIZE, tile + pixels * _PIXEL_BYTES, 0.0),
         Term("edits", len(request.edits), (("edits",),), 0, len(request.edits) * _EDIT_S),
     ]
     if "animation" in request.outputs:
-        kept = frames * pixels
-        terms.append(Term("pixels of the animation", kept, (*_SIZE, *_cameras(request)), kept * _KEPT_BYTES, 0.0))
+        kept = request.pixels_in_all
+        terms.append(Term("pixels of the animation", kept, (*_SIZE, cameras), kept * _KEPT_BYTES, 0.0))
     for output in ("mesh", "field"):
         if output in request.outputs:
             nodes = (getattr(request, f"{output}_resolution") + 1) ** 3
             where_ = ((f"{output}_resolution",),)
             terms.append(Term(f"nodes of the {output}", nodes, where_, nodes * _NODE_BYTES, nodes * _NODE_S))
-    return terms
-
-
-def _cameras(request: RenderRequest) -> tuple[Option, ...]:
-    if request.look_at is not None:
-        return (("look_at",),)
-    return (("poses",),) if request.poses is not None else (("orbit", "frames"),)
-
-
-def _file_bytes(request: RenderRequest) -> int:
-    width, height = request.image_size
-    frames = request.frames * (2 if request.before and request.edits else 1)
-    total = width * height * frames * sum(_FILE_BYTES.get(output, 0) for output in request.outputs)
+    total = request.pixels_in_all * sum(_FILE_BYTES.get(output, 0) for output in request.outputs)
     if "mesh" in request.outputs:
         total += 6 * request.mesh_resolution**2 * _MESH_FILE_BYTES
     if "field" in request.outputs:
         total += 4 * (request.field_resolution + 1) ** 3
-    return total
+    return RenderCost(tuple(terms), total)
 
 
 # Which revision of the renderer this is: raised by hand whenever the same request gives other files.

@@ -48,29 +48,21 @@ class DistanceGrid:
         bound = torch.zeros(size, device=low.device)
         cells = torch.cartesian_prod(*(torch.arange(int(n), device=low.device) for n in counts))
         for level in range(_LEVELS):
-            cell = coarse / (1 << level)
+            cell, parts = coarse / (1 << level), 1 << (_LEVELS - 1 - level)
             distance = torch.cat(
                 [finite_distance(field, low + cell * (part + 0.5)) for part in torch.split(cells, _AT_ONCE)]
             )
-            cls._enter(bound, cells, distance, cell, _LEVELS - 1 - level)
+            free = distance * _TRUSTED > 0.5 * 3**0.5 * cell
+            within = torch.cartesian_prod(*(torch.arange(parts, device=low.device),) * 3)
+            # from the cell's middle to the farthest corner of each finest cell
+            offset = ((within + 0.5) / parts - 0.5).abs() + 0.5 / parts
+            found = (distance[free, None] * _TRUSTED - cell * offset.norm(dim=-1)).reshape(-1)
+            x, y, z = (cells[free, None] * parts + within).reshape(-1, 3).unbind(-1)
+            bound[x, y, z] = torch.where(found >= _LEAST * cell / parts, found, 0.0)
             near = distance.abs() * _TRUSTED <= 0.5 * 3**0.5 * cell
             children = torch.cartesian_prod(*(torch.arange(2, device=low.device),) * 3)
             cells = (2 * cells[near, None] + children).reshape(-1, 3)
         return cls(low, coarse / (1 << (_LEVELS - 1)), bound)
-
-    @staticmethod
-    def _enter(bound: Tensor, cells: Tensor, distance: Tensor, cell: float, finer: int) -> None:
-        """Write what cells (C, 3) of a level with these distances (C,) at their middles say of the finest ones."""
-        free = distance * _TRUSTED > 0.5 * 3**0.5 * cell
-        parts = 1 << finer
-        within = torch.cartesian_prod(*(torch.arange(parts, device=cells.device),) * 3)
-        # from the cell's middle to the farthest corner of each finest cell
-        offset = ((within + 0.5) / parts - 0.5).abs() + 0.5 / parts
-        reach = cell * offset.norm(dim=-1)
-        index = (cells[free, None] * parts + within).reshape(-1, 3)
-        x, y, z = index.unbind(-1)
-        found = (distance[free, None] * _TRUSTED - reach).reshape(-1)
-        bound[x, y, z] = torch.where(found >= _LEAST * cell / parts, found, 0.0)
 
     def at(self, points: Tensor) -> Tensor:
         """(N,): the bound at points (N, 3); 0 outside of the grid."""

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from regnf_core.editing.edits import Part, PartedField, Tint
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.observation import ColoredField, SdfField, has_color, inverse_deviation_of
+from regnf_core.fields.observation import SdfField, has_color, inverse_deviation_of
+from regnf_core.rendering.camera import up_vector
 from regnf_core.rendering.request import RenderOptions
 from regnf_core.rendering.tracing import Region, Start
 from regnf_core.surface.sphere_tracing import Rays, finite_distance, require_finite
@@ -75,7 +76,11 @@ def volume_samples(region: Region, rays: Rays, start: Start, medium: Medium, lea
         if index.numel() == 0:
             break
         points = rays.origins[index] + t[:, None] * rays.directions[index]
-        d, s = _distance(region, points, medium, least)
+        # the field's where the opacity may change, a lower bound and ``least`` elsewhere
+        d = region.grid.at(points)
+        s = torch.full_like(d, least)
+        asked = (d <= 2.0 * CLEAR / least).nonzero().squeeze(-1)
+        d[asked], s[asked] = medium(points[asked])
         alpha = _alpha(last_s * last_d, last_s * d)
         weight = passed[index] * alpha
         passed[index] = passed[index] * (1.0 - alpha)
@@ -90,16 +95,16 @@ def volume_samples(region: Region, rays: Rays, start: Start, medium: Medium, lea
         index, t, last_t, last_d, last_s = (part[going] for part in (index, t, last_t, last_d, last_s))
     opacity = 1.0 - passed
     length = weighted / opacity.clamp_min(1e-6)
-    return _shaded_samples(region, rays, kept, opacity, length)
-
-
-def _distance(region: Region, points: Tensor, medium: Medium, least: float) -> tuple[Tensor, Tensor]:
-    """Distance and s (N,): the field's where the opacity may change, a lower bound and ``least`` elsewhere."""
-    distance = region.grid.at(points)
-    s = torch.full_like(distance, least)
-    asked = (distance <= 2.0 * CLEAR / least).nonzero().squeeze(-1)
-    distance[asked], s[asked] = medium(points[asked])
-    return distance, s
+    empty = opacity.new_zeros(0)
+    ray, t, weight = (torch.cat(values) for values in zip(*(kept or [(empty.long(), empty, empty)]), strict=True))
+    shaded = weight > _LEAST_WEIGHT * opacity[ray]
+    ray, t, weight = ray[shaded], t[shaded], weight[shaded]
+    total = torch.zeros_like(opacity).index_add_(0, ray, weight)
+    weight = weight * (opacity / total.clamp_min(1e-9))[ray]
+    opacity = torch.where(total > 0, opacity, 0.0)
+    points = rays.origins[ray] + t[:, None] * rays.directions[ray]
+    gradient = region.field.signed_distance_and_gradient(points)[1].to(points)
+    return TileSamples(ray, points, torch.nn.functional.normalize(gradient, dim=-1), weight, opacity, length)
 
 
 def _alpha(before: Tensor, after: Tensor) -> Tensor:
@@ -122,22 +127,6 @@ def _mean_share(before: Tensor, after: Tensor) -> Tensor:
     return torch.where((fall > 1e-9) & ((a - b) > 1e-4), share, 0.5).clamp(0.0, 1.0).to(before)
 
 
-def _shaded_samples(
-    region: Region, rays: Rays, kept: list[tuple[Tensor, Tensor, Tensor]], opacity: Tensor, length: Tensor
-) -> TileSamples:
-    empty = opacity.new_zeros(0)
-    parts = kept or [(empty.long(), empty, empty)]
-    ray, t, weight = (torch.cat(values) for values in zip(*parts, strict=True))
-    shaded = weight > _LEAST_WEIGHT * opacity[ray]
-    ray, t, weight = ray[shaded], t[shaded], weight[shaded]
-    total = torch.zeros_like(opacity).index_add_(0, ray, weight)
-    weight = weight * (opacity / total.clamp_min(1e-9))[ray]
-    opacity = torch.where(total > 0, opacity, 0.0)
-    points = rays.origins[ray] + t[:, None] * rays.directions[ray]
-    gradient = region.field.signed_distance_and_gradient(points)[1].to(points)
-    return TileSamples(ray, points, torch.nn.functional.normalize(gradient, dim=-1), weight, opacity, length)
-
-
 # The color of places that rays see: the field's own, or light and shade on a plain color; tinted where asked.
 
 _PLAIN: Tint = (0.88, 0.88, 0.86)
@@ -145,7 +134,7 @@ _HEADLIGHT, _SKY, _GROUND = 0.70, 0.34, 0.08
 """Shares of full light: from the camera, from above and from below."""
 _OWN_UNDER_TINT = 0.35
 """How much of a field's own color is left under a tint."""
-SHARP = 2000.0
+_SHARP = 2000.0
 """Inverse deviation of a field that has none, times its bounds' diagonal: 90 % of the opacity within .3 % of it."""
 
 
@@ -159,20 +148,13 @@ class Painter:
     options: RenderOptions
 
     @classmethod
-    def of(cls, field: SdfField, up: Tensor, options: RenderOptions) -> Painter:
+    def of(cls, field: SdfField, options: RenderOptions) -> Painter:
         """Raises InvalidInputError (COLORS_MISSING): colors are asked for, and no part has any."""
         parts = field.parts if isinstance(field, PartedField) else (Part(field, None),)
         if options.coloring == "field" and not any(has_color(part.field) for part in parts):
-            message = "the field has no colors"
             hint = "Let it be shaded: coloring auto or shaded."
-            raise InvalidInputError(message, reason="COLORS_MISSING", hint=hint)
-        return cls(field, parts, up, options)
-
-    def part_at(self, points: Tensor) -> Tensor:
-        """(N,) int64, whose surface points (N, 3) belong to."""
-        if isinstance(self.field, PartedField) and len(points):
-            return self.field.part_at(points)
-        return torch.zeros(len(points), dtype=torch.int64, device=points.device)
+            raise InvalidInputError("the field has no colors", reason="COLORS_MISSING", hint=hint)
+        return cls(field, parts, up_vector(options.up).float(), options)
 
     def distance_and_sharpness(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) at points (N, 3), and NeuS's s (N,) there, per scene unit: each part's own.
@@ -191,47 +173,37 @@ class Painter:
         """The least s of all parts."""
         return min(self._sharpness_of(part) for part in self.parts)
 
-    def colors(self, samples: TileSamples, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """sRGB (M, 3) 0..1 of the samples, seen along unit ``directions`` (M, 3), and their parts (M,)."""
-        part_at = self.part_at(samples.points)
-        colors = samples.points.new_zeros(len(samples.points), 3)
-        for number in torch.unique(part_at).tolist():
-            chosen = (part_at == number).nonzero().squeeze(-1)
-            args = samples.points[chosen], samples.normals[chosen], directions[chosen]
-            colors[chosen] = self._part_colors(self.parts[number], *args)
-        return colors, part_at
+    def colors(self, points: Tensor, directions: Tensor, normals: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """sRGB (N, 3) 0..1 of points (N, 3) seen along unit ``directions`` (N, 3), and their parts (N,) int64.
 
-    def flat_colors(self, points: Tensor, directions: Tensor) -> Tensor:
-        """sRGB (N, 3) of points (N, 3) without shading, seen along unit ``directions`` (N, 3)."""
-        part_at = self.part_at(points)
+        normals: (N, 3) unit; None: without shading.
+        """
+        part_at = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+        if isinstance(self.field, PartedField) and len(points):
+            part_at = self.field.part_at(points)
         colors = torch.empty_like(points)
         for number in torch.unique(part_at).tolist():
-            chosen, part = (part_at == number).nonzero().squeeze(-1), self.parts[number]
-            tint = part.tint if self.options.tints else None
-            if tint is None and self.options.coloring != "shaded" and has_color(part.field):
-                colors[chosen] = _own_colors(part.field, part, points[chosen], directions[chosen])
-            else:
-                colors[chosen] = torch.tensor(tint or _PLAIN, device=points.device)
-        return colors
+            chosen = (part_at == number).nonzero().squeeze(-1)
+            shading = None if normals is None else normals[chosen]
+            colors[chosen] = self._part_colors(self.parts[number], points[chosen], directions[chosen], shading)
+        return colors, part_at
 
-    def _part_colors(self, part: Part, points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
+    def _part_colors(self, part: Part, points: Tensor, directions: Tensor, normals: Tensor | None) -> Tensor:
         tint = part.tint if self.options.tints else None
-        light = self._light(normals, directions)
-        if self.options.coloring != "shaded" and has_color(part.field):
-            own = _own_colors(part.field, part, points, directions)
-            if tint is None:
-                return own
-            mixed = torch.tensor(tint, device=own.device) * light[:, None]
-            gray = own.mean(-1, keepdim=True)
-            return ((1.0 - _OWN_UNDER_TINT) * mixed + _OWN_UNDER_TINT * gray * mixed.clamp_min(0.2)).clamp(0.0, 1.0)
-        base = torch.tensor(tint or _PLAIN, device=points.device)
-        return (base * light[:, None]).clamp(0.0, 1.0)
-
-    def _light(self, normals: Tensor, directions: Tensor) -> Tensor:
-        """(M,): a lamp at the camera, and light from all around, more from above."""
+        own = None if self.options.coloring == "shaded" else part.color(points, directions)
+        if own is not None and tint is None:
+            return own.clamp(0.0, 1.0)
+        plain = torch.tensor(tint or _PLAIN, device=points.device)
+        if normals is None:
+            return plain.expand_as(points)
+        # a lamp at the camera, and light from all around, more from above
         head = (-(normals * directions).sum(-1)).clamp_min(0.0)
         above = 0.5 + 0.5 * (normals @ self.up.to(normals))
-        return _HEADLIGHT * head + _GROUND + (_SKY - _GROUND) * above
+        lit = plain * (_HEADLIGHT * head + _GROUND + (_SKY - _GROUND) * above)[:, None]
+        if own is None:
+            return lit.clamp(0.0, 1.0)
+        gray = own.clamp(0.0, 1.0).mean(-1, keepdim=True)
+        return ((1.0 - _OWN_UNDER_TINT) * lit + _OWN_UNDER_TINT * gray * lit.clamp_min(0.2)).clamp(0.0, 1.0)
 
     def _sharpness_of(self, part: Part) -> float:
         if self.options.inverse_deviation is not None:
@@ -241,11 +213,4 @@ class Painter:
         if learned is not None:
             return learned * scale
         low, high = part.field.bounds
-        return SHARP / float((high - low).norm()) * scale
-
-
-def _own_colors(field: ColoredField, part: Part, points: Tensor, directions: Tensor) -> Tensor:
-    if part.T_field_scene is not None:
-        points = part.T_field_scene.apply(points.double()).float()
-        directions = directions @ part.T_field_scene.rotation.to(directions).T
-    return field.color(points, directions).to(points).clamp(0.0, 1.0)
+        return _SHARP / float((high - low).norm()) * scale

@@ -17,6 +17,7 @@ from torch import Tensor
 from regnf_core.document import ObjectSymmetry
 from regnf_core.errors import FieldFormatError, atomic_path
 from regnf_core.fields.observation import SdfField
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
@@ -43,7 +44,7 @@ _SCORE_WIDTH = MODEL.stages[-1].score_width
 
 
 @dataclass(frozen=True, eq=False)
-class SelfSymmetry:
+class SelfSymmetry(Bundle):
     """Rigid transforms (K,) that carry the object, or most of it, onto itself; the identity is left out.
 
     axis: (3,) when every turn about it is a symmetry · deviation: (K,) the share of the surface that each transform
@@ -53,11 +54,6 @@ class SelfSymmetry:
     T: Sim3
     axis: Tensor | None
     deviation: Tensor
-
-    def to(self, device: torch.device | str) -> SelfSymmetry:
-        """The same on another device."""
-        axis = None if self.axis is None else self.axis.to(device)
-        return SelfSymmetry(self.T.on(device), axis, self.deviation.to(device))
 
     def group(self) -> ObjectSymmetry:
         """The symmetries that the object's field confirms. On the CPU."""
@@ -83,8 +79,9 @@ def propose_symmetries(
     itself = SurfacePair(obj, obj, few, few)
     context = RefinementContext(extremal_points, generator, SAME_SCALE)
     found = coarse_to_fine(itself, PoseCandidates.start(_rigid(rotations)), MODEL.stages, context)
-    max_score = _score_of_identity(itself) + MODEL.max_score_above_identity
-    found = found[found.scores <= max_score].to("cpu")
+    identity = _rigid(torch.eye(3, dtype=torch.float64, device=few.points.device)[None])
+    max_score = float(disagreement(residuals(itself, identity), _SCORE_WIDTH)) + MODEL.max_score_above_identity
+    found = found[found.scores <= max_score].on("cpu")
     T = found.T[_distinct_symmetries(found.T, found.scores, extremal_points)]
     axis = _continuous_axis(itself, T, max_score)
     if axis is not None:
@@ -114,11 +111,6 @@ def confirm_symmetries(
     if axis is not None and bool((deviation[_about(T, axis)] > MODEL.max_deviating_share).any()):
         axis = None
     return SelfSymmetry(T, axis, deviation)
-
-
-def _score_of_identity(itself: SurfacePair) -> float:
-    identity = _rigid(torch.eye(3, dtype=torch.float64, device=itself.scene_samples.points.device)[None])
-    return float(disagreement(residuals(itself, identity), _SCORE_WIDTH))
 
 
 def _distinct_symmetries(T: Sim3, scores: Tensor, extremal_points: Tensor) -> Tensor:
@@ -179,7 +171,7 @@ def extremal_points(points: Tensor, count: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Hull:
+class Hull(Bundle):
     """Half-spaces: normals (F, 3) pointing outward, and offsets (F,): within, normals @ x + offsets <= 0.
 
     Without any, nothing is within.
@@ -197,10 +189,6 @@ class Hull:
             equations = torch.zeros(0, 4)
         equations = equations.to(points.device)
         return cls(equations[:, :3], equations[:, 3])
-
-    def to(self, device: torch.device | str) -> Hull:
-        """The same hull on another device."""
-        return Hull(self.normals.to(device), self.offsets.to(device))
 
     def contains(self, points: Tensor, margin: float) -> Tensor:
         """(...) bool: which points (..., 3) lie within, by at least ``margin`` from every face."""
@@ -259,7 +247,7 @@ def _shares(bins: Tensor, count: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectModel:
+class ObjectModel(Bundle):
     """An object's surface and symmetries. Points in the working frame: the surface's centroid at 0, its diameter 1.
 
     spacing: between samples · extremal_points: (E, 3) outermost points, by which two placements are compared ·
@@ -283,23 +271,6 @@ class ObjectModel:
         """The samples' convex hull."""
         return Hull.of(self.samples.on_surface())
 
-    def to(self, device: torch.device | str) -> ObjectModel:
-        """The same model on another device; itself where it is there already. The frame stays on the CPU."""
-        if self.samples.points.device == torch.device(device):
-            return self
-        moved = ObjectModel(
-            self.frame,
-            self.samples.to(device),
-            self.spacing,
-            self.extremal_points.to(device),
-            self.symmetry.to(device),
-            self.signature.to(device),
-        )
-        for name in ("distance_grid", "hull"):
-            if name in self.__dict__:
-                moved.__dict__[name] = self.__dict__[name].to(device)
-        return moved
-
     def field(self, obj: SdfField) -> WorkingField:
         """The object's field, the one that this model was made from, in the working frame."""
         return WorkingField(obj, self.frame)
@@ -318,13 +289,13 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     samples = sampled.samples
     outermost = extremal_points(samples.on_surface(), MODEL.extremal_points)
     device = working_device(obj)
-    there, rotations = samples.to(device), super_fibonacci(MODEL.rotations).to(device)
+    there, rotations = samples.on(device), super_fibonacci(MODEL.rotations).to(device)
     grid = distance_grid(there, sampled.spacing)
     proposed = propose_symmetries(grid, there, outermost, rotations, generator)
-    symmetry = confirm_symmetries(proposed, sampled.field, there, outermost, generator).to("cpu")
+    symmetry = confirm_symmetries(proposed, sampled.field, there, outermost, generator).on("cpu")
     sampled.field.require_finite()
     model = ObjectModel(sampled.frame, samples, sampled.spacing, outermost, symmetry, signature(samples))
-    model.__dict__["distance_grid"] = grid.to("cpu")  # what the property would make again
+    model.__dict__["distance_grid"] = grid.on("cpu")  # what the property would make again
     return model
 
 
@@ -332,42 +303,36 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
 
 MODEL_VERSION = "2"
 """Raised whenever models made by older code must be made again."""
-_SHAPES: dict[str, tuple[int | str, ...]] = {
-    "center": (3,),
-    "lengths": (2,),
-    "points": ("N", 3),
-    "values": ("N",),
-    "normals": ("N", 3),
-    "extremes": ("E", 3),
-    "symmetry.scale": ("K",),
-    "symmetry.rotation": ("K", 3, 3),
-    "symmetry.translation": ("K", 3),
-    "symmetry.deviation": ("K",),
-    "symmetry.axis": ("A", 3),
-    "signature": (SIGNATURE_LENGTH,),
+_SHAPES = {
+    "center": "3",
+    "lengths": "2",
+    "points": "N 3",
+    "values": "N",
+    "normals": "N 3",
+    "extremes": "E 3",
+    "symmetry.scale": "K",
+    "symmetry.rotation": "K 3 3",
+    "symmetry.translation": "K 3",
+    "symmetry.deviation": "K",
+    "symmetry.axis": "A 3",
+    "signature": str(SIGNATURE_LENGTH),
 }
+"""By the tensors' names. A letter stands for the same count wherever it appears."""
 
 
 def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None:
     """Write the model atomically."""
     axis = model.symmetry.axis
-    tensors = {
-        "center": model.frame.center,
-        "lengths": torch.tensor([model.frame.length, model.spacing], dtype=torch.float64),
-        "points": model.samples.points,
-        "values": model.samples.values,
-        "normals": model.samples.normals,
-        "extremes": model.extremal_points,
-        "symmetry.scale": model.symmetry.T.scale,
-        "symmetry.rotation": model.symmetry.T.rotation,
-        "symmetry.translation": model.symmetry.T.translation,
-        "symmetry.deviation": model.symmetry.deviation,
-        "symmetry.axis": axis[None] if axis is not None else torch.zeros(0, 3),
-        "signature": model.signature,
-    }
-    content = save(
-        {name: tensor.contiguous() for name, tensor in tensors.items()}, {"regnf_object_model": MODEL_VERSION}
+    values = (
+        model.frame.center,
+        torch.tensor([model.frame.length, model.spacing], dtype=torch.float64),
+        *(model.samples.points, model.samples.values, model.samples.normals, model.extremal_points),
+        *(model.symmetry.T.scale, model.symmetry.T.rotation, model.symmetry.T.translation, model.symmetry.deviation),
+        axis[None] if axis is not None else torch.zeros(0, 3),
+        model.signature,
     )
+    tensors = {name: tensor.contiguous() for name, tensor in zip(_SHAPES, values, strict=True)}
+    content = save(tensors, {"regnf_object_model": MODEL_VERSION})
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
@@ -400,17 +365,15 @@ def read_object_model(path: str | os.PathLike[str]) -> ObjectModel:
 
 
 def _check(tensors: dict[str, Tensor]) -> None:
-    """Names, shapes (letters stand for the same count wherever they appear) and finite numbers."""
+    """Names, shapes and finite numbers."""
     if tensors.keys() != _SHAPES.keys():
         raise _invalid(f"unexpected or missing tensors: {sorted(tensors.keys() ^ _SHAPES.keys())[:4]}")
     counts: dict[str, int] = {}
     for name, shape in _SHAPES.items():
-        found = tuple(tensors[name].shape)
-        fits = len(found) == len(shape) and all(
-            have == (counts.setdefault(want, have) if isinstance(want, str) else want)
-            for have, want in zip(found, shape, strict=True)
-        )
-        if not fits or not tensors[name].is_floating_point() or not torch.isfinite(tensors[name]).all():
+        parts, found = shape.split(), list(tensors[name].shape)
+        expected = [int(p) if p.isdigit() else counts.setdefault(p, n) for p, n in zip(parts, found, strict=False)]
+        finite = tensors[name].is_floating_point() and bool(torch.isfinite(tensors[name]).all())
+        if found != expected or len(found) != len(parts) or not finite:
             raise _invalid(f"{name} has shape {found} or numbers that are not finite")
     if counts["N"] == 0 or counts["E"] == 0 or counts["A"] > 1 or not (tensors["lengths"] > 0).all():
         raise _invalid("no samples, or lengths that are not positive")

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 
 import torch
 from torch import Tensor
 
-from regnf_core.document import STARTS, IterationRecord, RegistrationResult, Run
+from regnf_core.document import IterationRecord, RegistrationResult
 from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import RegistrationOptions
-from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
-from regnf_core.robust.constants.model import Stage
-from regnf_core.robust.model import ObjectModel, SelfSymmetry, model_object
+from regnf_core.progress import Run
+from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH, Stage
+from regnf_core.robust.model import ObjectModel, model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.refine.levenberg_marquardt import RefinementContext, coarse_to_fine
 from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
@@ -42,19 +42,6 @@ ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, *REFINEMENT
 """Of the refinement on the fields."""
 
 
-@dataclass(frozen=True, eq=False)
-class WarmStart:
-    """What is known before a registration with the preset `robust`.
-
-    T_object_scene: its neighborhood is searched first, everything else only if that ends in a rejection or in an answer
-    less likely than 0.95 · object_model: what ``model_object`` made of the object's field earlier; saves making it
-    again.
-    """
-
-    T_object_scene: Sim3 | None = None
-    object_model: ObjectModel | None = None
-
-
 def register_robust(
     scene_field: SdfField,
     object_field: SdfField,
@@ -62,38 +49,44 @@ def register_robust(
     options: RegistrationOptions,
     seed: int,
     run: Run,
-    warm_start: WarmStart | None = None,
+    initial_transform: Sim3 | None = None,
+    object_model: ObjectModel | None = None,
     scene_view: SceneView | None = None,
 ) -> RegistrationResult:
     """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
 
-    ``scene_view`` saves making one; it must be of this scene, box and options.
+    initial_transform: its neighborhood is searched first, everything else only if that ends in a rejection or in an
+    answer less likely than 0.95 · object_model, scene_view: made earlier, of this object, scene, box and options.
     The work is done on the device of the scene's field. Random numbers are drawn on the CPU, whatever the device.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
     """
-    known = warm_start or WarmStart()
     scene, obj = CountingField(scene_field), CountingField(object_field)
     generator = torch.Generator().manual_seed(seed)
     with run.phase("sampling"):
         # 1. Surface points of the scene in the box.
         view = scene_view or view_scene(scene_field, detection, options.robust)
         # 2. Surface points of the object, and its symmetries.
-        model = known.object_model or model_object(obj, options.robust)
+        model = object_model or model_object(obj, options.robust)
         problem = make_problem(view, model, scene, obj, options.robust)
     evaluation: Evaluation | None = None
-    for start in _starts(problem, options, seed, generator, known.T_object_scene):
+    for seeds, given, stages in _starts(problem, options, seed, generator, initial_transform):
         # 3. Seeds: around a given pose; else from the two shapes and the box; else from matched features too.
         with run.phase("initializing"):
             # 4. Search: where the seeds lead to on distance grids. No field is evaluated.
-            searched = search_poses(problem.view, problem.model, start.seeds, generator, problem.bound, start.stages)
+            searched = search_poses(problem.view, problem.model, seeds, generator, problem.bound, stages)
         with run.phase("optimizing"):
             # 5. Refinement of the best poses, and of their symmetric equivalents, on the fields.
-            poses = Sim3.cat([searched.T, start.given])
-            refined = refine_poses(problem, poses, generator, _progress_of_steps(run))
+            poses = Sim3.cat([searched.T, given])
+            taken = count(1)
+            on_step = lambda: run.optimized(next(taken) / ITERATIONS)  # noqa: E731, B023 -- called within this turn
+            refined = refine_poses(problem, poses, generator, on_step)
         with run.phase("verifying"):
             # 6. Verdict on held-out samples. A pose is compared with all that earlier starts led to.
-            evaluation = _evaluated(evaluation, problem, refined, options)
+            known = None if evaluation is None else evaluation.held_out
+            if evaluation is not None:
+                refined = PoseCandidates.cat([evaluation.candidates.on(refined.scores.device), refined])
+            evaluation = evaluate_candidates(problem, refined, options, known)
         if not evaluation.doubtful:
             break
     assert evaluation is not None  # there is always a start
@@ -102,33 +95,26 @@ def register_robust(
     return result_of(problem, evaluation, options, seed, evaluations)
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """What an attempt begins with. seeds: (H,) · given: what is refined whatever the search finds, (1,) or (0,) ·
-    stages: of the search."""
-
-    seeds: Sim3
-    given: Sim3
-    stages: Sequence[Stage] = SEARCH.stages
-
-
 def _starts(
     problem: RegistrationProblem,
     options: RegistrationOptions,
     seed: int,
     generator: torch.Generator,
     T_known: Sim3 | None,
-) -> Iterator[_Start]:
-    """Slower ways where the faster ones before fail or leave doubt, each made when its turn comes."""
+) -> Iterator[tuple[Sim3, Sim3, Sequence[Stage]]]:
+    """Slower ways where the faster ones before fail or leave doubt, each made when its turn comes.
+
+    Seeds (H,), what is refined whatever the search finds (1,) or (0,), and the stages of the search.
+    """
     view, model, device = problem.view, problem.model, problem.view.foreground.points.device
     if T_known is not None:
         near = problem.in_working_frames(T_known).on(device)
-        yield _Start(seed_poses_around(near, generator), near.expand(1))
+        yield seed_poses_around(near, generator), near.expand(1), SEARCH.stages
     seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
-    yield _Start(seeds, seeds[:0])
+    yield seeds, seeds[:0], SEARCH.stages
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-        yield _Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
+        yield Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages
 
 
 def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
@@ -159,7 +145,7 @@ def search_poses(
     """
     seeds = bound.scale.limited_poses(seeds)
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
-    seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
+    seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds  # a wrong box must not end the search
     grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
     context = RefinementContext(
         model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
@@ -170,8 +156,7 @@ def search_poses(
 def refine_poses(
     problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
 ) -> PoseCandidates:
-    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them for the last stages. Best
-    first.
+    """Poses T (H,) refined on the fields, best first; the best one's symmetry equivalents join for the last stages.
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
@@ -181,43 +166,17 @@ def refine_poses(
     )
     start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
     found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
+    symmetry, points = problem.model.symmetry, problem.model.extremal_points
+    if len(symmetry.T):
+        # The best pose under each of the object's symmetries, but for those that are among the candidates already.
+        equivalents = symmetry.T @ found.T[:1]
+        nearest = torch.stack([displacement(equivalents, one, points) for one in found.T]).amin(0)
+        equivalents = equivalents[nearest > REFINEMENT.same_pose]
+        origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
+        found = replace(found[origins.where(origins < len(found), 0)], T=Sim3.cat([found.T, equivalents]))
     # The last stages' samples are the same for every seed: the same optimum is met at the same place.
     last = replace(context, generator=fixed_generator())
-    return coarse_to_fine(problem.fit, _with_equivalents(problem, found), REFINEMENT.last_stages, last)
-
-
-def _with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
-    """The candidates, and the best one's symmetry equivalents that are not among them."""
-    equivalents = _missing_equivalents(found.T, problem.model.symmetry, problem.model.extremal_points)
-    origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
-    origins = origins.where(origins < len(found), 0)
-    return replace(found[origins], T=Sim3.cat([found.T, equivalents]))
-
-
-def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
-    """The best pose (the first of T) under each of the object's symmetries, without those that T holds already."""
-    if len(symmetry.T) == 0:
-        return T[:0]
-    equivalents = symmetry.T @ T[:1]
-    nearest = torch.stack([displacement(equivalents, one, points) for one in T]).amin(0)
-    return equivalents[nearest > REFINEMENT.same_pose]
-
-
-def _evaluated(
-    last: Evaluation | None, problem: RegistrationProblem, refined: PoseCandidates, options: RegistrationOptions
-) -> Evaluation:
-    """The evaluation of these candidates and of those of the ``last`` attempt, which has those of all before."""
-    if last is None:
-        return evaluate_candidates(problem, refined, options)
-    candidates = PoseCandidates.cat([last.candidates.to(refined.scores.device), refined])
-    return evaluate_candidates(problem, candidates, options, last.held_out)
-
-
-def _progress_of_steps(run: Run) -> Callable[[], None]:
-    """What to call after each iteration: reports the share done, and lets the caller cancel."""
-    taken = count(1)
-    span = STARTS["verifying"] - STARTS["optimizing"]
-    return lambda: run.report("optimizing", STARTS["optimizing"] + span * next(taken) / ITERATIONS)
+    return coarse_to_fine(problem.fit, found, REFINEMENT.last_stages, last)
 
 
 def result_of(
@@ -227,8 +186,8 @@ def result_of(
     view, model, winner = problem.view, problem.model, evaluation.winner
     history = evaluation.candidates.history
     return RegistrationResult(
-        verdict=evaluation.verdict,
-        verdict_reason=evaluation.reason,
+        verdict=evaluation.found.verdict,
+        verdict_reason=evaluation.found.reason,
         verdict_limit=evaluation.found.broken,
         T_object_scene=evaluation.T,
         T_object_scene_initial=problem.in_field_frames(history[0].T[winner]),
@@ -243,7 +202,7 @@ def result_of(
         considered=evaluation.considered,
         center_object=model.frame.center.clone(),
         covariance=pose_covariance(problem, evaluation),
-        symmetry=model.symmetry.to("cpu").group(),
+        symmetry=model.symmetry.on("cpu").group(),
     )
 
 

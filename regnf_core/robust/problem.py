@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-
 from regnf_core.fields.observation import SdfField
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.model import ObjectModel
@@ -17,7 +16,7 @@ from regnf_core.robust.working_frame import fixed_generator, split, working_devi
 
 
 @dataclass(frozen=True, eq=False)
-class RegistrationProblem:
+class RegistrationProblem(Bundle):
     """A detection and an object. Poses T (H,) map the scene's working frame to the object's.
 
     All tensors are on the device that the work is done on, but for the frames and the poses between fields' frames.
@@ -40,18 +39,9 @@ class RegistrationProblem:
         """A single T_object_scene as a pose between the working frames, on the CPU."""
         return self.model.frame.to_field().inverse() @ T_object_scene @ self.view.frame.to_field()
 
-    def to(self, device: torch.device | str) -> RegistrationProblem:
-        """The same with all samples on another device. Fields stay where they are."""
-        fit, held_out = (pair.to(device) for pair in (self.fit, self.held_out))
-        return RegistrationProblem(self.view.to(device), self.model.to(device), fit, held_out, self.bound.to(device))
-
 
 def make_problem(
-    view: SceneView,
-    model: ObjectModel,
-    scene: SdfField,
-    obj: SdfField,
-    options: RobustOptions,
+    view: SceneView, model: ObjectModel, scene: SdfField, obj: SdfField, options: RobustOptions
 ) -> RegistrationProblem:
     """Divide the samples of both surfaces into those to fit and those to hold out, on the device of the scene's field.
 
@@ -59,7 +49,7 @@ def make_problem(
     An object's field on another device is evaluated there, with a copy of each point and each value.
     """
     device = working_device(scene)
-    view, model = view.to(device), model.to(device)
+    view, model = view.on(device), model.on(device)
     generator = fixed_generator()
     A, A_held = split(view.foreground, options.held_out_share, generator)
     B, B_held = split(model.samples, options.held_out_share, generator)

@@ -16,14 +16,15 @@ offset d apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.working_frame import Samples, UnobservedTest, subsample
+from regnf_core.robust.working_frame import Samples, UnobservedTest, WorkingField, subsample
 
 
 class DistanceModel(Protocol):
@@ -32,15 +33,8 @@ class DistanceModel(Protocol):
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
-@runtime_checkable
-class CheckedLater(Protocol):
-    """A distance model whose values are checked when asked for: see :class:`WorkingField`."""
-
-    def require_finite(self) -> None: ...
-
-
 @dataclass(frozen=True, eq=False)
-class SurfacePair:
+class SurfacePair(Bundle):
     """The scene's and the object's surface: a distance model and samples of each, in their working frames."""
 
     scene: DistanceModel
@@ -48,14 +42,10 @@ class SurfacePair:
     scene_samples: Samples
     object_samples: Samples
 
-    def to(self, device: torch.device | str) -> SurfacePair:
-        """The same with the samples on another device."""
-        return SurfacePair(self.scene, self.obj, self.scene_samples.to(device), self.object_samples.to(device))
-
     def require_finite(self) -> None:
         """Raises InvalidInputError (FIELD_NOT_FINITE) for what a field said where nobody could read it."""
         for model in (self.scene, self.obj):
-            if isinstance(model, CheckedLater):
+            if isinstance(model, WorkingField):
                 model.require_finite()
 
     def subsample(self, limit: int, generator: torch.Generator) -> SurfacePair:
@@ -66,7 +56,7 @@ class SurfacePair:
 
 
 @dataclass(frozen=True, eq=False)
-class Residuals:
+class Residuals(Bundle):
     """Residuals (H, N + M) of H poses, scene samples first, object units; their Jacobian (H, N + M, 7), at fixed units
     of the scene: s d(r/s). Its column of the scale is that without an offset, whose part is next to nothing where
     the offset is at its best.
@@ -78,7 +68,7 @@ class Residuals:
     unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed, and samples of both
     that face such space while the other surface there does not face the same way; None: all of it was observed ·
     offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
-    the values · shares: (H, N + M), see :class:`Samples`; the sum of each direction is 1.
+    the values.
     """
 
     values: Tensor
@@ -87,7 +77,6 @@ class Residuals:
     scene_count: int
     unobserved: Tensor | None = None
     offset: Tensor | None = None
-    shares: Tensor | None = None
 
     @property
     def scene_to_object(self) -> Tensor:
@@ -102,15 +91,10 @@ class Residuals:
     def means(self, of_samples: Tensor) -> tuple[Tensor, Tensor]:
         """(H,) and (H,): the means of a quantity (H, N + M) of the samples over each direction."""
         n = self.scene_count
-        if self.shares is None:
-            return of_samples[:, :n].mean(1), of_samples[:, n:].mean(1)
-        weighted = of_samples * self.shares
-        return weighted[:, :n].sum(1), weighted[:, n:].sum(1)
+        return of_samples[:, :n].mean(1), of_samples[:, n:].mean(1)
 
     def weighted(self, weights: Tensor) -> Tensor:
         """Weights (H, N + M) of the samples as parts of these means."""
-        if self.shares is not None:
-            return weights * self.shares
         n, m = self.scene_count, weights.shape[1] - self.scene_count
         return torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
 
@@ -118,16 +102,10 @@ class Residuals:
         """The Jacobian (H, N + M, 7), or (H, N + M, 8) where there is an offset: its column is the last one."""
         if self.offset is None:
             return self.jacobian
+        # r1 falls and r2 grows where the scene's surface lies farther out
         column = torch.ones_like(self.values[:, None])
         column[..., : self.scene_count] = -1.0
         return torch.cat([self.jacobian.mT, column.to(self.jacobian)], 1).mT
-
-    def to(self, device: torch.device | str) -> Residuals:
-        """The same on another device."""
-        values, J, cosines = (part.to(device) for part in (self.values, self.jacobian, self.cosines))
-        maybe = (self.unobserved, self.offset, self.shares)
-        unobserved, offset, shares = (None if part is None else part.to(device) for part in maybe)
-        return Residuals(values, J, cosines, self.scene_count, unobserved, offset, shares)
 
     @classmethod
     def where(cls, mask: Tensor, first: Residuals, second: Residuals) -> Residuals:
@@ -139,7 +117,6 @@ class Residuals:
             first.scene_count,
             _where(mask[:, None], first.unobserved, second.unobserved),
             _where(mask, first.offset, second.offset),
-            first.shares,
         )
 
 
@@ -161,7 +138,6 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
         len(A),
         None if unobserved is None else torch.cat([_hidden(A, cosines1), unobserved], 1),
         offset,
-        None if A.shares is None or B.shares is None else torch.cat([A.shares, B.shares], 1),
     )
 
 
@@ -169,7 +145,7 @@ def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3) -> tuple[Tensor, T
     s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
     arm = (s[..., None] * R) @ A.points.mT  # y - t, (H, 3, N)
     value, g = _query(obj, arm + t)
-    own = s * A.values
+    own = s * A.values  # samples lie near the surface, not on it: the field's value there counts, in object units
     return value - own, _jacobian(arm, g, _dot(g, arm).sub_(value)), _cosine(g, R @ A.normals.mT)
 
 
@@ -182,7 +158,7 @@ def _object_to_scene(
     value, g = _query(scene, w)
     turned = R @ g  # R g_a
     scaled = s * value
-    J = _jacobian(arm, -turned, B.values - _dot(turned, arm))
+    J = _jacobian(arm, -turned, B.values - _dot(turned, arm))  # of s d(r/s): no term from s S_a, see above
     r2 = scaled - B.values
     cosines = _cosine(turned, B.normals.mT)
     if unobserved is None:
@@ -213,6 +189,7 @@ def _as_points(places: Tensor) -> Tensor:
 
 def _jacobian(arm: Tensor, g: Tensor, lever: Tensor) -> Tensor:
     """[arm x g, g, lever], (H, 7, N), from (H, 3, N), (H, 3, N) and (H, N)."""
+    # Written in place, plane by plane: a cross product along so short an axis, and a join, take several times as long.
     J = torch.empty(arm.shape[0], 7, arm.shape[2], dtype=arm.dtype, device=arm.device)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from regnf_core.fields.observation import CountingField, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.bundle import Bundle, CopiedOnce
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import OCCLUSION, REFINEMENT, SCENE, SUPPORT_PLANES
 from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
 from regnf_core.robust.working_frame import (
-    SampledField,
     Samples,
     UnobservedTest,
     WorkingField,
@@ -39,9 +39,9 @@ class SingleView:
 
     viewpoint: Tensor
 
-    def to(self, device: torch.device | str) -> SingleView:
-        """The same for points on another device."""
-        return SingleView(self.viewpoint.to(device))
+    @cached_property
+    def _there(self) -> CopiedOnce:
+        return CopiedOnce(self.viewpoint)
 
     def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
         """(M,) bool, where the signed distances (M,) are those of matter. points: not needed."""
@@ -50,7 +50,7 @@ class SingleView:
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
         """(M,) bool: which surface elements at points (M, 3) with unit normals (M, 3) face away from the viewpoint."""
-        return ((self.viewpoint - points) * normals).sum(-1) < 0.0
+        return ((self._there.on(points.device)[0] - points) * normals).sum(-1) < 0.0
 
 
 def occlusion_boundary(samples: Samples, generator: torch.Generator) -> tuple[Tensor, SingleView | None]:
@@ -117,7 +117,7 @@ def _cosines(points: Tensor, normals: Tensor, viewpoints: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class SmoothedSurface:
+class SmoothedSurface(Bundle):
     """Points (N, 3) and unit normals (N, 3) averaged over neighbors on the same sheet.
 
     roughness: median standard deviation of the neighbors' heights, the points' unit · normal_roughness: 1 - median
@@ -128,9 +128,6 @@ class SmoothedSurface:
     normals: Tensor
     roughness: float
     normal_roughness: float
-
-    def __getitem__(self, index: Tensor) -> SmoothedSurface:
-        return SmoothedSurface(self.points[index], self.normals[index], self.roughness, self.normal_roughness)
 
 
 def smooth(samples: Samples) -> SmoothedSurface:
@@ -192,18 +189,19 @@ def support_planes(
 def _best_plane(
     surface: SmoothedSurface, generator: torch.Generator, edges: Tensor | None, outside: Tensor | None
 ) -> Tensor | None:
-    """(N,) bool: points on and behind the support plane with the most points, or with the most of those outside; None
-    when there is none."""
+    """(N,) bool: points on and behind the support plane with the most points, or most outside; None: there is none."""
     c = SUPPORT_PLANES
     basis = surface if outside is None else surface[outside.nonzero().squeeze(-1)]
     if len(basis.points) < c.min_points:
         return None
     points, normals = surface.points, surface.normals
     rough = _rough(surface)
-    planes = _planes(basis, generator, fitted=rough > 0.0 or outside is not None)
-    thickness = _thickness(surface, planes, edges)
-    heights = points @ planes.normals.T - planes.heights
-    facing = normals @ planes.normals.T
+    across, levels = _planes(basis, generator, fitted=rough > 0.0 or outside is not None)
+    thickness = torch.full_like(levels, _max_thickness(surface))
+    if edges is not None:
+        thickness = thickness.minimum(c.max_share_of_height * (across @ edges.to(across).T).abs().sum(-1))
+    heights = points @ across.T - levels
+    facing = normals @ across.T
     on_plane = (heights.abs() <= thickness) & (facing >= c.min_normal_cosine)
     behind = heights < -c.behind * thickness
     counts = _count_support(on_plane, behind, facing, rough)
@@ -239,16 +237,9 @@ def _rough(surface: SmoothedSurface) -> float:
     return min(max((surface.normal_roughness - low) / (high - low), 0.0), 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class _Planes:
-    """K planes: unit normals (K, 3) and heights (K,) above the origin."""
-
-    normals: Tensor
-    heights: Tensor
-
-
-def _planes(surface: SmoothedSurface, generator: torch.Generator, fitted: bool) -> _Planes:
-    """Planes through samples of the surface. fitted: again by least squares, to the samples near them."""
+def _planes(surface: SmoothedSurface, generator: torch.Generator, fitted: bool) -> tuple[Tensor, Tensor]:
+    """Unit normals (K, 3) and heights (K,) above the origin of planes through samples of the surface. fitted: again by
+    least squares, to the samples near them."""
     c = SUPPORT_PLANES
     points, normals = surface.points, surface.normals
     picks = torch.randperm(len(points), generator=generator)[: c.candidates]
@@ -265,7 +256,7 @@ def _planes(surface: SmoothedSurface, generator: torch.Generator, fitted: bool) 
         enough = total >= c.min_points
         n = torch.where(enough, thinnest * torch.sign((thinnest * n).sum(-1, keepdim=True)), n)
         middles = torch.where(enough, middle, middles)
-    return _Planes(n, (middles * n).sum(-1))
+    return n, (middles * n).sum(-1)
 
 
 def _max_thickness(surface: SmoothedSurface) -> float:
@@ -274,20 +265,11 @@ def _max_thickness(surface: SmoothedSurface) -> float:
     return min(max(c.thickness, c.thickness_per_roughness * surface.roughness), c.max_thickness)
 
 
-def _thickness(surface: SmoothedSurface, planes: _Planes, edges: Tensor | None) -> Tensor:
-    """(K,): half the thickness of each plane."""
-    most = torch.full_like(planes.heights, _max_thickness(surface))
-    if edges is None:
-        return most
-    heights = (planes.normals @ edges.to(planes.normals).T).abs().sum(-1)
-    return most.minimum(SUPPORT_PLANES.max_share_of_height * heights)
-
-
 # What one detection shows of a scene: sampled once, registered with any number of objects.
 
 
 @dataclass(frozen=True, eq=False)
-class SceneView:
+class SceneView(Bundle):
     """The surface in the detection box. Working frame: the box's center at 0, its diagonal 1.
 
     foreground: the samples in front of floors and walls · spacing: between samples · occlusion_boundary_share: of the
@@ -306,15 +288,6 @@ class SceneView:
     def field(self, scene: SdfField) -> WorkingField:
         """The scene's field, the one that this view is of, in the working frame."""
         return WorkingField(scene, self.frame)
-
-    def to(self, device: torch.device | str) -> SceneView:
-        """The same view with its samples on another device; its roughness is measured once. Itself where it is there
-        already."""
-        if self.foreground.points.device == torch.device(device):
-            return self
-        moved = replace(self, foreground=self.foreground.to(device))
-        moved.__dict__["normal_roughness"] = self.normal_roughness
-        return moved
 
     @cached_property
     def normal_roughness(self) -> float:
@@ -342,44 +315,24 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
     generator = fixed_generator()
     counted = CountingField(scene)
     sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
-    removed, unobserved = _unobserved_surface(counted, sampled, generator)
-    everything = _with_hidden(replace(sampled.samples, unobserved=unobserved))
+    everything, known = sampled.samples, observation_of(scene)
+    observation = None if known is None else WorkingObservation(known, sampled.frame)
+    unobserved: UnobservedTest | None = observation
+    if observation is None:
+        removed, unobserved = occlusion_boundary(everything, generator)
+    else:
+        removed = ~observation.on_surface(everything.points)
+    outside = None
+    if unobserved is not None:
+        hidden = unobserved.faces_unobserved(everything.points, everything.normals)
+        everything = replace(everything, unobserved=unobserved, hidden=hidden)
     observed = everything[~removed]
-    outside = None if unobserved is None else ~_within(observed, detection)
+    if unobserved is not None:
+        half = (detection.size / detection.diagonal / 2).to(observed.points)
+        outside = ~((observed.points @ detection.rotation.to(observed.points)).abs() <= half).all(-1)
     edges = detection.rotation.mT * (detection.size / detection.diagonal)[:, None]
     foreground = observed[~support_planes(observed, generator, edges, outside)]
     if len(foreground) < SCENE.min_foreground:
         foreground = observed if len(observed) >= SCENE.min_foreground else everything
     share = float(removed.float().mean())
-    observation = _observation(counted, sampled)
     return SceneView(sampled.frame, detection, foreground, sampled.spacing, share, counted.evaluations, observation)
-
-
-def _observation(scene: SdfField, sampled: SampledField) -> WorkingObservation | None:
-    observation = observation_of(scene)
-    return None if observation is None else WorkingObservation(observation, sampled.frame)
-
-
-def _with_hidden(samples: Samples) -> Samples:
-    """The samples, and which of them nobody can have seen from their front."""
-    if samples.unobserved is None:
-        return samples
-    return replace(samples, hidden=samples.unobserved.faces_unobserved(samples.points, samples.normals))
-
-
-def _unobserved_surface(
-    scene: SdfField, sampled: SampledField, generator: torch.Generator
-) -> tuple[Tensor, UnobservedTest | None]:
-    """Which samples (N,) were not observed, and where else nothing was: by the field's observation, where it has one,
-    else by its occlusion boundaries."""
-    observed = _observation(scene, sampled)
-    if observed is not None:
-        return ~observed.on_surface(sampled.samples.points), observed
-    return occlusion_boundary(sampled.samples, generator)
-
-
-def _within(samples: Samples, detection: OrientedBox) -> Tensor:
-    """(N,) bool: which samples lie in the detection box itself."""
-    half = (detection.size / detection.diagonal / 2).to(samples.points)
-    within: Tensor = ((samples.points @ detection.rotation.to(samples.points)).abs() <= half).all(-1)
-    return within

@@ -13,16 +13,12 @@ from torch.nn.functional import normalize
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import Observation, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.bundle import Bundle, CopiedOnce
 from regnf_core.geometry.metrics import diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE, OCCLUSION, SAMPLING
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
-from regnf_core.surface.requirements import (
-    MIN_POINTS,
-    require_box_in_scene,
-    require_object_surface,
-    require_scene_surface,
-)
+from regnf_core.surface.requirements import MIN_POINTS, require_box_in_scene, require_surface
 from regnf_core.surface.result_clouds import project_to_surface
 from regnf_core.surface.surface_cells import Cells, crop_to_surface, surface_cells
 
@@ -42,42 +38,24 @@ class UnobservedTest(Protocol):
         space in front of them was not seen to be free."""
         ...
 
-    def to(self, device: torch.device | str) -> UnobservedTest:
-        """The same for points on another device."""
-        ...
-
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class Samples(Bundle):
     """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32.
 
-    unobserved: where the field shows something that was not observed; None: everything was observed · shares: (N,), the
-    weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same · hidden: (N,) bool,
-    samples of a scene that nobody can have seen from their front; they tell nothing where the object faces another way.
-
-    Where each pose of a batch has samples of its own, all tensors have one more dimension in front.
+    unobserved: where the field shows something that was not observed; None: everything was observed · hidden: (N,)
+    bool, samples of a scene that nobody can have seen from their front; they tell nothing where the object faces
+    another way.
     """
 
     points: Tensor
     values: Tensor
     normals: Tensor
     unobserved: UnobservedTest | None = None
-    shares: Tensor | None = None
     hidden: Tensor | None = None
 
     def __len__(self) -> int:
-        return int(self.points.shape[-2])
-
-    def __getitem__(self, index: Tensor) -> Samples:
-        shares, hidden = (None if part is None else part[index] for part in (self.shares, self.hidden))
-        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved, shares, hidden)
-
-    def to(self, device: torch.device | str) -> Samples:
-        """The same samples on another device."""
-        points, values, normals = (part.to(device) for part in (self.points, self.values, self.normals))
-        shares, hidden = (None if part is None else part.to(device) for part in (self.shares, self.hidden))
-        unobserved = None if self.unobserved is None else self.unobserved.to(device)
-        return Samples(points, values, normals, unobserved, shares, hidden)
+        return len(self.points)
 
     def on_surface(self) -> Tensor:
         """The points (N, 3) moved onto the surface along their normals."""
@@ -181,7 +159,7 @@ class WorkingField:
     def __init__(self, field: SdfField, frame: WorkingFrame) -> None:
         self.field = field
         self.frame = frame
-        self._centers: dict[torch.device, Tensor] = {}
+        self._center = CopiedOnce(frame.center)
         self._not_finite: Tensor | None = None
 
     def value(self, points: Tensor) -> Tensor:
@@ -203,9 +181,7 @@ class WorkingField:
 
     def _own(self, points: Tensor) -> Tensor:
         """Points (M, 3) in the field's frame, on its device."""
-        center = self._centers.get(points.device)
-        if center is None:
-            center = self._centers[points.device] = self.frame.center.to(points.device)
+        (center,) = self._center.on(points.device)
         return (points.double() * self.frame.length + center).to(self.field.device)
 
     def _finite(self, values: Tensor) -> Tensor:
@@ -217,77 +193,20 @@ class WorkingField:
         return values
 
 
-@dataclass(frozen=True, eq=False)
-class VoxelStates:
-    """An observation's voxels, looked up in a working frame, or in that of each of H poses.
-
-    states: (V,) uint8, z fastest · counts: (3,) int64 · turn: (..., 3, 3) and shift: (..., 3), float32: a point x is in
-    the voxel floor(x turn + shift) · clearance: (...) float32, working units, see above.
-    """
-
-    states: Tensor
-    counts: Tensor
-    turn: Tensor
-    shift: Tensor
-    clearance: Tensor
-
-    @classmethod
-    def of(cls, observation: Observation) -> VoxelStates:
-        """For points of the observation's own frame, which T_grid_frame carries to the grid's."""
-        T = Sim3.identity() if observation.T_grid_frame is None else observation.T_grid_frame
-        to_cells = T.scale / observation.voxel
-        return cls(
-            observation.states.reshape(-1),
-            torch.tensor(observation.states.shape),
-            (to_cells * T.rotation).float().mT.contiguous(),
-            ((T.translation - observation.low) / observation.voxel).float(),
-            (clearance(observation) / to_cells).float(),
-        )
-
-    def to(self, device: torch.device) -> VoxelStates:
-        """The same on another device."""
-        parts = (self.states, self.counts, self.turn, self.shift, self.clearance)
-        return VoxelStates(*(part.to(device) for part in parts))
-
-    def at(self, points: Tensor) -> Tensor:
-        """The states (..., M) at points (..., M, 3); UNSEEN beyond the grid."""
-        cells = (points @ self.turn).add_(self.shift.unsqueeze(-2)).floor_().long()
-        within = ((cells >= 0) & (cells < self.counts)).all(-1)
-        x, y, z = torch.minimum(cells.clamp_min_(0), self.counts - 1).unbind(-1)
-        index = x.mul(self.counts[1]).add_(y).mul_(self.counts[2]).add_(z)
-        return torch.where(within, self.states[index], UNSEEN)
-
-    def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
-        """(..., M) bool: which points (..., M, 3), with these signed distances (..., M) in object diameters, were not
-        observed: those in unseen voxels, and those off the surface in voxels where one was measured. Such a voxel does
-        not tell which part of it is free."""
-        states = self.at(points)
-        return (states == UNSEEN) | ((states == SURFACE) & (values.abs() > EVIDENCE.agreement))
-
-    def facing_unseen(self, points: Tensor, normals: Tensor) -> Tensor:
-        """(..., M) bool: no line of sight passed in front of surface elements at points (..., M, 3) with unit normals
-        (..., M, 3)."""
-        ahead = self.clearance[..., None, None] * normals
-        return (self.at(points + 0.5 * ahead) != FREE) & (self.at(points + ahead) != FREE)
-
-
 class WorkingObservation:
     """What was observed of a field, in its working frame: at (M, 3) float32 points on any device, results there."""
 
     def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
-        self._observation = observation.seen_in(frame.to_field())
-        self._voxels = {torch.device("cpu"): VoxelStates.of(self._observation)}
-
-    def to(self, device: torch.device | str) -> WorkingObservation:
-        """Itself: it works where its points are."""
-        del device
-        return self
-
-    def on(self, device: torch.device) -> VoxelStates:
-        """The voxels for points of the working frame on the device; copied there once."""
-        if device not in self._voxels:
-            self._voxels[device] = self._voxels[torch.device("cpu")].to(device)
-        return self._voxels[device]
+        observation = observation.seen_in(frame.to_field())
+        T = Sim3.identity() if observation.T_grid_frame is None else observation.T_grid_frame
+        to_cells = T.scale / observation.voxel
+        turn = (to_cells * T.rotation).float().mT.contiguous()
+        shift = ((T.translation - observation.low) / observation.voxel).float()
+        ahead = (clearance(observation) / to_cells).float()
+        states, counts = observation.states.reshape(-1), torch.tensor(observation.states.shape)
+        self._observation = observation
+        # A point x is in the voxel floor(x turn + shift), z fastest.
+        self._parts = CopiedOnce(states, counts, turn, shift, ahead)
 
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""
@@ -295,15 +214,30 @@ class WorkingObservation:
 
     def on_surface(self, points: Tensor) -> Tensor:
         """(M,) bool: a surface was measured there."""
-        return self.on(points.device).at(points) == SURFACE
+        return self._at(points) == SURFACE
 
     def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
-        """(M,) bool: neither was a surface measured there, nor did a line of sight pass through."""
-        return self.on(points.device).unobserved(points, values)
+        """(M,) bool: which points (M, 3), with these signed distances (M,) in object diameters, were not observed.
+
+        Those in unseen voxels, and those off the surface in voxels where one was measured: such a voxel does not tell
+        which part of it is free.
+        """
+        states = self._at(points)
+        return (states == UNSEEN) | ((states == SURFACE) & (values.abs() > EVIDENCE.agreement))
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
         """(M,) bool: no line of sight passed in front of these surface elements, whose unit normals are (M, 3)."""
-        return self.on(points.device).facing_unseen(points, normals)
+        ahead = self._parts.on(points.device)[-1] * normals
+        return (self._at(points + 0.5 * ahead) != FREE) & (self._at(points + ahead) != FREE)
+
+    def _at(self, points: Tensor) -> Tensor:
+        """The states (M,) at points (M, 3); UNSEEN beyond the grid."""
+        states, counts, turn, shift, _ = self._parts.on(points.device)
+        cells = (points @ turn).add_(shift).floor_().long()
+        within = ((cells >= 0) & (cells < counts)).all(-1)
+        x, y, z = torch.minimum(cells.clamp_min_(0), counts - 1).unbind(-1)
+        index = x.mul(counts[1]).add_(y).mul_(counts[2]).add_(z)
+        return torch.where(within, states[index], UNSEEN)
 
 
 def _not_finite() -> InvalidInputError:
@@ -336,7 +270,7 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
     low, high = obj.bounds
-    rough = _box_frame(low, high)
+    rough = WorkingFrame(((low + high) / 2).double(), float((high - low).norm()))
     field = WorkingField(obj, rough)
     low, high = rough.into(low).double(), rough.into(high).double()
     known = observation_of(obj)
@@ -354,7 +288,7 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
         measured = observation.on_surface(found.points)
         measured &= ~observation.faces_unobserved(found.points, found.normals)
         found = found[measured] if int(measured.sum()) >= MIN_POINTS else found
-    require_object_surface(len(found))
+    require_surface(len(found), of_object=True)
     surface = found.on_surface()
     size = diameter(surface)
     center = surface.double().mean(0)
@@ -387,17 +321,12 @@ def sample_scene_surface(
     found = found[space.faces_outside(found.points @ axes, found.normals @ axes)]
     bounds = frame.into(scene.bounds)
     found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
-    require_scene_surface(len(found))
+    require_surface(len(found), of_object=False)
     return SampledField(field, frame, found, cells.edge)
 
 
-def _box_frame(low: Tensor, high: Tensor) -> WorkingFrame:
-    return WorkingFrame(((low + high) / 2).double(), float((high - low).norm()))
-
-
 def _samples_near(field: WorkingField, cells: Cells, limit: int, generator: torch.Generator) -> Samples:
-    """At most ``limit`` samples: one Newton step from the cells' centers to the surface, value and normal at its
-    end."""
+    """At most ``limit`` samples: one Newton step from cells' centers to the surface, value and normal at its end."""
     close = (cells.values.abs() <= SAMPLING.max_cell_distance * cells.edge).nonzero().squeeze(-1)
     if close.numel() > limit:
         close = close[torch.randperm(close.numel(), generator=generator)[:limit]]

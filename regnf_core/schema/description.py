@@ -256,12 +256,16 @@ class FieldDescription(ABC):
         if self.observation is not None:
             self.observation.check_tensors(tensors)
             tensors = {name: spec for name, spec in tensors.items() if name != OBSERVATION}
-        if self.color is None:
-            self.check_tensors(tensors)
-            return
-        own, color = split_color(tensors)
+        own, color = (tensors, {}) if self.color is None else split_color(tensors)
         self.check_tensors(own)
-        self._check_color(self.color, color, own)
+        if isinstance(self.color, NetworkColor):
+            width = self.hidden_width(own)
+            require(width is not None, f"fields of the kind {self.kind} have no color by a network")
+            self.color.check(color, width or 0)
+        elif self.color is not None:
+            shape = self.node_shape(own)
+            require(shape is not None, f"fields of the kind {self.kind} have no color by values")
+            self.color.check(color, shape or ())
 
     def hidden_width(self, tensors: Mapping[str, TensorSpec]) -> int | None:
         """Columns of the last layer, which a color's network sees too; None: the kind has no such network."""
@@ -272,21 +276,6 @@ class FieldDescription(ABC):
         """The shape of the vertices or nodes that may have colors; None: the kind has none."""
         del tensors
         return None
-
-    def _check_color(
-        self,
-        color: NetworkColor | ValueColor,
-        tensors: Mapping[str, TensorSpec],
-        own: Mapping[str, TensorSpec],
-    ) -> None:
-        if isinstance(color, NetworkColor):
-            width = self.hidden_width(own)
-            require(width is not None, f"fields of the kind {self.kind} have no color by a network")
-            color.check(tensors, width or 0)
-        else:
-            shape = self.node_shape(own)
-            require(shape is not None, f"fields of the kind {self.kind} have no color by values")
-            color.check(tensors, shape or ())
 
     @abstractmethod
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:

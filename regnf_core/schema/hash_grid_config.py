@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
@@ -54,9 +54,8 @@ class HashGridConfig:
     def __post_init__(self) -> None:
         for name, values in (("resolutions", self.resolutions), ("strides", self.strides)):
             if values is not None and len(values) != self.levels:
-                raise FieldFormatError(
-                    f"hash grid has {self.levels} levels and {len(values)} {name}", reason="FIELD_SHAPES_MISMATCH"
-                )
+                message = f"hash grid has {self.levels} levels and {len(values)} {name}"
+                raise FieldFormatError(message, reason="FIELD_SHAPES_MISMATCH")
 
     @classmethod
     def from_top_resolution(cls, top_resolution: int, **values: Any) -> HashGridConfig:
@@ -122,12 +121,11 @@ class HashGridConfig:
         if chosen is not None:
             others = {level: other for level, (_, other) in counts.items()}
             return replace(self, resolutions=_with_others(usual, others, chosen))
-        raise FieldFormatError(
-            f"hash table has {entries} entries, its description gives {self.entries}", reason="FIELD_SHAPES_MISMATCH"
-        )
+        message = f"hash table has {entries} entries, its description gives {total}"
+        raise FieldFormatError(message, reason="FIELD_SHAPES_MISMATCH")
 
     def _entries_of(self, nodes: int) -> int:
-        return min(_round_up(nodes**3), 1 << self.log2_table_size)
+        return min(-(-(nodes**3) // _ENTRY_ALIGNMENT) * _ENTRY_ALIGNMENT, 1 << self.log2_table_size)
 
     def stride_variants(self) -> Iterator[HashGridConfig]:
         """This table indexed by other roundings of its dense, doubtful levels, fewest changes first; not this config.
@@ -140,7 +138,8 @@ class HashGridConfig:
             if self.level_is_dense()[level] and other**3 <= self.level_entries()[level]
         }
         usual = self.level_resolutions()
-        for chosen in itertools.islice(_combinations(fits), _MAX_PATTERNS):
+        choices = itertools.chain.from_iterable(itertools.combinations(fits, n) for n in range(1, len(fits) + 1))
+        for chosen in itertools.islice(choices, _MAX_PATTERNS):
             yield replace(self, strides=_with_others(usual, fits, chosen))
 
     def _otherwise_rounded(self) -> dict[int, int]:
@@ -161,20 +160,9 @@ def _scales(levels: int, base_resolution: int, per_level_scale: float) -> tuple[
     return tuple(float(growth * np.float32(base_resolution) - np.float32(1.0)) for growth in growths)
 
 
-def _combinations(levels: Iterable[int]) -> Iterator[tuple[int, ...]]:
-    """Every choice of one or more of the levels, fewest first."""
-    listed = tuple(levels)
-    for count in range(1, len(listed) + 1):
-        yield from itertools.combinations(listed, count)
-
-
 def _with_others(usual: tuple[int, ...], others: dict[int, int], chosen: tuple[int, ...]) -> tuple[int, ...]:
     """``usual`` with the ``chosen`` levels replaced by their other value."""
     return tuple(others[level] if level in chosen else value for level, value in enumerate(usual))
-
-
-def _round_up(nodes: int) -> int:
-    return -(-nodes // _ENTRY_ALIGNMENT) * _ENTRY_ALIGNMENT
 
 
 def _fewest(changes: dict[int, int], total: int) -> tuple[int, ...] | None:

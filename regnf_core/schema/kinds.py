@@ -60,11 +60,9 @@ class MlpDescription(FieldDescription):
         return 3 + (self.positional_encoding.width if self.positional_encoding is not None else 0)
 
     def hidden_width(self, tensors: Mapping[str, TensorSpec]) -> int:
-        """Columns of the last layer."""
         return tensors[f"layers.{count_layers(tensors) - 1}.weight"].shape[1]
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
         require_layer_count(layers)
         require(all(0 < i < layers for i in self.input_at), "input_at names the first layer or a missing one")
@@ -110,11 +108,9 @@ class NeusFactoDescription(FieldDescription):
         return 3 + sum(encoding.width for encoding in encodings if encoding is not None)
 
     def hidden_width(self, tensors: Mapping[str, TensorSpec]) -> int:
-        """Columns of the last layer."""
         return tensors[f"layers.{count_layers(tensors) - 1}.weight"].shape[1]
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
         require_layer_count(layers)
         stored_grid = self.hash if self.use_grid else None
@@ -175,7 +171,6 @@ class OnnxDescription(FieldDescription):
     opset: Annotated[int, Ge(13), Le(26)]
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first node or tensor that is not as described."""
         require_names(tensors, set(tensors), integers={name for name, spec in tensors.items() if spec.dtype == "I32"})
         numbers = sum(len(constant.values) for constant in self.constants.values())
         require(numbers <= MAX_NUMBERS, f"the constants hold {numbers} numbers, at most {MAX_NUMBERS} are taken")
@@ -193,9 +188,8 @@ class OnnxDescription(FieldDescription):
                 continue
             require(signature.least <= len(node.inputs) <= signature.most, f"{where}: {len(node.inputs)} inputs")
             require(1 <= len(node.outputs) <= signature.outputs, f"{where}: {len(node.outputs)} outputs")
-            require(
-                all(name == "" or name in by_points for name in node.inputs), f"{where}: an input that no node computes"
-            )
+            known = all(name == "" or name in by_points for name in node.inputs)
+            require(known, f"{where}: an input that no node computes")
             require(all(name and name not in by_points for name in node.outputs), f"{where}: an output made twice")
             moving = [by_points.get(name, False) for name in node.inputs]
             settled = not any(moving[i] for i in signature.settled if i < len(moving))
@@ -230,7 +224,6 @@ class MeshDescription(FieldDescription):
         return tensors["vertices"].shape[:1]
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         require_names(tensors, {"vertices", "faces"}, integers={"faces"})
         for name in ("vertices", "faces"):
             require_shape(tensors, name, (count_rows(tensors, name), 3))
@@ -260,7 +253,6 @@ class VoxelGridDescription(FieldDescription):
         return tensors["values"].shape
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         require_names(tensors, {"values"} | (tensors.keys() & {WEIGHTS}))
         shape = tensors["values"].shape
         require(len(shape) == 3 and min(shape) >= 2, f"values has shape {shape}, expected two nodes an axis at least")
@@ -292,7 +284,6 @@ class NeuralPointsDescription(FieldDescription):
     """Whether the points' frames are turned: quaternions tell how."""
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
         names = layer_tensor_names(layers)
         require_names(tensors, names | {"points", "features"} | ({"orientations"} if self.oriented else set()))
@@ -324,7 +315,6 @@ class VoxelBlocksDescription(FieldDescription):
         return tensors["values"].shape
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         require_names(tensors, {"values", "blocks"} | (tensors.keys() & {WEIGHTS}), integers={"blocks"})
         blocks = count_rows(tensors, "blocks")
         require_shape(tensors, "blocks", (blocks, 3))

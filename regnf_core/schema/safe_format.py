@@ -85,9 +85,6 @@ def _adapter(described: type[FieldDescription]) -> TypeAdapter[FieldDescription]
 
 
 FORMAT_VERSION = "2"
-_OLD_VERSION = "1"
-_OLD_NAMES = {"family": "kind", "neighbours": "neighbors", "normalised": "normalized"}
-"""Entries that were called otherwise in version 1. Nothing else has changed since."""
 _TYPE_NAMES = {"float32": "F32", "float16": "F16", "int32": "I32"}
 _ALIGNMENT = 64
 _MAX_DESCRIPTION = 1 << 20
@@ -168,7 +165,7 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
     version, text = metadata.get("regnf"), metadata.get("field")
     if version is None or text is None:
         raise FieldFormatError("a safetensors file, but no regnf field", reason="SAFE_FORMAT_INVALID")
-    if version not in (FORMAT_VERSION, _OLD_VERSION):
+    if version != FORMAT_VERSION:
         raise FieldFormatError(f"field format version {version[:20]!r} is not known", reason="SAFE_FORMAT_VERSION")
     if len(text) > _MAX_DESCRIPTION:
         raise FieldFormatError("the field's description is too long", reason="SAFE_FORMAT_INVALID")
@@ -176,8 +173,6 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise FieldFormatError("the field's description is not JSON", reason="SAFE_FORMAT_INVALID") from error
-    if version == _OLD_VERSION and isinstance(values, dict):
-        values = {_OLD_NAMES.get(name, name): value for name, value in values.items()}
     return parse_description(values)
 
 

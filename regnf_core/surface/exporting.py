@@ -14,14 +14,11 @@ from trimesh.exchange.gltf import export_glb
 from regnf_core.errors import InvalidInputError, atomic_path
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import SdfField
-from regnf_core.surface.isosurface import Floats, Lattice, Surface, extract_surface
+from regnf_core.surface.isosurface import Floats, Lattice, Progress, Surface, extract_surface
 
 MESH_FORMATS = ("glb", "ply")
 _SLAB_POINTS = 1 << 18
 _MAX_NODES = 1 << 28
-
-Progress = Callable[[int], None]
-"""Called with the number of points evaluated so far."""
 
 
 def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Progress | None = None) -> int:
@@ -42,13 +39,13 @@ def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     return len(surface.faces)
 
 
-def glb_of(mesh: trimesh.Trimesh, origin: Floats) -> bytes:
+def glb_of(mesh: trimesh.Trimesh, origin: Floats, normals: bool = True) -> bytes:
     """The mesh as .glb, ``origin`` (3,) added to its places by its node: vertices have single precision alone."""
     shift = np.eye(4)
     shift[:3, 3] = origin
     scene = trimesh.Scene()
     scene.add_geometry(mesh, transform=shift)
-    export: Callable[..., bytes] = partial(export_glb, include_normals=True)
+    export: Callable[..., bytes] = partial(export_glb, include_normals=normals)
     return export(scene)
 
 

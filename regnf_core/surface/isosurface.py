@@ -82,7 +82,11 @@ def extract_surface(field: SdfField, resolution: int = 128, progress: Progress |
     vertices, faces = _marching_cubes(_follow_surface(evaluator, lattice, cells))
     if len(faces) == 0:
         raise NoSurfaceError("the field has no surface within its bounds", reason="NO_SURFACE_IN_OBJECT")
-    return _oriented(evaluator, vertices, faces)
+    normals = evaluator.normals(vertices)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    along = (np.cross(b - a, c - a) * normals[faces].sum(axis=1)).sum(axis=1)
+    # the corners' order does not say which side is free: all are reversed when most disagree with the normals
+    return Surface(vertices, faces[:, ::-1].copy() if along.sum() < 0 else faces, normals)
 
 
 class _Evaluator:
@@ -192,11 +196,3 @@ def _marching_cubes(crossed: _Crossed) -> tuple[Floats, Ints]:
     distances = np.where(crossed.distances == 0.0, np.finfo(np.float64).tiny, crossed.distances)
     found = igl.marching_cubes(distances, crossed.points, np.ascontiguousarray(crossed.corners, np.int64))
     return found[0], found[1]
-
-
-def _oriented(evaluator: _Evaluator, vertices: Floats, faces: Ints) -> Surface:
-    """The surface with normals; all faces are reversed when most of them disagree with the normals."""
-    normals = evaluator.normals(vertices)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    along = (np.cross(b - a, c - a) * normals[faces].sum(axis=1)).sum(axis=1)
-    return Surface(vertices, faces[:, ::-1].copy() if along.sum() < 0 else faces, normals)

@@ -7,8 +7,9 @@ and what lies behind was not. Surface that a field has invented is behind what w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -44,23 +45,20 @@ class TracedDepths:
         column, row = first.unbind(-1)
         columns = [column.clamp(0, width - 1), (column + 1).clamp(0, width - 1)]
         rows = [row.clamp(0, height - 1), (row + 1).clamp(0, height - 1)]
-        depths = [self.free.view(-1)[y * width + x] for x in columns for y in rows]
-        least = torch.minimum(torch.minimum(depths[0], depths[1]), torch.minimum(depths[2], depths[3]))
-        largest = torch.maximum(torch.maximum(depths[0], depths[1]), torch.maximum(depths[2], depths[3]))
-        return least, largest
+        depths = torch.stack([self.free.view(-1)[y * width + x] for x in columns for y in rows])
+        return depths.amin(0), depths.amax(0)
 
 
 def trace_depths(field: SdfField, cameras: PinholeCameras, rays_each: int) -> list[TracedDepths]:
     """An image a camera, of about ``rays_each`` rays, evenly spread over it. The region is the field's bounds."""
-    return [_image(field, cameras, camera, rays_each) for camera in range(len(cameras))]
-
-
-def _image(field: SdfField, cameras: PinholeCameras, camera: int, count: int) -> TracedDepths:
-    width = max(2, round(math.sqrt(count * float(cameras.aspect[camera]))))
-    height = max(2, round(count / width))
-    places = _places(height, width).view(-1, 2)
-    free, meets = free_depths(field, cameras.positions[camera], cameras.directions(camera, places))
-    return TracedDepths(free.view(height, width), meets.view(height, width))
+    images = []
+    for camera in range(len(cameras)):
+        width = max(2, round(math.sqrt(rays_each * float(cameras.aspect[camera]))))
+        height = max(2, round(rays_each / width))
+        places = _places(height, width).view(-1, 2)
+        free, meets = free_depths(field, cameras.positions[camera], cameras.directions(camera, places))
+        images.append(TracedDepths(free.view(height, width), meets.view(height, width)))
+    return images
 
 
 def _places(height: int, width: int) -> Tensor:
@@ -123,7 +121,8 @@ def observe_by_cameras(
     ends = _ends(chosen, images)
     grid = _grid_round(ends, field.bounds, sum(points >= enough for enough in _POINTS_HALVED))
     states = torch.full(grid.counts, UNSEEN, dtype=torch.uint8).view(-1)
-    cells, _ = surface_cells(_value(field), grid.low, grid.high, max(grid.counts) >> grid.halvings, grid.halvings)
+    base = max(grid.counts) >> grid.halvings
+    cells, _ = surface_cells(partial(_distance, field), grid.low, grid.high, base, grid.halvings)
     states[_looked_through(grid.middles(), chosen, images, _MARGIN * grid.voxel)] = FREE
     near = grid.index(cells.centers)
     states[near[cells.values < 0]] = UNSEEN
@@ -272,5 +271,5 @@ def _shown(places: Tensor, depth: Tensor) -> Tensor:
     return shown
 
 
-def _value(field: SdfField) -> Callable[[Tensor], Tensor]:
-    return lambda points: finite_distance(field, points.float())
+def _distance(field: SdfField, points: Tensor) -> Tensor:
+    return finite_distance(field, points.float())

@@ -17,13 +17,8 @@ def require_box_in_scene(scene: SdfField, detection: OrientedBox) -> None:
     require_in_scene(detection.to_detection(), (low, high))
 
 
-def require_scene_surface(points: int) -> None:
-    """Raises NoSurfaceError (NO_SURFACE_IN_DETECTION) for fewer than MIN_POINTS points."""
+def require_surface(points: int, of_object: bool) -> None:
+    """Raises NoSurfaceError (NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT) for fewer than MIN_POINTS points."""
     if points < MIN_POINTS:
-        raise NoSurfaceError(f"only {points} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION")
-
-
-def require_object_surface(points: int) -> None:
-    """Raises NoSurfaceError (NO_SURFACE_IN_OBJECT) for fewer than MIN_POINTS points."""
-    if points < MIN_POINTS:
-        raise NoSurfaceError(f"only {points} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
+        where, what = ("on the object", "OBJECT") if of_object else ("in the detection box", "DETECTION")
+        raise NoSurfaceError(f"only {points} surface points {where}", reason=f"NO_SURFACE_IN_{what}")

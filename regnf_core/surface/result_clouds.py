@@ -50,8 +50,8 @@ def mean_residual(
 # short, the step is long and wrong. So |g| counts as ``min_slope`` at least. Four values are in use:
 #
 #     0.5     MIN_SLOPE: clouds for viewers, an object's bounds
-#     0.2     samples for registration (robust/constants/); shorter gradients are dropped there
-#     0.001   the surface beneath a sample (robust/constants/): only a gradient of zero is left out
+#     0.2     samples for registration (robust/constants.py); shorter gradients are dropped there
+#     0.001   the surface beneath a sample (robust/constants.py): only a gradient of zero is left out
 #     1e-6    the import gate, which bounds the steps' length as well
 
 MIN_SLOPE = 0.5
@@ -99,11 +99,7 @@ _TOLERANCE_SHARE = 0.05  # of a typical gap: largest |S| at a new point
 
 
 def upsample(
-    field: SdfField,
-    samples: SurfaceSamples,
-    count: int,
-    generator: torch.Generator,
-    inside: Callable[[Tensor], Tensor],
+    field: SdfField, samples: SurfaceSamples, count: int, generator: torch.Generator, inside: Callable[[Tensor], Tensor]
 ) -> SurfaceSamples:
     """The samples and new ones, about ``count`` in all: old points shifted along the surface, then projected onto it.
 
@@ -175,7 +171,8 @@ def with_clouds(
     """
     scene, obj, T = CountingField(scene_field), CountingField(object_field), result.T_object_scene
     generator = torch.Generator().manual_seed(result.seed)
-    extent = _extent(result.object_samples)
+    low, high = result.object_samples.points.amin(0).tolist(), result.object_samples.points.amax(0).tolist()
+    extent = OrientedBox.from_corners(low, [max(b, a + 1e-9) for a, b in zip(low, high, strict=True)])
     A = upsample(scene, result.scene_samples, _OBJECT_POINTS, generator, in_region)
     B = upsample(obj, result.object_samples, _OBJECT_POINTS, generator, lambda points: extent.contains(points, _MARGIN))
     residuals = {
@@ -187,9 +184,3 @@ def with_clouds(
     around = sample_surroundings(scene, detection, _SURROUNDING_POINTS, generator)
     metrics = {**result.metrics, "field_evaluations_clouds": float(scene.evaluations + obj.evaluations)}
     return replace(result, scene_samples=A, object_samples=B, residuals=residuals, surroundings=around, metrics=metrics)
-
-
-def _extent(samples: SurfaceSamples) -> OrientedBox:
-    """The samples' axis-aligned box."""
-    low, high = samples.points.amin(0).tolist(), samples.points.amax(0).tolist()
-    return OrientedBox.from_corners(low, [max(b, a + 1e-9) for a, b in zip(low, high, strict=True)])

@@ -17,6 +17,7 @@ from torch import Tensor
 from regnf_core.errors import InvalidInputError, NoSurfaceError
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox, ray_box_interval
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.surface.result_clouds import newton_step
 
 # Virtual cameras that look at a box from above, and the grid of rays each of them casts.
@@ -28,7 +29,7 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True)
-class Rays:
+class Rays(Bundle):
     """Rays of one or several cameras: origins (N, 3), unit directions (N, 3), float32, field frame."""
 
     origins: Tensor
@@ -79,14 +80,12 @@ def cast_rays(
     parts = -(-total // most)  # of about equal size: a part of a few rays would be rounded otherwise than a large one
     for part in range(parts):
         first, last = total * part // parts, total * (part + 1) // parts
-        origins, directions = [], []
+        cast = []
         for view in range(first // per_edge**2, -(-last // per_edge**2)):
             before = view * per_edge**2
             pixels = torch.arange(max(first - before, 0), min(last - before, per_edge**2))
-            one = _cast_from(positions[view], target, corners, per_edge, pixels)
-            origins.append(one.origins)
-            directions.append(one.directions)
-        yield Rays(torch.cat(origins), torch.cat(directions))
+            cast.append(_cast_from(positions[view], target, corners, per_edge, pixels))
+        yield Rays.cat(cast)
 
 
 def _cast_from(position: Tensor, target: Tensor, corners: Tensor, per_edge: int, pixels: Tensor) -> Rays:

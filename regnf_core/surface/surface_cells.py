@@ -14,6 +14,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
+
 # Which surface faces the outside. Fields learned from images have cavities inside matter that do not exist.
 
 _STEP = 1.5  # cells along the normal: beyond the surface's own cell, short of the far side of most gaps
@@ -67,7 +69,7 @@ _MAX_CROPS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class Cells(Bundle):
     """Cubic cells: centers (N, 3) float64, the field's values there (N,), the edge; all in one frame and unit."""
 
     centers: Tensor
@@ -77,9 +79,6 @@ class Cells:
     def near(self) -> Cells:
         """The cells that may hold surface."""
         return self[self.values.abs() <= _REACH * self.edge]
-
-    def __getitem__(self, index: Tensor) -> Cells:
-        return Cells(self.centers[index], self.values[index], self.edge)
 
     def extent(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner (3,) of all cells."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.document import Considered, IterationRecord, RegistrationResult, json_number, result_document
+from regnf_core.document import IterationRecord, RegistrationResult, json_number, result_document
 from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.metrics import Symmetries
 from regnf_core.geometry.sim3 import Sim3
@@ -48,20 +48,10 @@ def write_ply(
 
 
 def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
-    """One plain entry an iteration: the loss, its parts, the kernel, and T_object_scene as a row-major 4x4 matrix."""
+    """One plain entry an iteration: the record's members, and T_object_scene as a row-major 4x4 matrix."""
     return [
-        {
-            "iteration": record.iteration,
-            "loss": json_number(record.loss),
-            "residual_scene": json_number(record.residual_scene),
-            "residual_object": json_number(record.residual_object),
-            "regularizer": json_number(record.regularizer),
-            "kernel_shape": record.kernel_shape,
-            "kernel_scale": record.kernel_scale,
-            "scene_samples": record.scene_samples,
-            "object_samples": record.object_samples,
-            "T_object_scene": {"matrix": record.T_object_scene.matrix().tolist()},
-        }
+        {name: json_number(value) for name, value in vars(record).items() if name != "T_object_scene"}
+        | {"T_object_scene": {"matrix": record.T_object_scene.matrix().tolist()}}
         for record in trace
     ]
 
@@ -107,10 +97,13 @@ def write_result(
     document = result_document(result, truth, symmetries, result.scene_samples.points.device, **said)
     _write_json(directory / "result.json", document)
     names = ["trace.json", "T_scene_object.npy", "result.json"]
-    if result.considered is not None:
-        _write_considered(directory / "considered.npz", result.considered)
-        names.append("considered.npz")
-    return names
+    if result.considered is None:
+        return names
+    arrays: dict[str, Any] = {n: _numbers(getattr(result.considered, n)) for n in ("scene_points", "object_points")}
+    for name in ("scene_signs", "object_signs"):
+        arrays[name] = getattr(result.considered, name).cpu().numpy()
+    np.savez(directory / "considered.npz", **arrays)
+    return [*names, "considered.npz"]
 
 
 def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
@@ -134,24 +127,11 @@ def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
     return [*names, _PICTURE]
 
 
-def _write_considered(path: Path, considered: Considered) -> None:
-    """The held-out samples, and what they say of each pose that was judged."""
-    points = {name: _numbers(getattr(considered, name)) for name in ("scene_points", "object_points")}
-    signs = {name: getattr(considered, name).cpu().numpy() for name in ("scene_signs", "object_signs")}
-    arrays: dict[str, Any] = points | signs
-    np.savez(path, **arrays)
-
-
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:
     points = np.concatenate([_numbers(samples.points) for samples, _ in parts])
     normals = np.concatenate([_numbers(samples.normals) for samples, _ in parts])
-    colors = np.concatenate(
-        [
-            np.tile((255 * np.array(color)).round().astype(np.uint8), (len(samples.points), 1))
-            for samples, color in parts
-        ]
-    )
-    write_ply(path, points, normals, colors)
+    colors = np.concatenate([np.tile(np.array(color), (len(samples.points), 1)) for samples, color in parts])
+    write_ply(path, points, normals, (255 * colors).round().astype(np.uint8))
 
 
 def _write_json(path: Path, values: Any) -> None:

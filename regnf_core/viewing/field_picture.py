@@ -47,23 +47,19 @@ def field_picture(
     """
     surface = extract_surface(field, size.resolution, progress)
     radius = _DISC * Lattice.over(field, size.resolution).step
-    panels = [_view(surface, side, up_axis or "z", radius, size.panel) for side in _SIDES]
+    axis = "xyz".index((up_axis or "z")[-1])
+    up = np.eye(3)[axis] * (-1.0 if (up_axis or "z").startswith("-") else 1.0)
+    first, pixels = np.eye(3)[(axis + 1) % 3], size.panel * _OVERSAMPLING
+    surfels = Surfels(surface.vertices, surface.normals, np.broadcast_to(_COLOR, surface.vertices.shape))
+    panels = []
+    for along, across, above in _SIDES:
+        view = view_from(along * first + across * np.cross(up, first) + above * up, up, surface.vertices, pixels)
+        picture = _image(render(surfels, view, pixels, radius, _BACKGROUND))
+        panels.append(picture.resize((size.panel, size.panel), Image.Resampling.LANCZOS))
     sheet = Image.new("RGB", (3 * size.panel, size.panel))
     for number, panel in enumerate([*panels, _section(field, surface, size.panel)]):
         sheet.paste(panel, (number * size.panel, 0))
     return sheet
-
-
-def _view(surface: Surface, side: tuple[float, float, float], up_axis: str, radius: float, edge: int) -> Image.Image:
-    axis = "xyz".index(up_axis[-1])
-    up = np.eye(3)[axis] * (-1.0 if up_axis.startswith("-") else 1.0)
-    first = np.eye(3)[(axis + 1) % 3]
-    direction = side[0] * first + side[1] * np.cross(up, first) + side[2] * up
-    colors = np.broadcast_to(_COLOR, surface.vertices.shape)
-    pixels = edge * _OVERSAMPLING
-    view = view_from(direction, up, surface.vertices, pixels)
-    picture = render(Surfels(surface.vertices, surface.normals, colors), view, pixels, radius, _BACKGROUND)
-    return _image(picture).resize((edge, edge), Image.Resampling.LANCZOS)
 
 
 def _section(field: SdfField, surface: Surface, pixels: int) -> Image.Image:
@@ -82,9 +78,8 @@ def _section(field: SdfField, surface: Surface, pixels: int) -> Image.Image:
     distance = np.zeros((pixels, pixels))
     distance[within] = field.signed_distance(torch.from_numpy(places[within])).double().cpu().numpy()
     picture = np.broadcast_to(_BACKGROUND, (pixels, pixels, 3)).copy()
-    picture[within] = _shades(
-        distance[within] / float(np.linalg.norm(high - low)), pixel / float(np.linalg.norm(high - low))
-    )
+    diagonal = float(np.linalg.norm(high - low))
+    picture[within] = _shades(distance[within] / diagonal, pixel / diagonal)
     return _image(picture)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
-import struct
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 
 from regnf_core.errors import RegnfError
@@ -22,104 +21,19 @@ from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import SdfField, has_color
 from regnf_core.schema.safe_format import read_description
 from regnf_core.schema.similarity import local_origin
+from regnf_core.surface.exporting import glb_of
 from regnf_core.surface.isosurface import extract_surface
 from regnf_core.viewing.field_picture import field_picture
 
-# The meshes that people look at as GLB files of one fixed form.
-#
-# A file has one node (with a translation, where it lies far from the origin), one primitive of triangles, positions,
-# perhaps normals (without them it is flat), perhaps colors (as displays show them, like all meshes that regnf
-# writes), indices of 32 bits.
-
-_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _BYTE, _INDEX = 5126, 5121, 5125
-_VERTICES, _INDICES = 34962, 34963
-_HEAD = struct.Struct("<5I")
-
-
-@dataclass(frozen=True)
-class _Form:
-    """All that a file's JSON depends on."""
-
-    vertices: int
-    triangles: int
-    normals: bool
-    colors: bool
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    origin: tuple[float, float, float] | None
-
-    @property
-    def sections(self) -> list[tuple[str, int]]:
-        """What lies in the binary part, one after the other, and how many bytes each has."""
-        found = [("POSITION", 12 * self.vertices)]
-        if self.normals:
-            found.append(("NORMAL", 12 * self.vertices))
-        if self.colors:
-            found.append(("COLOR_0", 4 * self.vertices))
-        return [*found, ("indices", 12 * self.triangles)]
-
-    def text(self) -> bytes:
-        """The JSON part, filled up with spaces to a multiple of four bytes."""
-        accessors, views, at = [], [], 0
-        for number, (name, size) in enumerate(self.sections):
-            target = _INDICES if name == "indices" else _VERTICES
-            views.append({"buffer": 0, "byteOffset": at, "byteLength": size, "target": target})
-            accessors.append({"bufferView": number} | self._accessor(name))
-            at += size
-        attributes = {name: number for number, (name, _) in enumerate(self.sections[:-1])}
-        primitive = {"attributes": attributes, "indices": len(attributes), "mode": 4}
-        document = {
-            "asset": {"version": "2.0", "generator": "regnf"},
-            "scene": 0,
-            "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0} if self.origin is None else {"mesh": 0, "translation": list(self.origin)}],
-            "meshes": [{"primitives": [primitive]}],
-            "accessors": accessors,
-            "bufferViews": views,
-            "buffers": [{"byteLength": at}],
-        }
-        text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-        return text + b" " * (-len(text) % 4)
-
-    def _accessor(self, name: str) -> dict[str, Any]:
-        match name:
-            case "POSITION":
-                ends = {"min": list(self.low), "max": list(self.high)}
-                return {"componentType": _FLOAT, "count": self.vertices, "type": "VEC3"} | ends
-            case "NORMAL":
-                return {"componentType": _FLOAT, "count": self.vertices, "type": "VEC3"}
-            case "COLOR_0":
-                return {"componentType": _BYTE, "normalized": True, "count": self.vertices, "type": "VEC4"}
-        return {"componentType": _INDEX, "count": 3 * self.triangles, "type": "SCALAR"}
-
 
 def mesh_file(
-    vertices: NDArray[Any],
-    faces: NDArray[Any],
-    normals: NDArray[Any] | None = None,
-    colors: NDArray[Any] | None = None,
+    vertices: NDArray[Any], faces: NDArray[Any], normals: NDArray[Any] | None = None, colors: NDArray[Any] | None = None
 ) -> bytes:
-    """The GLB of a mesh. vertices, normals: (V, 3) · faces: (F, 3) · colors: (V, 3) in [0, 1].
-
-    Positions have single precision. So of vertices far from the origin the node's translation has the larger part.
-    """
-    origin = local_origin([vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()])
-    points = np.ascontiguousarray(vertices if origin is None else vertices - np.array(origin), "<f4")
-    low, high = (tuple(float(end) for end in ends) for ends in (points.min(axis=0), points.max(axis=0)))
-    form = _Form(len(points), len(faces), normals is not None, colors is not None, low, high, origin)
-    parts = [points.tobytes()]
-    if normals is not None:
-        parts.append(np.ascontiguousarray(normals, "<f4").tobytes())
-    if colors is not None:
-        levels = np.full((len(points), 4), 255, np.uint8)
-        levels[:, :3] = np.rint(np.clip(colors, 0.0, 1.0) * 255.0)
-        parts.append(levels.tobytes())
-    parts.append(np.ascontiguousarray(faces, "<u4").tobytes())
-    text, data = form.text(), b"".join(parts)
-    whole = _HEAD.size + len(text) + 8 + len(data)
-    head = _HEAD.pack(_MAGIC, 2, whole, len(text), _JSON) + text + struct.pack("<2I", len(data), _BINARY)
-    return head + data
+    """The GLB of a mesh. vertices, normals: (V, 3) · faces: (F, 3) · colors: (V, 3) in [0, 1]."""
+    origin = np.array(local_origin([vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()]) or (0.0, 0.0, 0.0))
+    levels = None if colors is None else np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
+    mesh = trimesh.Trimesh(vertices - origin, faces, vertex_normals=normals, vertex_colors=levels, process=False)
+    return glb_of(mesh, origin, normals is not None)
 
 
 # A triangle mesh with fewer triangles: vertices that share a cell of a grid become one (Rossignac, Borrel 1993).
@@ -152,7 +66,11 @@ def at_most(mesh: Triangles, triangles: int, vertices: int) -> Triangles:
     """
     if len(mesh.faces) <= triangles and len(mesh.vertices) <= vertices:
         return mesh
-    edge = _first_edge(mesh, min(triangles, 2 * vertices))
+    # a surface leaves about two triangles for each square of the cells' edge; no more cells than can be counted
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    least = float(np.ptp(mesh.vertices, axis=0).max()) / (_MOST_CLUSTERS - 1)
+    edge = max((area / min(triangles, 2 * vertices)) ** 0.5, least, float(np.finfo(np.float64).tiny))
     while True:
         smaller = clustered(mesh, edge)
         if len(smaller.faces) <= triangles and len(smaller.vertices) <= vertices:
@@ -171,13 +89,15 @@ def clustered(mesh: Triangles, edge: float) -> Triangles:
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    means = Triangles(
-        _means(mesh.vertices, cluster, counts),
-        faces[np.sort(first)],
-        None if mesh.normals is None else _unit(_means(mesh.normals, cluster, counts)),
-        None if mesh.colors is None else _means(mesh.colors, cluster, counts),
-    )
-    return used_alone(means)
+
+    def means(values: Floats) -> Floats:
+        return np.stack([np.bincount(cluster, values[:, axis], len(counts)) for axis in range(3)], 1) / counts[:, None]
+
+    normals = None if mesh.normals is None else means(mesh.normals)
+    if normals is not None:
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    colors = None if mesh.colors is None else means(mesh.colors)
+    return used_alone(Triangles(means(mesh.vertices), faces[np.sort(first)], normals, colors))
 
 
 def used_alone(mesh: Triangles) -> Triangles:
@@ -187,26 +107,6 @@ def used_alone(mesh: Triangles) -> Triangles:
         return mesh
     normals, colors = (None if part is None else part[used] for part in (mesh.normals, mesh.colors))
     return replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3), normals=normals, colors=colors)
-
-
-def _first_edge(mesh: Triangles, triangles: int) -> float:
-    """A surface leaves about two triangles for each square of the cells' edge; no more cells than can be counted."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    longest = float(np.ptp(mesh.vertices, axis=0).max())
-    return float(max((area / triangles) ** 0.5, longest / (_MOST_CLUSTERS - 1), np.finfo(np.float64).tiny))
-
-
-def _means(values: Floats, cluster: Ints, counts: Ints) -> Floats:
-    """(C, 3) means of values (V, 3) over the clusters."""
-    sums = [np.bincount(cluster, values[:, axis], len(counts)) for axis in range(3)]
-    means: Floats = np.stack(sums, axis=1) / counts[:, None]
-    return means
-
-
-def _unit(vectors: Floats) -> Floats:
-    found: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-    return found
 
 
 # The surface of a field as people see it: a mesh with a bounded number of triangles, in two levels of detail.
@@ -229,7 +129,7 @@ class DisplayMeshes:
 class TooSlowError(RegnfError):
     """The field is too slow to be drawn in good time."""
 
-    reason = "FIELD_PREVIEW_NOT_FOUND"
+    reason = "FIELD_VIEW_NOT_FOUND"
 
 
 def display_meshes(field: SdfField, budget_s: float) -> DisplayMeshes:
@@ -295,19 +195,13 @@ class _Clock:
 
 
 def _surface(field: SdfField, cells: int, clock: _Clock) -> Triangles:
-    found = extract_surface(field, cells, clock)
-    return Triangles(found.vertices, found.faces, found.normals, _colors(field, found.vertices, found.normals))
-
-
-def _colors(field: SdfField, vertices: Floats, normals: Floats) -> Floats | None:
-    """(V, 3) in [0, 1], seen from before the surface."""
-    if not has_color(field):
-        return None
-    points, towards = torch.from_numpy(vertices), torch.from_numpy(-normals)
-    parts = zip(torch.split(points, _AT_ONCE), torch.split(towards, _AT_ONCE), strict=True)
-    found = torch.cat([field.color(some, along).cpu() for some, along in parts])
-    colors: Floats = found.clamp(0.0, 1.0).double().numpy()
-    return colors
+    found, colors = extract_surface(field, cells, clock), None
+    if has_color(field):  # seen from before the surface
+        points, towards = torch.from_numpy(found.vertices), torch.from_numpy(-found.normals)
+        parts = zip(torch.split(points, _AT_ONCE), torch.split(towards, _AT_ONCE), strict=True)
+        seen = torch.cat([field.color(some, along).cpu() for some, along in parts])
+        colors = seen.clamp(0.0, 1.0).double().numpy()
+    return Triangles(found.vertices, found.faces, found.normals, colors)
 
 
 _BUDGET_S = 5.0
@@ -323,24 +217,11 @@ def field_views(path: Path) -> FieldViews:
     fine = coarse = None
     with suppress(RegnfError, MemoryError):
         found = display_meshes(field, _BUDGET_S)
-        fine, coarse = _file_of(found.fine), None if found.coarse is None else _file_of(found.coarse)
-    return FieldViews(fine, coarse, _picture(field, up_axis))
-
-
-def _file_of(mesh: Triangles) -> bytes:
-    return mesh_file(mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
-
-
-def _picture(field: SdfField, up_axis: str | None) -> bytes | None:
-    end = time.process_time() + _BUDGET_S
-
-    def watch(_: int) -> None:
-        if time.process_time() > end:
-            raise TooSlowError("the field is too slow to be drawn")
-
+        fine, coarse = (
+            None if mesh is None else mesh_file(mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
+            for mesh in (found.fine, found.coarse)
+        )
     file = io.BytesIO()
-    try:
-        field_picture(field, up_axis, progress=watch).save(file, "PNG")
-    except (RegnfError, MemoryError):
-        return None
-    return file.getvalue()
+    with suppress(RegnfError, MemoryError):
+        field_picture(field, up_axis, progress=_Clock(time.process_time() + _BUDGET_S)).save(file, "PNG")
+    return FieldViews(fine, coarse, file.getvalue() or None)

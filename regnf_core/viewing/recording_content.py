@@ -89,7 +89,8 @@ def recorded(result: RegistrationResult, detection: OrientedBox | None, object_n
         stream.set_log_tick_enabled(False)
         stream.send_blueprint(_layout(result))
         _log_scene(stream, result, detection)
-        _log_considered(stream, result.considered)
+        if result.considered is not None:
+            _log_considered(stream, result.considered)
         _log_course(stream, result)
         text = rr.TextDocument(verdict_text(result, object_name), media_type=rr.MediaType.MARKDOWN)
         stream.log("verdict", text, static=True)
@@ -119,10 +120,8 @@ def _log_scene(stream: rr.RecordingStream, result: RegistrationResult, detection
         stream.log("scene/detection", shape, static=True)
 
 
-def _log_considered(stream: rr.RecordingStream, considered: Considered | None) -> None:
+def _log_considered(stream: rr.RecordingStream, considered: Considered) -> None:
     """Each pose that was judged, with its probability and reason as a label."""
-    if considered is None:
-        return
     for number, one in enumerate(considered.poses):
         entity = f"scene/considered/{number}"
         stream.log(entity, _transform(one.T_scene_object), static=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from regnf_core.document import RegistrationResult
 from regnf_core.geometry.metrics import gaps
-from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.surface.sphere_tracing import axis_vector
 from regnf_core.viewing.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
@@ -37,14 +37,19 @@ _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable
 def registration_picture(result: RegistrationResult) -> Image.Image:
     """Three panels side by side in the scene frame: at the start, at the end, and the residuals of both surfaces."""
     scene = _surfels(result.scene_samples, SCENE_COLOR)
-    start = _placed(result.object_samples, result.T_object_scene_initial, OBJECT_COLOR)
-    end = _placed(result.object_samples, result.T_object_scene, OBJECT_COLOR)
-    up = axis_vector(_up_axis(result.options)).numpy()
+    start, end = (
+        _surfels(result.object_samples.transformed(T_object_scene.inverse()), OBJECT_COLOR)
+        for T_object_scene in (result.T_object_scene_initial, result.T_object_scene)
+    )
+    up = axis_vector(result.options["up_axis"] or "z").numpy()
     direction = _best_direction(scene, up)
     edge = _PANEL * _OVERSAMPLING
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
     radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
-    residual = _residual_surfels(result, scene, end)
+    residual = Surfels.join(
+        replace(scene, colors=residual_colors_of(result, "scene_residuals")),
+        replace(end, colors=residual_colors_of(result, "object_residuals")),
+    )
     before, after = Surfels.join(scene, start), Surfels.join(scene, end)
     in_front = nearest_surfels(after, view, edge, radius)
     panels = [
@@ -57,11 +62,6 @@ def registration_picture(result: RegistrationResult) -> Image.Image:
         sheet.paste(panel, (number * _PANEL, _CAPTION))
     _captions(sheet, result)
     return sheet
-
-
-def _up_axis(options: dict[str, Any]) -> str:
-    """The scene's vertical axis that the options name; z if they name none."""
-    return str(options["up_axis"] or "z")
 
 
 def residual_colors(shares: Floats) -> Floats:
@@ -78,22 +78,10 @@ def _surfels(samples: SurfaceSamples, color: tuple[float, float, float]) -> Surf
     return Surfels(points, samples.normals.double().cpu().numpy(), np.broadcast_to(np.array(color), points.shape))
 
 
-def _placed(samples: SurfaceSamples, T_object_scene: Sim3, color: tuple[float, float, float]) -> Surfels:
-    """The object's samples in the scene frame."""
-    return _surfels(samples.transformed(T_object_scene.inverse()), color)
-
-
 def residual_colors_of(result: RegistrationResult, name: str) -> Floats:
     """(N, 3) colors of the result's residuals of that name: ``scene_residuals`` or ``object_residuals``."""
     sizes = result.residuals[name].double().abs().cpu().numpy()
     return residual_colors(sizes / (_RAMP_TOP * result.metrics["object_diameter"]))
-
-
-def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfels) -> Surfels:
-    return Surfels.join(
-        Surfels(scene.points, scene.normals, residual_colors_of(result, "scene_residuals")),
-        Surfels(placed.points, placed.normals, residual_colors_of(result, "object_residuals")),
-    )
 
 
 def _best_direction(scene: Surfels, up: Floats) -> Floats:
@@ -126,19 +114,13 @@ def _captions(sheet: Image.Image, result: RegistrationResult) -> None:
         left = number * _PANEL + 24
         draw.text((left, 16), heading, fill=_INK, font=title)
         draw.text((left, 42), note, fill=(120, 124, 130), font=small)
-    _color_bar(sheet, draw, small)
-
-
-def _color_bar(
-    sheet: Image.Image, draw: ImageDraw.ImageDraw, font: ImageFont.FreeTypeFont | ImageFont.ImageFont
-) -> None:
     width, height = 150, 10
     left, top = 3 * _PANEL - width - 24, 22
     ramp = residual_colors(np.linspace(0.0, 1.0, width))
     bar = np.broadcast_to((255 * ramp).astype(np.uint8), (height, width, 3))
     sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
-    draw.text((left, top + 20), "0", fill=_INK, font=font)
-    draw.text((left + width, top + 20), f"{100 * _RAMP_TOP:g} % of diameter", fill=_INK, font=font, anchor="ra")
+    draw.text((left, top + 20), "0", fill=_INK, font=small)
+    draw.text((left + width, top + 20), f"{100 * _RAMP_TOP:g} % of diameter", fill=_INK, font=small, anchor="ra")
 
 
 # A window with a registration in 3D, where a display and PyVista or Open3D are there.
@@ -151,7 +133,10 @@ def show(result: RegistrationResult) -> bool:
     if not has_display():
         return False
     placed = result.object_samples.transformed(result.T_object_scene.inverse())
-    clouds = [(_points(result.scene_samples), SCENE_COLOR), (_points(placed), OBJECT_COLOR)]
+    clouds = [
+        (samples.points.double().cpu().numpy(), color)
+        for samples, color in ((result.scene_samples, SCENE_COLOR), (placed, OBJECT_COLOR))
+    ]
     for name, draw in (("pyvista", _with_pyvista), ("open3d", _with_open3d)):
         try:
             library = importlib.import_module(name)
@@ -167,11 +152,6 @@ def has_display() -> bool:
     if sys.platform.startswith("linux"):
         return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     return True
-
-
-def _points(samples: SurfaceSamples) -> NDArray[np.float64]:
-    points: NDArray[np.float64] = samples.points.double().cpu().numpy()
-    return points
 
 
 def _with_pyvista(pyvista: Any, clouds: list[Cloud]) -> None:

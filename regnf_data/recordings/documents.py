@@ -210,13 +210,12 @@ def read_sdfstudio(folder: Path, given: Given) -> Recording:
     from regnf_data import sdfstudio
 
     metadata = sdfstudio.read_metadata(folder)
-    sdfstudio.check_camera(metadata)
-    listed = metadata.get("frames")
-    if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed) or not listed:
-        raise DatasetError("meta_data.json lists no frames", reason="DATASET_NO_FRAMES")
+    listed = sdfstudio.frames_of(metadata)
     stated = metadata.get("depth_unit_scale_factor")
     unit = given.depth_unit or (None if stated is None else float(stated))
     size = (int(metadata["height"]), int(metadata["width"])) if "height" in metadata and "width" in metadata else None
+    given_metric = sdfstudio.worldtogt(metadata)
+    T_metric_world = None if given_metric is None else sdfstudio.similarity(given_metric, "worldtogt", _INVALID)
     frames: list[StoredFrame | None] = []
     for index, each in enumerate(listed):
         depth = each.get("sensor_depth_path")
@@ -236,7 +235,7 @@ def read_sdfstudio(folder: Path, given: Given) -> Recording:
                 color_file(resolve(folder, color, f"rgb_path of {name}")) if color else None,
             )
         )
-    return recording_of(folder.name, "sdfstudio", frames, (), sdfstudio.metric_world(metadata))
+    return recording_of(folder.name, "sdfstudio", frames, (), T_metric_world)
 
 
 # COLMAP: cameras and images, as text or binary, and a depth image of each image's name.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array, Camera, Size
-from regnf_data.sdfstudio import image_size, read_colors, read_depth, read_mask
+from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
 
 MOST_FRAMES = 100_000
 MOST_PIXELS = 1 << 25
@@ -177,7 +177,7 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
 
 def color_file(path: Path) -> Callable[[], NDArray[np.uint8]]:
     """Reads a color image."""
-    return lambda: read_colors(path, checked_size(path))
+    return lambda: np.asarray(decoded(path, checked_size(path), "RGB"), dtype=np.uint8)
 
 
 def mask_file(path: Path) -> NDArray[np.bool_]:
@@ -197,7 +197,8 @@ def checked_size(path: Path) -> Size:
             raise DatasetError(f"{path.name} is no image of one channel", reason="DATASET_IMAGE_INVALID")
         size = (int(shape[0]), int(shape[1]))
     else:
-        size = image_size(path)
+        with opened_image(path) as image:
+            size = image.height, image.width
     if size[0] * size[1] > MOST_PIXELS:
         raise DatasetError(f"{path.name} has {size[1]} x {size[0]} pixels", reason="DATASET_TOO_LARGE")
     return size

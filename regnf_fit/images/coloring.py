@@ -6,9 +6,10 @@ The geometry does not change. Where rays meet it is computed once, so that an it
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -17,8 +18,18 @@ from regnf_core.fields.color_head import Appearance, ColorHead, PositionalEncodi
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.schema.description import TABLE, DirectionEncoding, NetworkColor, color_tensors
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_fit.images.preparation import PixelRays
-from regnf_fit.network import GRID_RADIUS, StartShape, TrainableField, random_layers
+from regnf_data.posed_images import PosedImages
+from regnf_fit.images.preparation import PixelRays, measured_within, rays_of_pixels
+from regnf_fit.network import (
+    GRID_RADIUS,
+    StartShape,
+    TrainableField,
+    arrays_of,
+    layer_tensors,
+    make_optimizer,
+    random_layers,
+    random_table,
+)
 from regnf_fit.options import ReconstructionOptions
 
 # The parameters of a field that is being fitted to images: geometry, color and the opacity's sharpness.
@@ -83,8 +94,7 @@ class HeldOutErrors:
     eikonal_error: float
 
 
-@dataclass(frozen=True)
-class FirstHits:
+class FirstHits(NamedTuple):
     """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3), not of unit length."""
 
     depths: Tensor
@@ -94,11 +104,9 @@ class FirstHits:
 @torch.no_grad()
 def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
     """Where rays first enter matter: sphere tracing with a least step, then bisection."""
-    parts = [_traced(field, rays.take(index), size) for index in _chunks(len(rays))]
-    if not parts:
-        empty = torch.zeros(0, 3)
-        return FirstHits(empty[:, 0], empty)
-    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals")))
+    chunks = torch.split(torch.arange(len(rays)), _HELD_OUT_CHUNK)  # of no rays: one, empty
+    parts = [_traced(field, rays.take(index), size) for index in chunks]
+    return FirstHits(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
 @torch.no_grad()
@@ -116,10 +124,6 @@ def evaluate(field: RadianceField, rays: PixelRays, size: float) -> HeldOutError
         depth_error_median=float(depth_error.median()) if both.any() else None,
         eikonal_error=float((norms - 1.0).abs().mean()) if met.any() else 1.0,
     )
-
-
-def _chunks(count: int) -> tuple[Tensor, ...]:
-    return tuple(torch.arange(start, min(start + _HELD_OUT_CHUNK, count)) for start in range(0, count, _HELD_OUT_CHUNK))
 
 
 def _traced(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
@@ -153,26 +157,11 @@ _RAYS = 60_000
 _BATCH = 2048
 _ITERATIONS = 600
 _TABLE_RATE, _NETWORK_RATE = 1e-2, 2e-3
-_TABLE_SPREAD = 1e-4
 _DIRECTIONS = 2
 """Frequencies of the direction: highlights of a fitted color are wide."""
 _SAME_SURFACE = 0.01
 """Diagonals between where a ray meets the field and the depth that was measured."""
 _CHUNK = 1 << 14
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """What N rays meet: the surface as a color sees it, unit directions (N, 3), the pixels' colors (N, 3)."""
-
-    appearance: Appearance
-    directions: Tensor
-    colors: Tensor
-
-    def take(self, index: Tensor) -> _Seen:
-        one = self.appearance
-        picked = Appearance(one.position[index], one.gradient[index], one.hidden[index])
-        return _Seen(picked, self.directions[index], self.colors[index])
 
 
 class SurfaceColor(nn.Module):
@@ -184,8 +173,7 @@ class SurfaceColor(nn.Module):
         self.form = NetworkColor("network", direction=direction, gradient="unit", hash=grid, grid_radius=GRID_RADIUS)
         weights, biases = random_layers([self.form.own_width + hidden, width, width, 3], generator)
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
-        table = torch.rand(grid.entries, grid.features_per_level, generator=generator)
-        self.table = nn.Parameter((2.0 * table - 1.0) * _TABLE_SPREAD)
+        self.table = random_table(grid, generator)
 
     def head(self) -> ColorHead:
         """The color of the present parameters, differentiable with respect to them."""
@@ -194,31 +182,35 @@ class SurfaceColor(nn.Module):
 
     def stored(self, half_table: bool) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The description's entry, and the tensors by their names in the file."""
-        table = self.table.detach()
-        tensors = {TABLE: table.half() if half_table else table}
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"] = weight.detach(), bias.detach()
-        return asdict(self.form), color_tensors({name: tensor.cpu().numpy() for name, tensor in tensors.items()})
+        tensors = {TABLE: self.table.half() if half_table else self.table}
+        return asdict(self.form), color_tensors(arrays_of(tensors | layer_tensors(self.weights, self.biases)))
 
 
 def fit_color(field: RadianceField, rays: PixelRays, size: float, seed: int) -> SurfaceColor | None:
     """The color of ``field``'s surface in the pixels of ``rays``; None where no ray meets it. size: of the bounds."""
     generator = torch.Generator().manual_seed(seed)
     device = rays.origins.device
-    shown = _of_one_surface(rays).nonzero()[:, 0]
+    # Rays that show one surface alone: on the edge of what is near, a pixel mixes its color with what is behind.
+    plain = ~rays.background & (rays.cosines > 0.0)
+    shown = (plain if bool(plain.any()) else ~rays.background).nonzero()[:, 0]
     chosen = shown[torch.randperm(len(shown), generator=generator)[:_RAYS].to(device)]
-    seen = _seen(field, rays.take(chosen), size)
-    if seen is None:
+    rays = rays.take(chosen)
+    hits = first_hits(field, rays, size)
+    met = hits.depths > 0.0
+    if rays.depths.any():  # a ray that meets another surface than the camera saw has another's color
+        met &= (hits.depths - rays.depths).abs() * rays.directions.norm(dim=1) < _SAME_SURFACE * size
+    if not met.any():
         return None
-    hidden = seen.appearance.hidden.shape[1]
-    color = SurfaceColor(hidden, field.options.hidden_width, field.options.grid, generator).to(device)
-    networks = [*color.weights, *color.biases]
-    groups = [{"params": [color.table], "lr": _TABLE_RATE, "eps": 1e-15}, {"params": networks, "lr": _NETWORK_RATE}]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
+    rays, depths = rays.take(met), hits.depths[met]
+    directions = torch.nn.functional.normalize(rays.directions, dim=1)
+    seen = appearance_of(field, rays.at(depths[:, None])[:, 0])
+    color = SurfaceColor(seen.hidden.shape[1], field.options.hidden_width, field.options.grid, generator).to(device)
+    optimizer = make_optimizer(color.table, [*color.weights, *color.biases], _TABLE_RATE, _NETWORK_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _ITERATIONS)
     for _ in range(_ITERATIONS):
-        batch = seen.take(torch.randint(len(seen.colors), (_BATCH,), generator=generator).to(device))
-        loss = (color.head()(batch.appearance, batch.directions) - batch.colors).square().mean()
+        some = torch.randint(len(rays), (_BATCH,), generator=generator).to(device)
+        batch = Appearance(seen.position[some], seen.gradient[some], seen.hidden[some])
+        loss = (color.head()(batch, directions[some]) - rays.colors[some]).square().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -237,22 +229,88 @@ def appearance_of(field: RadianceField, points: Tensor) -> Appearance:
     return Appearance(points, gradients, hidden)
 
 
-def _of_one_surface(rays: PixelRays) -> Tensor:
-    """Which rays (R,) show one surface alone: on the edge of what is near, a pixel mixes its color with what is behind.
+# Whole images that no color is fitted to, and how much the field's pictures are like them.
 
-    Where there are depths: those with a plane through their neighbors. Otherwise all that no mask excludes.
-    """
-    plain = ~rays.background & (rays.cosines > 0.0)
-    return plain if bool(plain.any()) else ~rays.background
+_ONE_OF = 15
+_MOST_IMAGES = 4
+_LEAST_IMAGES = 4
+"""Of fewer images all are needed."""
+_PLACES = tuple((x / 3.0, y / 3.0) for x in (-1, 0, 1) for y in (-1, 0, 1))
+"""In a pixel, from its middle: a camera's pixel has the mean color of what lies in it."""
+_WINDOW, _SPREAD = 11, 1.5
+_LUMINANCE, _CONTRAST = 0.01**2, 0.03**2
 
 
-def _seen(field: RadianceField, rays: PixelRays, size: float) -> _Seen | None:
-    hits = first_hits(field, rays, size)
-    met = hits.depths > 0.0
-    if rays.depths.any():  # a ray that meets another surface than the camera saw has another's color
-        met &= (hits.depths - rays.depths).abs() * rays.directions.norm(dim=1) < _SAME_SURFACE * size
-    if not met.any():
+def held_out_images(count: int) -> list[int]:
+    """The numbers of the images to hold out, of so many: one of 15, evenly over them, at most four."""
+    if count < _LEAST_IMAGES:
+        return []
+    wanted = min(max(count // _ONE_OF, 1), _MOST_IMAGES)
+    return [int((i + 0.5) * count / wanted) for i in range(wanted)]
+
+
+@torch.no_grad()
+def likeness(
+    field: RadianceField, color: SurfaceColor, images: PosedImages, chosen: list[int], size: float
+) -> tuple[float, float] | None:
+    """Of the field's surface, colored, to the chosen images: decibels (PSNR) over all pixels that show the thing, and
+    their mean structural similarity, up to 1. None where they show nothing of it."""
+    squared, similar, pixels = 0.0, 0.0, 0
+    for number in chosen:
+        shown, seen, drawn = _picture(field, color, images, number, size)
+        if not shown.any():
+            continue
+        pixels += int(shown.sum())
+        squared += float((drawn - seen)[shown].square().mean(dim=-1).sum())
+        similar += float(structural_similarity(drawn, seen)[shown].sum())
+    if not pixels:
         return None
-    rays, depths = rays.take(met), hits.depths[met]
-    directions = torch.nn.functional.normalize(rays.directions, dim=1)
-    return _Seen(appearance_of(field, rays.at(depths[:, None])[:, 0]), directions, rays.colors)
+    return -10.0 * math.log10(max(squared / pixels, 1e-10)), similar / pixels
+
+
+def structural_similarity(one: Tensor, other: Tensor) -> Tensor:
+    """(H, W) of pictures (H, W, 3) in [0, 1], in Gaussian windows of 11 pixels, mean of channels (Wang et al. 2004)."""
+    offsets = torch.arange(_WINDOW, dtype=one.dtype, device=one.device) - _WINDOW // 2
+    bell = torch.exp(-0.5 * (offsets / _SPREAD).square())
+    kernel = (bell[:, None] * bell / bell.sum().square())[None, None]
+
+    def mean(picture: Tensor) -> Tensor:
+        padded = torch.nn.functional.pad(picture.permute(2, 0, 1)[:, None], (_WINDOW // 2,) * 4, mode="replicate")
+        return torch.nn.functional.conv2d(padded, kernel)[:, 0].permute(1, 2, 0)
+
+    a, b = mean(one), mean(other)
+    both = mean(one * other) - a * b
+    spread = mean(one.square()) - a.square() + mean(other.square()) - b.square()
+    alike = (2.0 * a * b + _LUMINANCE) * (2.0 * both + _CONTRAST)
+    whole: Tensor = alike / ((a.square() + b.square() + _LUMINANCE) * (spread + _CONTRAST))
+    return whole.mean(dim=-1)
+
+
+def _picture(
+    field: RadianceField, color: SurfaceColor, images: PosedImages, number: int, size: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which pixels (H, W) show the thing, the image (H, W, 3), the field's picture; black where nothing is shown."""
+    device = field.table.device
+    height, width = images.colors.shape[1:3]
+    pixels = number * height * width + np.arange(height * width)
+    rays = rays_of_pixels(images, pixels, None).to(device)
+    shown = ~rays.background & (rays.far > rays.near) if images.depths is None else measured_within(rays)
+    index = shown.nonzero()[:, 0]
+    drawn, seen = torch.zeros(len(rays), 3, device=device), torch.zeros(len(rays), 3, device=device)
+    if len(index):
+        behind = field.background.sigmoid()
+        if bool(rays.background.any()):  # of what is behind the thing the field knows nothing
+            behind = rays.colors[rays.background].mean(dim=0)
+        rays = rays.take(index)
+        # by what a ray's direction changes to the pixel right of its own, and to the one below it
+        right, down = torch.from_numpy(images.T_world_pixel[number, :, :2].T.copy()).to(rays.directions)
+        for x, y in _PLACES:
+            moved = replace(rays, directions=rays.directions + x * right + y * down)
+            hits = first_hits(field, moved, size)
+            met = hits.depths > 0.0
+            points = moved.at(torch.where(met, hits.depths, moved.far)[:, None])[:, 0]
+            towards = torch.nn.functional.normalize(moved.directions, dim=1)
+            drawn[index] += torch.where(met[:, None], color.head()(appearance_of(field, points), towards), behind)
+        drawn /= len(_PLACES)
+        seen[index] = rays.colors
+    return shown.view(height, width), seen.view(height, width, 3), drawn.view(height, width, 3)

@@ -14,7 +14,16 @@ from torch import Tensor
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.geometry.box import OrientedBox
 from regnf_fit.images.fusion import MapDistances
-from regnf_fit.images.preparation import PixelRays, PreparedImages, cells_of, in_boxes, measured_within, uneven
+from regnf_fit.images.preparation import (
+    PixelRays,
+    PreparedImages,
+    cells_of,
+    ends_of,
+    in_boxes,
+    measured_within,
+    on_device,
+    uneven,
+)
 from regnf_fit.options import ReconstructionOptions
 
 _FREE_POOL = 400_000
@@ -58,18 +67,7 @@ class DepthSupervision:
 
     def to(self, device: torch.device) -> DepthSupervision:
         """The same on another device."""
-        return DepthSupervision(
-            rays=self.rays.to(device),
-            before=self.before.to(device),
-            behind=self.behind.to(device),
-            noise=self.noise.to(device),
-            trust=self.trust.to(device),
-            detailed=self.detailed.to(device),
-            free_points=self.free_points.to(device),
-            clearances=self.clearances.to(device),
-            size=self.size,
-            near=None if self.near is None else self.near.to(device),
-        )
+        return on_device(self, device)
 
 
 def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.random.Generator) -> DepthSupervision:
@@ -87,18 +85,23 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
     seen = (rays.depths > 0.0) & ~rays.background
     inside = measured_within(rays)
     surface = rays.take(inside)
-    ends = surface.at(surface.depths[:, None])[:, 0]
+    ends = ends_of(surface)
     usual = float(before[inside].median()) if len(surface) else options.band * size
     cloud = _cloud(ends.numpy(), surface.deviations.numpy(), usual)
     free_to = torch.where(seen, rays.depths - before / rays.directions.norm(dim=1), rays.far).minimum(rays.far)
     is_open = (seen | rays.background) & (free_to > rays.near)
     points = _free_points(rays.take(is_open), free_to[is_open], prepared.boxes, options.detail_share, rng)
+    # what depths count: the maximum likelihood of L1, within limits, 1 in the mean
+    trust = torch.ones_like(surface.deviations)
+    if len(surface) and bool((surface.deviations > 0.0).all()):
+        weight = (surface.deviations.median() / surface.deviations).clamp(1.0 / _MAX_TRUST, _MAX_TRUST)
+        trust = weight / weight.mean()
     return DepthSupervision(
         rays=surface,
         before=before[inside],
         behind=behind[inside],
         noise=_NOISE * spreads[inside],
-        trust=_trust(surface.deviations),
+        trust=trust,
         detailed=(in_boxes(prepared.boxes, ends) | uneven(ends, surface.deviations, size)).nonzero()[:, 0],
         free_points=points,
         clearances=torch.from_numpy(cKDTree(cloud).query(points.numpy())[0].astype(np.float32)),
@@ -120,30 +123,19 @@ def _free_points(
     return torch.cat((points[within], points[: _FREE_POOL - len(within)]))
 
 
-def _trust(deviations: Tensor) -> Tensor:
-    """What depths of these deviations (R,) count: the maximum likelihood of L1, within limits, 1 in the mean."""
-    if len(deviations) == 0 or not bool((deviations > 0.0).all()):
-        return torch.ones_like(deviations)
-    weight = (deviations.median() / deviations).clamp(1.0 / _MAX_TRUST, _MAX_TRUST)
-    return weight / weight.mean()
-
-
 def _cloud(points: NDArray[np.float32], deviations: NDArray[np.float32], band: float) -> NDArray[np.float64]:
     """Averaged points (V, 3). Those too noisy for the band count only where no others are."""
-    precise = deviations <= _PRECISE * band
-    cloud, rough = (_averaged(points[chosen], _VOXEL * band) for chosen in (precise, ~precise))
+
+    def averaged(given: Tensor) -> NDArray[np.float64]:
+        """One point (V, 3) for each occupied voxel: the mean of those within."""
+        return np.asarray(cells_of(given, _VOXEL * band).means(given)) if len(given) else np.zeros((0, 3))
+
+    precise = torch.from_numpy(deviations <= _PRECISE * band)
+    cloud, rough = (averaged(torch.from_numpy(points)[chosen]) for chosen in (precise, ~precise))
     if len(cloud) == 0 or len(rough) == 0:
         return cloud if len(cloud) else rough
     alone = np.isinf(cKDTree(cloud).query(rough, distance_upper_bound=_ALONE * band)[0])
     return np.concatenate((cloud, rough[alone]))
-
-
-def _averaged(points: NDArray[np.float32], voxel: float) -> NDArray[np.float64]:
-    """One point (V, 3) for each occupied voxel: the mean of those within."""
-    if len(points) == 0:
-        return np.zeros((0, 3))
-    given = torch.from_numpy(points)
-    return np.asarray(cells_of(given, voxel).means(given))
 
 
 # What measured depths say about the signed distance.
@@ -176,7 +168,7 @@ def depth_terms(
     """
     if data.near is not None:
         return _map_terms(function, data, data.near, options, generator)
-    chosen = _draw_rays(data, options, generator)
+    chosen = _draw_some_at_detail(len(data.rays), data.detailed, options.surface_rays, options, generator)
     rays = correct(data.rays.take(chosen))
     noise = torch.where(rays.cosines > 0.0, data.noise[chosen], 0.0)
     offsets = _offsets(data.before[chosen], data.behind[chosen], noise, options.band_samples, generator)
@@ -203,11 +195,9 @@ def _map_terms(
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The terms where a map of the images tells the distances near surfaces: |value - the map's| in place of rays."""
-    device = near.points.device
-    count = int(options.detail_share * options.map_points) if len(near.detailed) else 0
-    detailed = near.detailed[_draw(len(near.detailed), count, generator, device)]
-    chosen = torch.cat((detailed, _draw(len(near.points), options.map_points - count, generator, device)))
-    points, free = near.points[chosen], _draw(len(data.free_points), options.free_points, generator, device)
+    chosen = _draw_some_at_detail(len(near.points), near.detailed, options.map_points, options, generator)
+    points = near.points[chosen]
+    free = _draw(len(data.free_points), options.free_points, generator, points.device)
     values = function.value(torch.cat((points, data.free_points[free])))
     surface = (values[: len(points)] - near.distances[chosen]).abs().mean() / data.size
     return surface, _free_space(values[len(points) :], data, free), points
@@ -219,12 +209,14 @@ def _free_space(values: Tensor, data: DepthSupervision, free: Tensor) -> Tensor:
     return total / max(len(free), 1) / data.size
 
 
-def _draw_rays(data: DepthSupervision, options: ReconstructionOptions, generator: torch.Generator) -> Tensor:
-    """Indices of the rays of one iteration: a share of those that end in instances' boxes, and any."""
-    device = data.free_points.device
-    count = int(options.detail_share * options.surface_rays) if len(data.detailed) else 0
-    detailed = data.detailed[_draw(len(data.detailed), count, generator, device)]
-    return torch.cat((detailed, _draw(len(data.rays), options.surface_rays - count, generator, device)))
+def _draw_some_at_detail(
+    pool: int, detailed: Tensor, count: int, options: ReconstructionOptions, generator: torch.Generator
+) -> Tensor:
+    """(count,) of ``pool`` numbers: a share of those that are ``detailed`` (D,), and any."""
+    device = detailed.device
+    few = int(options.detail_share * count) if len(detailed) else 0
+    chosen = detailed[_draw(len(detailed), few, generator, device)]
+    return torch.cat((chosen, _draw(pool, count - few, generator, device)))
 
 
 def _offsets(before: Tensor, behind: Tensor, noise: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -28,14 +28,22 @@ from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
-from regnf_fit.images.coloring import COLOR_INPUTS, DIRECTION_DEGREE, RadianceField, SurfaceColor, evaluate, fit_color
-from regnf_fit.images.fusion import MapDistances, ends_of, map_distances, measured_rays, sharp_width
-from regnf_fit.images.held_out_images import held_out_images, likeness
+from regnf_fit.images.coloring import (
+    COLOR_INPUTS,
+    DIRECTION_DEGREE,
+    RadianceField,
+    SurfaceColor,
+    evaluate,
+    fit_color,
+    held_out_images,
+    likeness,
+)
+from regnf_fit.images.fusion import map_distances, measured_rays, sharp_width
 from regnf_fit.images.observing import observe
-from regnf_fit.images.preparation import PreparedImages, cells_of, prepare
+from regnf_fit.images.preparation import PreparedImages, cells_of, ends_of, prepare
 from regnf_fit.images.trainer import Trainer
 from regnf_fit.local_frame import LocalFrame
-from regnf_fit.network import GRID_RADIUS, POSITION_DEGREE
+from regnf_fit.network import GRID_RADIUS, POSITION_DEGREE, arrays_of, layer_tensors
 from regnf_fit.options import OF_IMAGES, FitProgress, ReconstructionOptions, ReconstructionReport, grid_of_levels
 
 # How large a network images need: a grid as fine as their pixels, with an entry for each cell that shows surface.
@@ -46,11 +54,6 @@ from regnf_fit.options import OF_IMAGES, FitProgress, ReconstructionOptions, Rec
 _LEVELS = {512: 8, 1024: 9}
 """Of a grid with so many nodes along an edge: neighboring levels differ by a factor of about 1.65."""
 _LEAST_LOG2, _MOST_LOG2 = 15, 18
-
-
-def suited(options: ReconstructionOptions, prepared: PreparedImages) -> ReconstructionOptions:
-    """The options with the grid that these images ask for, where none was given."""
-    return replace(options, grid=grid_of(prepared, options.table_log2)) if options.grid is OF_IMAGES else options
 
 
 def grid_of(prepared: PreparedImages, table_log2: int | None = None) -> HashGridConfig:
@@ -85,14 +88,13 @@ def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
     """The state in ``path``. Raises InvalidInputError (CHECKPOINT_INVALID, CHECKPOINT_OF_ANOTHER_FIT)."""
     try:
         content = torch.load(path, weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
-        raise InvalidInputError(f"{path.name} is not a checkpoint of a fit", reason="CHECKPOINT_INVALID") from error
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError):
+        content = None
     if not isinstance(content, dict) or content.get("version") != _VERSION:
         raise InvalidInputError(f"{path.name} is not a checkpoint of a fit", reason="CHECKPOINT_INVALID")
     if content.get("key") != key:
-        raise InvalidInputError(
-            f"{path.name} belongs to a fit of other data or options", reason="CHECKPOINT_OF_ANOTHER_FIT"
-        )
+        message = f"{path.name} belongs to a fit of other data or options"
+        raise InvalidInputError(message, reason="CHECKPOINT_OF_ANOTHER_FIT")
     state: dict[str, Any] = content["state"]
     return state
 
@@ -107,19 +109,12 @@ def stored_color(field: RadianceField) -> tuple[dict[str, Any], dict[str, NDArra
 
     No activation stands between the geometry's feature and the color's first layer: they are one layer of the file.
     """
-    weights = [_double(weight) for weight in field.color_weights]
-    biases = [_double(bias) for bias in field.color_biases]
+    weights, biases = ([part.detach().double().cpu() for part in p] for p in (field.color_weights, field.color_biases))
     own, features = weights[0][:, :COLOR_INPUTS], weights[0][:, COLOR_INPUTS:]
-    weights[0] = np.concatenate((own, features @ _double(field.feature_weight)), axis=1)
-    biases[0] = biases[0] + features @ _double(field.feature_bias)
-    layers = {f"layers.{i}.weight": weight.astype(np.float32) for i, weight in enumerate(weights)}
-    layers |= {f"layers.{i}.bias": bias.astype(np.float32) for i, bias in enumerate(biases)}
-    return asdict(_FORM), color_tensors(layers)
-
-
-def _double(tensor: Tensor) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = tensor.detach().double().cpu().numpy()
-    return values
+    weights[0] = torch.cat((own, features @ field.feature_weight.detach().double().cpu()), dim=1)
+    biases[0] = biases[0] + features @ field.feature_bias.detach().double().cpu()
+    layers = {name: part.float() for name, part in layer_tensors(weights, biases).items()}
+    return asdict(_FORM), color_tensors(arrays_of(layers))
 
 
 # A fitted field in the layout of sdfstudio's neus-facto checkpoints, colors included.
@@ -135,18 +130,16 @@ def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path
     The distances are those of the field before its table is rounded to half precision. What the tensors do not say
     stands in ``config.yml`` beside it, as sdfstudio names it; a file of that name that is there already stays.
     """
-    layers = dict(enumerate(zip(field.weights, field.biases, strict=True)))
-    last = len(layers) - 1
     entries: dict[str, Tensor] = {"aabb": bounds.float(), "encoding.params": field.table.flatten()}
-    for i, (weight, bias) in layers.items():
-        if i == last:  # the feature's rows follow the distance's
-            weight, bias = torch.cat((weight, field.feature_weight)), torch.cat((bias, field.feature_bias))
-        entries |= _normalized(f"glin{i}", weight, bias)
-    colors = zip(field.color_weights, field.color_biases, strict=True)
-    for i, (weight, bias) in enumerate(colors):
-        if i == 0:
-            weight = torch.cat((weight, weight.new_zeros(len(weight), _EMBEDDING)), dim=1)
-        entries |= _normalized(f"clin{i}", weight, bias)
+    shape = [list(layer) for layer in zip(field.weights, field.biases, strict=True)]
+    color = [list(layer) for layer in zip(field.color_weights, field.color_biases, strict=True)]
+    # the feature's rows follow the distance's
+    shape[-1] = [torch.cat((shape[-1][0], field.feature_weight)), torch.cat((shape[-1][1], field.feature_bias))]
+    color[0][0] = torch.nn.functional.pad(color[0][0], (0, _EMBEDDING))
+    for name, layers in (("glin", shape), ("clin", color)):
+        for i, (weight, bias) in enumerate(layers):  # W = g v / |v|, row by row; here v = W
+            entries[f"{name}{i}.weight_g"] = weight.norm(dim=1, keepdim=True)
+            entries[f"{name}{i}.weight_v"], entries[f"{name}{i}.bias"] = weight, bias
     # sdfstudio keeps a tenth of the sharpness's logarithm; the density of VolSDF beside it is not used
     entries["deviation_network.variance"] = torch.tensor([math.log(sharpness) / 10.0])
     entries["laplace_density.beta"] = torch.tensor([0.1])
@@ -182,15 +175,6 @@ def _settings(field: RadianceField) -> dict[str, Any]:
         "use_position_encoding": True,
     }
     return {"method_name": "neus-facto", "pipeline": {"model": {"sdf_field": sdf_field}}}
-
-
-def _normalized(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:
-    """A layer with weight normalization: W = g v / |v|, row by row; here v = W."""
-    return {
-        f"{name}.weight_g": weight.norm(dim=1, keepdim=True),
-        f"{name}.weight_v": weight,
-        f"{name}.bias": bias,
-    }
 
 
 _REPORT_EVERY = 25
@@ -230,15 +214,23 @@ def reconstruct(
     """
     options = options or ReconstructionOptions()
     started = time.monotonic()
-    torch_device = pick_device(device)
+    if device not in ("auto", "cpu", "cuda"):
+        raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {device:.40}")
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    torch_device = usable_device(device)
     rng = np.random.default_rng(seed)
     key = _key(images, options, seed)
     check_bounds(images.bounds)
     frame = LocalFrame.in_grid(images.bounds, GRID_RADIUS)
     given, images = images, frame.enter(images)
     prepared = prepare(images, options.start, rng, given)
-    options = suited(options, prepared)
-    trainer = Trainer(prepared, options, seed, torch_device, rng, _near(images, prepared, options, rng))
+    if options.grid is OF_IMAGES:
+        options = replace(options, grid=grid_of(prepared, options.table_log2))
+    # in rooms whose poses are believed, the map that the depths fuse to tells distances; otherwise rays do
+    mapped = prepared.has_depth and prepared.start.hollow and not options.refine_poses
+    near = map_distances(images, prepared, rng) if mapped else None
+    trainer = Trainer(prepared, options, seed, torch_device, rng, near)
     observation = observe(images, options.observation_voxels, prepared.spread)
     write = _Writer(prepared.bounds, label, source or {}, observation, frame)
     if files.checkpoint is not None and files.checkpoint.exists():
@@ -251,14 +243,28 @@ def reconstruct(
         with torch.no_grad():
             held_out = trainer.poses.correct(held_out)
     chosen = held_out_images(len(images.colors))
-    color = _fit_color(trainer, prepared, chosen, seed)
-    _write_all(trainer, files, write, color)
+    color = None
+    if trainer.learns_color:  # of the finished geometry, without the images ``chosen``
+        rays = prepared.training
+        rays = rays.take(~torch.isin(rays.images, torch.tensor(chosen, dtype=rays.images.dtype))).to(torch_device)
+        with torch.no_grad():
+            rays = rays if trainer.poses is None else trainer.poses.correct(rays)
+        color = fit_color(trainer.averaged, rays, prepared.size, seed)
+    write(trainer, files.output, color)
+    if files.pictures:
+        _draw(trainer.averaged, write.bounds, files.output.with_suffix(".png"))
+    if files.sdfstudio is not None:
+        sharpness = float(trainer.sharpness().detach())
+        write_sdfstudio(trainer.averaged, write.bounds, sharpness, files.sdfstudio, frame)
+    if files.checkpoint is not None:
+        files.checkpoint.unlink(missing_ok=True)
     errors = evaluate(trainer.averaged, held_out, prepared.size)
     alike = None if color is None else likeness(trainer.averaged, color, images, chosen, prepared.size)
+    psnr, ssim = alike or (None, None)
     return ReconstructionReport(
         loss=loss,
-        psnr=None if alike is None else alike.psnr,
-        ssim=None if alike is None else alike.ssim,
+        psnr=psnr,
+        ssim=ssim,
         pose_shift=None if trainer.poses is None else trainer.poses.median_shift() / frame.scale,
         iterations=options.iterations,
         seconds=time.monotonic() - started,
@@ -267,48 +273,6 @@ def reconstruct(
         eikonal_error=errors.eikonal_error,
         warnings=prepared.warnings,
     )
-
-
-def _write_all(trainer: Trainer, files: FitFiles, write: _Writer, color: SurfaceColor | None) -> None:
-    """Write what the caller asked for. What the fit would have gone on from is no longer needed."""
-    write(trainer, files.output, color)
-    if files.pictures:
-        _draw(trainer.averaged, write.bounds, files.output.with_suffix(".png"))
-    if files.sdfstudio is not None:
-        sharpness = float(trainer.sharpness().detach())
-        write_sdfstudio(trainer.averaged, write.bounds, sharpness, files.sdfstudio, write.frame)
-    if files.checkpoint is not None:
-        files.checkpoint.unlink(missing_ok=True)
-
-
-def _near(
-    images: PosedImages, prepared: PreparedImages, options: ReconstructionOptions, rng: np.random.Generator
-) -> MapDistances | None:
-    """Distances of the map that the depths fuse to: in rooms whose poses are believed. Otherwise rays tell them."""
-    if not prepared.has_depth or not prepared.start.hollow or options.refine_poses:
-        return None
-    return map_distances(images, prepared, rng)
-
-
-def _fit_color(trainer: Trainer, prepared: PreparedImages, held_out: list[int], seed: int) -> SurfaceColor | None:
-    """The color of the finished geometry, without the images ``held_out``; None where no color is wanted or seen."""
-    if not trainer.learns_color:
-        return None
-    rays = prepared.training
-    rays = rays.take(~torch.isin(rays.images, torch.tensor(held_out, dtype=rays.images.dtype)))
-    rays = rays.to(trainer.field.table.device)
-    with torch.no_grad():
-        rays = rays if trainer.poses is None else trainer.poses.correct(rays)
-    return fit_color(trainer.averaged, rays, prepared.size, seed)
-
-
-def pick_device(name: str) -> torch.device:
-    """``auto``: an NVIDIA GPU where there is one. Raises InvalidOptionsError."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name not in ("cpu", "cuda"):
-        raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {name:.40}")
-    return usable_device(name)
 
 
 def _train(

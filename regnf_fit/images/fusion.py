@@ -13,19 +13,27 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.numpy import load_file
 from torch import Tensor
 
 from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
-from regnf_core.fields.observation import SdfField
 from regnf_core.schema.safe_format import read_description, write_safe_field
-from regnf_data.fusing import BlockGrid, DepthImages, Progress, fuse_blocks
+from regnf_data.fusing import BlockGrid, Progress, fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
 from regnf_fit.images.observing import attach_observation
-from regnf_fit.images.preparation import PixelRays, PreparedImages, cells_of, in_boxes, measured_within, prepare, uneven
+from regnf_fit.images.preparation import (
+    PixelRays,
+    PreparedImages,
+    cells_of,
+    ends_of,
+    in_boxes,
+    measured_within,
+    on_device,
+    prepare,
+    uneven,
+)
 from regnf_fit.local_frame import LocalFrame
 
 # The surface that depth images measured, and how wide their pixels are at it.
@@ -37,11 +45,6 @@ _SHARP = 0.25
 def measured_rays(prepared: PreparedImages) -> PixelRays:
     """The training rays whose depth lies within the bounds."""
     return prepared.training.take(measured_within(prepared.training))
-
-
-def ends_of(rays: PixelRays) -> Tensor:
-    """(R, 3), where rays with depths end."""
-    return rays.at(rays.depths[:, None])[:, 0]
 
 
 def sharp_width(prepared: PreparedImages, rays: PixelRays) -> float:
@@ -70,16 +73,17 @@ _GROWTH = 1.1
 
 
 @dataclass(frozen=True)
-class MapSize:
-    """voxel: from node to node, field units; None: as wide as a pixel of the sharper images is at its surface, or as
-    noise and many blocks allow · truncation: voxels; None: 4, or 6 standard deviations of the depths from image to
-    image."""
+class FusionOptions:
+    """How images are fused. voxel: from node to node, field units; None: as wide as a pixel of the sharper images is at
+    its surface, or as noise and many blocks allow · truncation: voxels; None: 4, or 6 standard deviations of the depths
+    from image to image · observation_voxels: along the longest side of the grid of what was observed."""
 
     voxel: float | None = None
     truncation: float | None = None
+    observation_voxels: int = 192
 
 
-def map_grid(prepared: PreparedImages, rays: PixelRays, size: MapSize) -> BlockGrid:
+def map_grid(prepared: PreparedImages, rays: PixelRays, size: FusionOptions) -> BlockGrid:
     """The voxels of a map. rays: those that were measured, at least one.
 
     Raises InvalidOptionsError for voxels that are too small for the surface that was measured.
@@ -103,32 +107,17 @@ def write_map(
     colors: whether the map has colors.
     """
     assert images.depths is not None
-    depths = _within(images, images.depths, grid.voxel * grid.truncation)
-    fused = DepthImages(depths, images.intrinsics, images.T_world_camera, images.colors if colors else None)
-    fuse_blocks(fused, grid, path, progress)
+    margin = grid.voxel * grid.truncation  # depths that end farther outside of the bounds are left out
+    low, high = images.bounds[0] - margin, images.bounds[1] + margin
+    ends = (images.ends(image) for image in range(len(images)))
+    within = np.stack([((places >= low) & (places <= high)).all(axis=-1) for places in ends])
+    depths = np.where(within & images.measured, images.depths, np.float32(0.0))
+    shown = images.colors if colors else None
+    fuse_blocks(depths, images.intrinsics, images.T_world_camera, grid, path, shown, progress)
     return replace(images, depths=depths)
 
 
-def _within(images: PosedImages, depths: NDArray[np.float32], margin: float) -> NDArray[np.float32]:
-    """The depths, 0 where they end farther than ``margin`` outside the bounds, or a mask says background."""
-    height, width = images.size
-    places = np.stack([*np.indices((height, width))[::-1] + 0.5, np.ones((height, width))], axis=-1)
-    low, high = images.bounds[0] - margin, images.bounds[1] + margin
-    kept = np.zeros_like(depths)
-    for number, (depth, K, pose) in enumerate(zip(depths, images.intrinsics, images.T_world_camera, strict=True)):
-        ends = (depth[..., None] * (places @ np.linalg.inv(K).T)) @ pose[:3, :3].T + pose[:3, 3]
-        kept[number] = np.where(((ends >= low) & (ends <= high)).all(axis=-1), depth, 0.0)
-    return kept if images.masks is None else np.where(images.masks, kept, np.float32(0.0))
-
-
 _CHECKED = 20_000
-
-
-@dataclass(frozen=True)
-class FusionOptions(MapSize):
-    """How images are fused. observation_voxels: along the longest side of the grid of what was observed."""
-
-    observation_voxels: int = 192
 
 
 @dataclass(frozen=True)
@@ -171,7 +160,8 @@ def fuse_images(
     try:
         fused = write_map(images, grid, rough, progress)
         attach_observation(rough, fused, options.observation_voxels, prepared.spread)  # ``fused`` is too little of them
-        error = _error(rough, rays)
+        chosen = torch.linspace(0, len(rays) - 1, min(len(rays), _CHECKED)).long()
+        error = float(open_field(rough).signed_distance(ends_of(rays.take(chosen))).abs().median())
         description = frame.leave({**read_description(rough), "label": label, "source": source or {}})
         write_safe_field(rough, description, load_file(rough))
         rough.replace(output)
@@ -185,12 +175,6 @@ def fuse_images(
         seconds=time.monotonic() - started,
         warnings=prepared.warnings,
     )
-
-
-def _error(path: Path, rays: PixelRays) -> float:
-    """Median distance of the map at points that were measured."""
-    chosen = torch.linspace(0, len(rays) - 1, min(len(rays), _CHECKED)).long()
-    return float(open_field(path).signed_distance(ends_of(rays.take(chosen))).abs().median())
 
 
 # Signed distances near the measured surface, from the map that all depths fuse to.
@@ -216,14 +200,14 @@ class MapDistances:
 
     def to(self, device: torch.device) -> MapDistances:
         """The same on another device."""
-        return MapDistances(self.points.to(device), self.distances.to(device), self.detailed.to(device))
+        return on_device(self, device)
 
 
 def map_distances(images: PosedImages, prepared: PreparedImages, rng: np.random.Generator) -> MapDistances:
     """Fuse ``images``, which have depths, without the pixels held out, and draw places near their surface."""
     assert images.depths is not None
     rays = measured_rays(prepared)
-    grid = map_grid(prepared, rays, MapSize())
+    grid = map_grid(prepared, rays, FusionOptions())
     depths = images.depths.copy()
     depths.reshape(-1)[prepared.held_out_pixels] = 0.0
     ends = ends_of(rays)
@@ -238,10 +222,7 @@ def map_distances(images: PosedImages, prepared: PreparedImages, rng: np.random.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.safetensors"
         write_map(replace(images, depths=depths), grid, path, colors=False)
-        distances = _distances(open_field(path), points)
+        field = open_field(path)
+        distances = torch.cat([field.signed_distance(part) for part in torch.split(points, _AT_ONCE)])
     near = distances.abs() < reach
     return MapDistances(points[near], distances[near], is_detailed[chosen[near]].nonzero()[:, 0])
-
-
-def _distances(field: SdfField, points: Tensor) -> Tensor:
-    return torch.cat([field.signed_distance(part) for part in torch.split(points, _AT_ONCE)])

@@ -31,7 +31,8 @@ Floats = NDArray[np.float64]
 _PAIRS, _SPREAD_PIXELS = 600, 500
 """Pairs of images that are drawn, and pixels of the first that are looked up in the second."""
 _SAME_SURFACE = 0.04
-"""Depths that differ by a larger share lie on different surfaces, as in depth_normals.py."""
+"""Depths that differ by a larger share lie on different surfaces: on one seen at 60 degrees a pixel of a common camera
+makes a hundredth."""
 _BINS, _LEAST_IN_BIN = 8, 200
 _MAD_TO_DEVIATION = 1.4826
 _REACH = 3.0
@@ -72,7 +73,14 @@ def depth_spread(images: PosedImages, cosines: NDArray[np.float32]) -> DepthSpre
     rng = np.random.default_rng(0)
     pairs = rng.integers(len(images), size=(_PAIRS, 2))
     found = [_differences(images, cosines, first, second, rng) for first, second in pairs if first != second]
-    return _by_depth(np.concatenate([depth for depth, _ in found]), np.concatenate([apart for _, apart in found]))
+    depths, apart = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    count = min(_BINS, len(depths) // _LEAST_IN_BIN)
+    if count == 0:
+        return NO_SPREAD
+    bins = np.array_split(np.argsort(depths), count)
+    # the difference of two images' depths has sqrt(2) times the deviation of one's
+    deviations = [_deviation(apart[part]) / sqrt(2.0) for part in bins]
+    return DepthSpread(np.array([np.median(depths[part]) for part in bins]), np.array(deviations))
 
 
 def _differences(
@@ -85,10 +93,8 @@ def _differences(
     pixels = rng.integers(height * width, size=_SPREAD_PIXELS)
     depth = images.depths[first].reshape(-1)[pixels].astype(np.float64)
     row, column = np.divmod(pixels, width)
-    rays = (
-        np.stack([column + 0.5, row + 0.5, np.ones(_SPREAD_PIXELS)], axis=-1)
-        @ np.linalg.inv(images.intrinsics[first]).T
-    )
+    pixels = np.stack([column + 0.5, row + 0.5, np.ones(_SPREAD_PIXELS)], axis=-1)
+    rays = pixels @ np.linalg.inv(images.intrinsics[first]).T
     T = np.linalg.inv(images.T_world_camera[second]) @ images.T_world_camera[first]
     seen = (rays * depth[:, None])[depth > 0.0] @ T[:3, :3].T + T[:3, 3]
     seen = seen[seen[:, 2] > 0.0]
@@ -105,16 +111,6 @@ def _differences(
     return ((seen[:, 2] + measured) / 2.0)[same], apart[same]
 
 
-def _by_depth(depths: Floats, apart: Floats) -> DepthSpread:
-    """The deviation of one image's depths: the difference of two has sqrt(2) times as much."""
-    count = min(_BINS, len(depths) // _LEAST_IN_BIN)
-    if count == 0:
-        return NO_SPREAD
-    parts = np.array_split(np.argsort(depths), count)
-    deviations = [_deviation(apart[part]) / sqrt(2.0) for part in parts]
-    return DepthSpread(np.array([np.median(depths[part]) for part in parts]), np.array(deviations))
-
-
 def _deviation(values: Floats) -> float:
     """The standard deviation of most of the values, whatever the others are."""
     size = np.abs(values)
@@ -128,8 +124,6 @@ def _deviation(values: Floats) -> float:
 
 _NORMAL_REACH = 2
 """Pixels on either side: a window of 5 x 5 is wide enough to average a sensor's noise."""
-"""Depths that differ by a larger share lie on different surfaces: on one seen at 60 degrees a pixel of a common camera
-makes a hundredth."""
 _MIN_PIXELS = 8
 _STEEPEST_NORMAL = 0.1
 _DEPTH_BINS = 20
@@ -156,32 +150,24 @@ def local_planes(depths: NDArray[np.float32], intrinsics: Floats) -> LocalPlanes
     for image, (depth, camera) in enumerate(zip(depths, intrinsics, strict=True)):
         planes = pixel_planes(depth, camera)
         cosines[image], left_over[image] = planes.cosines, planes.deviations
-    return LocalPlanes(cosines, _normals_by_depth(depths, left_over, cosines > 0.0))
-
-
-def _normals_by_depth(
-    depths: NDArray[np.float32], left_over: NDArray[np.float32], known: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """The median of ``left_over`` (N, H, W) as a function of the depth, at every pixel."""
+    known = cosines > 0.0
     if not known.any():
-        return np.zeros_like(depths)
+        return LocalPlanes(cosines, np.zeros_like(depths))
     z, noise = depths[known], left_over[known]
     edges = np.quantile(z, np.linspace(0.0, 1.0, _DEPTH_BINS + 1))
     bins = np.clip(np.searchsorted(edges, z, side="right") - 1, 0, _DEPTH_BINS - 1)
     filled = [i for i in range(_DEPTH_BINS) if (bins == i).any()]
     middles = [float(np.median(z[bins == i])) for i in filled]
     medians = [float(np.median(noise[bins == i])) for i in filled]
-    return np.interp(depths, middles, medians).astype(np.float32)
+    return LocalPlanes(cosines, np.interp(depths, middles, medians).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class PixelPlanes:
-    """Of one image. known: (H, W), where a plane could be laid; elsewhere the others mean nothing · depth: (H, W), the
-    plane's at the pixel, its noise averaged · normals: (H, W, 3), unit, camera frame, towards the camera · cosines,
-    deviations: (H, W), see LocalPlanes."""
+    """Of one image. known: (H, W), where a plane could be laid; elsewhere the others mean nothing · normals: (H, W, 3),
+    unit, camera frame, towards the camera · cosines, deviations: (H, W), see LocalPlanes."""
 
     known: NDArray[np.bool_]
-    depth: NDArray[np.float32]
     normals: NDArray[np.float32]
     cosines: NDArray[np.float32]
     deviations: NDArray[np.float32]
@@ -212,10 +198,8 @@ def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
     variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
     deviation = np.where(known, np.sqrt(variance) * depth.astype(np.float64) ** 2, 0.0)
     cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
-    smooth = np.divide(1.0, here, out=depth.astype(np.float64), where=known & (here > 0.0))
     normals = -normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    kept = (smooth, normals, cosine, deviation)
-    return PixelPlanes(known, *(each.astype(np.float32) for each in kept))
+    return PixelPlanes(known, *(each.astype(np.float32) for each in (normals, cosine, deviation)))
 
 
 def _moments(x: Floats, y: Floats, inverse: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats]:
@@ -265,7 +249,8 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
     if images.depths is None or voxels == 0:
         return None
     low, high = torch.from_numpy(images.bounds)
-    voxel = max(float((high - low).max()) / voxels, _PIXELS * _pixel_width(images))
+    widths = (images.depths / images.intrinsics[:, 0, 0, None, None])[images.depths > 0.0]  # of pixels where depths end
+    voxel = max(float((high - low).max()) / voxels, _PIXELS * float(np.median(widths)) if widths.size else 0.0)
     counts = [int(n) for n in ((high - low) / voxel - 1e-9).ceil().clamp_min(1)]
     states = torch.full(counts, UNSEEN, dtype=torch.uint8).view(-1)
     axes = [low[k] + (torch.arange(counts[k], dtype=torch.float64) + 0.5) * voxel for k in range(3)]
@@ -278,18 +263,12 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
             free = _looked_through(centers[part], images, image, clear)
             states[part[free]] = FREE
             left[number] = part[~free]
-    ends = torch.cat([_ends(images, image) for image in range(len(images))])
+    measured = images.measured
+    ends = torch.from_numpy(np.concatenate([images.ends(image)[measured[image]] for image in range(len(images))]))
     cells = ((ends - low) / voxel).floor().long()
     x, y, z = cells[((cells >= 0) & (cells < torch.tensor(counts))).all(-1)].unbind(-1)
     states.view(counts)[x, y, z] = SURFACE
     return Observation(states.view(counts), low, voxel)
-
-
-def _pixel_width(images: PosedImages) -> float:
-    """The median width of a pixel where its depth ends; 0 where none does."""
-    assert images.depths is not None
-    widths = (images.depths / images.intrinsics[:, 0, 0, None, None])[images.depths > 0.0]
-    return float(np.median(widths)) if widths.size else 0.0
 
 
 def _clear_depths(images: PosedImages, image: int, margins: NDArray[np.float32]) -> Tensor:
@@ -322,17 +301,6 @@ def _looked_through(centers: Tensor, images: PosedImages, image: int, clear: Ten
     return torch.zeros_like(shown).index_put((at,), free)
 
 
-def _ends(images: PosedImages, image: int) -> Tensor:
-    """(M, 3) float64 where one image's depths end, world frame; the background's are none."""
-    assert images.depths is not None
-    depths: NDArray[np.float32] = images.depths[image]
-    row, column = np.nonzero(depths > 0.0 if images.masks is None else (depths > 0.0) & images.masks[image])
-    z = depths[row, column].astype(np.float64)
-    rays = np.stack([column + 0.5, row + 0.5, np.ones_like(z)], -1) @ np.linalg.inv(images.intrinsics[image]).T
-    T = images.T_world_camera[image]
-    return torch.from_numpy((rays * z[:, None]) @ T[:3, :3].T + T[:3, 3])
-
-
 def attach_observation(
     path: Path, images: PosedImages, voxels: int = 192, spread: DepthSpread | None = None
 ) -> Observation:
@@ -346,9 +314,8 @@ def attach_observation(
         spread = depth_spread(images, local_planes(images.depths, images.intrinsics).cosines)
     spread = spread or NO_SPREAD
     seen = observe(images, voxels, spread)
-    if seen is None:
+    if seen is None or images.depths is None:
         raise DatasetError("an observation needs depths, and there are none", reason="DATASET_DEPTH_MISSING")
-    assert images.depths is not None
     measured = images.depths[images.depths > 0.0]
     _check_frame(open_field(path), seen, _SPREADS * spread.median(measured) if len(measured) else 0.0)
     description = read_description(path)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -13,11 +13,13 @@ from torch import Tensor
 
 from regnf_core.geometry.box import OrientedBox, ray_box_interval
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.agreement import check_agreement
-from regnf_fit.images.checks import check_images, check_seen
+from regnf_fit.images.checks import check_agreement, check_images, check_seen
 from regnf_fit.images.observing import NO_SPREAD, DepthSpread, LocalPlanes, depth_spread, local_planes
 from regnf_fit.network import StartShape
 from regnf_fit.options import Start
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 # Cubic cells of space, and which points lie in which.
 
@@ -84,6 +86,14 @@ def uneven(points: Tensor, deviations: Tensor, size: float) -> Tensor:
 
 # Rays through the pixels of posed images.
 
+Tensors = TypeVar("Tensors", bound="DataclassInstance")
+
+
+def on_device(parts: Tensors, device: torch.device) -> Tensors:
+    """The same with all tensors that it has on another device."""
+    moved = {each.name: getattr(parts, each.name) for each in fields(parts)}
+    return replace(parts, **{name: part.to(device) for name, part in moved.items() if hasattr(part, "to")})
+
 
 @dataclass(frozen=True)
 class PixelRays:
@@ -116,11 +126,16 @@ class PixelRays:
 
     def to(self, device: torch.device) -> PixelRays:
         """The same rays on another device."""
-        return PixelRays(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return on_device(self, device)
 
     def at(self, depths: Tensor) -> Tensor:
         """Points (R, S, 3) at depths (R, S)."""
         return self.origins[:, None] + depths[..., None] * self.directions[:, None]
+
+
+def ends_of(rays: PixelRays) -> Tensor:
+    """(R, 3), where rays with depths end."""
+    return rays.at(rays.depths[:, None])[:, 0]
 
 
 def measured_within(rays: PixelRays) -> Tensor:
@@ -135,12 +150,8 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
     planes: of the images' depths.
     """
     image, row, column = np.unravel_index(pixels, images.colors.shape[:3])
-    centers = np.stack([column + 0.5, row + 0.5, np.ones(len(pixels))], axis=-1)
-    T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
-    directions = np.einsum("rij,rj->ri", T_world_pixel[image], centers)
-    origins = images.T_world_camera[image, :3, 3]
-    bounds = torch.from_numpy(images.bounds)
-    near, far = ray_box_interval(torch.from_numpy(origins), torch.from_numpy(directions), bounds[0], bounds[1])
+    origins, directions = (torch.from_numpy(part) for part in images.rays(image, row, column))
+    near, far = ray_box_interval(origins, directions, *torch.from_numpy(images.bounds))
 
     def picked(values: NDArray[np.generic] | None) -> Tensor:
         if values is None:
@@ -148,8 +159,8 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
         return torch.from_numpy(values[image, row, column]).float()
 
     return PixelRays(
-        origins=torch.from_numpy(origins).float(),
-        directions=torch.from_numpy(directions).float(),
+        origins=origins.float(),
+        directions=directions.float(),
         near=near.float(),
         far=far.float(),
         colors=picked(images.colors) / 255.0 if len(pixels) else torch.zeros(0, 3),
@@ -159,12 +170,6 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
         deviations=picked(None if planes is None else planes.deviations),
         images=torch.from_numpy(image),
     )
-
-
-def pixel_axes(images: PosedImages) -> Tensor:
-    """(N, 2, 3) float32: by what a ray's direction changes to the pixel right of its own, and to the one below it."""
-    T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
-    return torch.from_numpy(T_world_pixel[:, :, :2].transpose(0, 2, 1).copy()).float()
 
 
 # The shape that a field starts from: a ball of matter in free space, or a hollow ball in matter.
@@ -200,7 +205,7 @@ def faces_middle(measured: PixelRays, center: Tensor, size: float) -> bool:
     convex thing seen from outside has a positive sum, a room seen from inside a negative one. size: the bounds'
     diagonal, field units.
     """
-    ends = measured.at(measured.depths[:, None])[:, 0]
+    ends = ends_of(measured)
     cells = cells_of(ends, _CELL * size)
     towards_camera = cells.means(-torch.nn.functional.normalize(measured.directions, dim=1))
     return bool((towards_camera * (cells.means(ends) - center)).sum() < 0.0)

@@ -33,35 +33,27 @@ from regnf_fit.options import ReconstructionOptions
 # the frame is that of all the given poses: that of one image would have the errors of that image.
 
 
-@dataclass(frozen=True)
-class PoseErrors:
-    """Standard deviations that are expected of the given poses. shift: field units · turn: radians."""
-
-    shift: float
-    turn: float
-
-
-def expected_errors(spread: DepthSpread, size: float) -> PoseErrors:
-    """Those that would make depths of one surface contradict each other as much as they do, each by itself.
+def expected_errors(spread: DepthSpread, size: float) -> tuple[float, float]:
+    """Standard deviations of the given poses' turns, radians, and shifts, field units: those that would make depths of
+    one surface contradict each other as much as they do, each by itself.
 
     size: of the bounds' diagonal; where the spread is not known, a thousandth of it.
     """
     if len(spread.depths) == 0:
-        return PoseErrors(1e-3 * size, 1e-3)
+        return 1e-3, 1e-3 * size
     shift = float(np.median(spread.deviations))
-    return PoseErrors(shift, shift / float(np.median(spread.depths)))
+    return shift / float(np.median(spread.depths)), shift
 
 
 class CameraPoses(nn.Module):
-    """A correction for each of N images."""
+    """A correction for each of N images. turn, shift: as of :func:`expected_errors`."""
 
-    def __init__(self, images: int, errors: PoseErrors) -> None:
+    def __init__(self, images: int, turn: float, shift: float) -> None:
         super().__init__()
         self.steps = nn.Parameter(torch.zeros(images, 6))
         """Rotation vectors and shifts (N, 6) in world axes, in the deviations that are expected. Their mean does not
         count."""
-        unit = torch.tensor([errors.turn] * 3 + [errors.shift] * 3, dtype=torch.float32)
-        self.register_buffer("unit", unit)
+        self.register_buffer("unit", torch.tensor([turn] * 3 + [shift] * 3, dtype=torch.float32))
 
     def corrections(self) -> tuple[Tensor, Tensor]:
         """Rotations (N, 3, 3) about the cameras and their shifts (N, 3), world axes."""
@@ -78,10 +70,6 @@ class CameraPoses(nn.Module):
     def median_shift(self) -> float:
         """Of all cameras, field units."""
         return float(self.corrections()[1].norm(dim=1).median())
-
-    def prior(self) -> Tensor:
-        """Mean square of the corrections in the deviations that are expected."""
-        return self.steps.square().mean()
 
     @torch.no_grad()
     def corrected(self, images: PosedImages) -> PosedImages:
@@ -251,11 +239,10 @@ class Trainer:
         networks = [*field.weights, *field.biases, *field.color_weights, *field.color_biases]
         networks += [field.feature_weight, field.feature_bias, field.background]
         sharpness = {"params": [field.log_sharpness], "lr": _SHARPNESS_RATE * options.network_rate}
-        self.optimizer = make_optimizer(field.table, networks, options, sharpness)
+        self.optimizer = make_optimizer(field.table, networks, options.table_rate, options.network_rate, sharpness)
         self.poses: CameraPoses | None = None
         if options.refine_poses and prepared.has_depth:
-            errors = expected_errors(prepared.spread, prepared.size)
-            self.poses = CameraPoses(prepared.images, errors).to(device)
+            self.poses = CameraPoses(prepared.images, *expected_errors(prepared.spread, prepared.size)).to(device)
             self.optimizer.add_param_group({"params": [self.poses.steps], "lr": options.pose_rate})
         self._rates = [group["lr"] for group in self.optimizer.param_groups]
 
@@ -281,7 +268,10 @@ class Trainer:
         loss = self._loss()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        self._hold_back_fine_levels()
+        # Coarse to fine, as Li et al. (2023, "Neuralangelo"): a level that does not learn yet stays next to zero.
+        levels = self.options.learning_levels(self.iteration)
+        if self.field.table.grad is not None and levels < len(self._level_ends):
+            self.field.table.grad[self._level_ends[levels - 1] :] = 0.0
         self.optimizer.step()
         with torch.no_grad():
             self.field.log_sharpness.clamp_(0.0, math.log(_SHARPEST))
@@ -290,12 +280,6 @@ class Trainer:
                 average.lerp_(parameter, 1.0 - keep)
         self.iteration += 1
         self._losses.append(loss.detach())
-
-    def _hold_back_fine_levels(self) -> None:
-        """Coarse to fine, as Li et al. (2023, "Neuralangelo"): a level that does not learn yet stays next to zero."""
-        levels = self.options.learning_levels(self.iteration)
-        if self.field.table.grad is not None and levels < len(self._level_ends):
-            self.field.table.grad[self._level_ends[levels - 1] :] = 0.0
 
     def sharpness(self) -> Tensor:
         """The opacity's sharpness now, per field unit."""
@@ -313,7 +297,7 @@ class Trainer:
         of_surface = of_surface if self._data.near is None else weights.map
         loss = of_surface * surface + weights.free_space * free_space
         if (poses := self._learning_poses()) is not None:
-            loss = loss + weights.poses * poses.prior()
+            loss = loss + weights.poses * poses.steps.square().mean()
         loss = loss + weights.eikonal * self._eikonal(function, near)
         if self.options.color_rays > 0 and (self.poses is not None or self.iteration % _COLOR_EVERY == 0):
             loss = loss + self._color(self._data)
@@ -365,23 +349,18 @@ class Trainer:
             loss = loss + weights.opacity * torch.nn.functional.binary_cross_entropy(opacity, wanted)
         return loss, rays.at(rendered.depths.detach()[:, None])[:, 0]
 
+    def _parts(self) -> dict[str, Any]:
+        parts = {"field": self.field, "averaged": self.averaged, "optimizer": self.optimizer}
+        return parts if self.poses is None else {**parts, "poses": self.poses}
+
     def state(self) -> dict[str, Any]:
         """Everything that the next iteration depends on."""
-        return {
-            "iteration": self.iteration,
-            "field": self.field.state_dict(),
-            "averaged": self.averaged.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            **({} if self.poses is None else {"poses": self.poses.state_dict()}),
-        }
+        parts = {name: part.state_dict() for name, part in self._parts().items()}
+        return {"iteration": self.iteration, "generator": self.generator.get_state(), **parts}
 
     def resume(self, state: dict[str, Any]) -> None:
         """Go on from a :meth:`state`."""
         self.iteration = state["iteration"]
-        self.field.load_state_dict(state["field"])
-        self.averaged.load_state_dict(state["averaged"])
-        self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
-        if self.poses is not None:
-            self.poses.load_state_dict(state["poses"])
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])

@@ -6,7 +6,7 @@ import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +28,7 @@ from regnf_fit.options import FitOptions, FitProgress, FitReport
 # A mesh file as the target of a fit.
 
 
-@dataclass(frozen=True)
-class MeshTarget:
+class MeshTarget(NamedTuple):
     """field: the mesh, scaled if that was asked for · source: where it came from, as the fitted field records it."""
 
     field: MeshField
@@ -66,11 +65,9 @@ class ExactSamples:
     distances: Tensor
     gradients: Tensor
 
-    def __len__(self) -> int:
-        return self.points.shape[0]
-
-    def take(self, index: Tensor) -> ExactSamples:
-        """The samples at ``index`` (M,)."""
+    def drawn(self, count: int, generator: torch.Generator) -> ExactSamples:
+        """Some of them, any as often as another."""
+        index = torch.randint(len(self.points), (count,), generator=generator)
         return ExactSamples(self.points[index], self.distances[index], self.gradients[index])
 
 
@@ -198,7 +195,8 @@ def _train(
     generator = torch.Generator().manual_seed(seed)
     size = diagonal(target)
     network = TrainableField(options, StartShape(torch.zeros(3), radius=size / 4.0), generator)
-    optimizer = make_optimizer(network.table, [*network.weights, *network.biases], options)
+    networks = [*network.weights, *network.biases]
+    optimizer = make_optimizer(network.table, networks, options.table_rate, options.network_rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, options.rate_share)
     started = time.monotonic()
     for iteration in range(1, options.iterations + 1):
@@ -224,17 +222,13 @@ def _loss(
     """Mean |distance error| in diagonals, plus the weighted squared error of the gradient near the surface."""
     function = network.function()
     from_volume = options.batch // 3
-    close = _draw(near, options.batch - from_volume, generator)
-    far = _draw(volume, from_volume, generator)
+    close = near.drawn(options.batch - from_volume, generator)
+    far = volume.drawn(from_volume, generator)
     values = function.value(torch.cat((close.points, far.points)))
     loss = (values - torch.cat((close.distances, far.distances))).abs().mean() / size
     if options.gradient_batch > 0:
-        slopes = _draw(near, options.gradient_batch, generator)
+        slopes = near.drawn(options.gradient_batch, generator)
         distance, gradient = function.value_and_gradient(slopes.points)
         loss = loss + (distance - slopes.distances).abs().mean() / size
         loss = loss + options.gradient_weight * (gradient - slopes.gradients).square().sum(dim=-1).mean()
     return loss
-
-
-def _draw(samples: ExactSamples, count: int, generator: torch.Generator) -> ExactSamples:
-    return samples.take(torch.randint(len(samples), (count,), generator=generator))

@@ -204,7 +204,6 @@ def _text(record: JobRecord | FieldRecord, **beside: str) -> bytes:
 
 
 def _as_record(kind: type[_Record], name: str, text: bytes) -> _Record:
-    """The record of a document. Raises UnreadableRecordError."""
     try:
         document = json.loads(text)
     except ValueError as error:
@@ -221,7 +220,6 @@ def _as_record(kind: type[_Record], name: str, text: bytes) -> _Record:
 
 STORAGE_KEY = f"{PREFIX}storage"
 GENERATION_KEY = f"{PREFIX}generation"
-_READING = "reading"
 
 
 class StorageMismatchError(RuntimeError):
@@ -235,13 +233,10 @@ def claim_storage(redis: Redis, storage_id: str, adopt: str | None = None) -> No
 
     ``adopt``: what the operator says: the id of the storage that shall have this Redis from now on.
     """
-    known = _known(redis)
-    if known is None:
-        redis.set(STORAGE_KEY, storage_id, nx=True)
-        known = _known(redis)
+    redis.set(STORAGE_KEY, storage_id, nx=True)
+    noted: Any = redis.get(STORAGE_KEY)
+    known = text(noted) if noted is not None else storage_id
     if known == storage_id:
-        if redis.get(STORAGE_KEY) is None:
-            redis.set(STORAGE_KEY, storage_id, nx=True)
         return
     if adopt == storage_id:
         redis.set(STORAGE_KEY, storage_id)
@@ -253,9 +248,3 @@ def claim_storage(redis: Redis, storage_id: str, adopt: str | None = None) -> No
         "REGNF_REDIS_URL, REGNF_STORAGE_URL and REGNF_STATE_DIR: every process of a service needs the same. If this "
         f"storage shall have this Redis, start once with REGNF_ADOPT_STORAGE={storage_id}"
     )
-
-
-def _known(redis: Redis) -> str | None:
-    """Whose Redis it is."""
-    noted: Any = redis.get(STORAGE_KEY)
-    return None if noted is None else text(noted)

@@ -10,26 +10,16 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from typing import Any, TypeVar
 from uuid import uuid4
 
 from redis import Redis
 
-from regnf_core.library_entries import EntryNotes
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journal import GENERATION_KEY, Journal, claim_storage
-from regnf_state.records import (
-    FINISHED,
-    NO_QUOTA,
-    FieldRecord,
-    JobNews,
-    JobRecord,
-    Quota,
-    RecordError,
-    UnreadableRecordError,
-)
+from regnf_state.records import NO_QUOTA, FieldRecord, JobNews, JobRecord, Quota, RecordError, UnreadableRecordError
 from regnf_state.redis.documents import Kind, text
 from regnf_state.redis.jobs import JOB, RecordStore
 from regnf_state.redis.queue import JobQueue
@@ -78,6 +68,8 @@ class Generation:
 
 
 _USED = f"{PREFIX}fields:used"
+_Found = TypeVar("_Found")
+Recall = Callable[[str], object]
 logger = logging.getLogger(__name__)
 
 
@@ -123,29 +115,27 @@ class JournaledRecordStore(RecordStore):
         self.journal.join([job for job, created in taken if job.more_webhooks and not created])
         return answers
 
+    def _found(self, ask: Callable[[], _Found], missing: Callable[[_Found], list[str]], recall: Recall) -> _Found:
+        """What ``ask`` finds, asked again once what is ``missing`` is rebuilt, if Redis has lost it."""
+        found = ask()
+        lost = missing(found)
+        if not lost or self.generation.is_current():
+            return found
+        for name in lost:
+            recall(name)
+        return ask()
+
     def get_job(self, job_id: str) -> JobRecord | None:
-        found = super().get_job(job_id)
-        if found is None and not self.generation.is_current():
-            self.recall_job(job_id)
-            found = super().get_job(job_id)
-        return found
+        ask = partial(super().get_job, job_id)
+        return self._found(ask, lambda job: [job_id] if job is None else [], self.recall_job)
 
     def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
-        found = super().get_jobs(job_ids)
-        missing = [name for name, job in zip(job_ids, found, strict=True) if job is None]
-        if not missing or self.generation.is_current():
-            return found
-        for name in missing:
-            self.recall_job(name)
-        return super().get_jobs(job_ids)
+        ask = partial(super().get_jobs, job_ids)
+        return self._found(ask, partial(_missing, job_ids), self.recall_job)
 
     def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
-        found = super().news(positions)
-        if all(one.record is not None for one in found) or self.generation.is_current():
-            return found
-        for job_id, _ in positions:
-            self.get_job(job_id)  # recalls the jobs that Redis has lost
-        return super().news(positions)
+        ids, ask = [job_id for job_id, _ in positions], partial(super().news, positions)
+        return self._found(ask, lambda news: _missing(ids, [one.record for one in news]), self.recall_job)
 
     def recall_job(self, job_id: str) -> JobRecord | None:
         """Rebuild a lost record. The job as it continues; None when there was nothing to rebuild."""
@@ -162,16 +152,10 @@ class JournaledRecordStore(RecordStore):
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
         if changes.get("status") == "running" and attempt > 1:
             self.journal.begin(job_id, attempt)
-        job = super().update_job(job_id, attempt, **changes)
-        if changes.get("status") in FINISHED:
-            _if_possible(f"the end of job {job_id}", lambda: self.journal.end(job))
-        return job
+        return super().update_job(job_id, attempt, **changes)
 
-    def request_cancel(self, job_id: str) -> JobRecord | None:
-        job = super().request_cancel(job_id)
-        if job is not None and job.status == "dismissed":
-            _if_possible(f"the end of job {job_id}", lambda: self.journal.end(job))
-        return job
+    def _note_end(self, job: JobRecord) -> None:
+        _if_possible(f"the end of job {job.id}", lambda: self.journal.end(job))
 
     def delete_job(self, job_id: str) -> bool:
         deleted = super().delete_job(job_id)
@@ -203,56 +187,33 @@ class JournaledRecordStore(RecordStore):
         return [float(score) for score in answers[1::2]]
 
     def get_field(self, sha256: str) -> FieldRecord | None:
-        found = super().get_field(sha256)
-        if found is None and not self.generation.is_current():
-            self.recall_field(sha256)
-            found = super().get_field(sha256)
-        return found
+        ask = partial(super().get_field, sha256)
+        return self._found(ask, lambda field: [sha256] if field is None else [], self.recall_field)
 
     def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
-        found = super().get_fields(references)
-        missing = [name for name, field in zip(references, found, strict=True) if field is None]
-        if not missing or self.generation.is_current():
-            return found
-        for name in missing:
-            self.recall_field(name)
-        return super().get_fields(references)
+        ask = partial(super().get_fields, references)
+        return self._found(ask, partial(_missing, references), self.recall_field)
 
     def recall_field(self, sha256: str) -> FieldRecord | None:
         """Rebuild a lost record. The field as it continues; None when there was nothing to rebuild."""
         field = self.journal.recall_field(sha256)
         return field if field is not None and self.restore_field(field) else None
 
-    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
-        field = super().update_field(sha256, attempt=attempt, **changes)
-        _if_possible(f"what became of field {sha256}", lambda: self.journal.keep_field(field))
-        return field
-
-    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
-        field = super().retry_import(sha256, attempt, lost=lost)
-        _if_possible(f"what became of field {sha256}", lambda: self.journal.keep_field(field))
-        return field
-
-    def reimport_field(self, known: FieldRecord, description: dict[str, Any], label: str | None) -> FieldRecord:
-        field = super().reimport_field(known, description, label)
-        self.journal.keep_field(field)
-        return field
-
-    def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
-        field = super().undo_reimport(before, attempt)
-        self.journal.keep_field(field)
-        return field
-
-    def set_entry(self, known: FieldRecord, notes: EntryNotes | None) -> FieldRecord:
-        field = super().set_entry(known, notes)
-        self.journal.keep_field(field)
-        return field
+    def _note_field(self, field: FieldRecord, must_last: bool) -> None:
+        if must_last:
+            self.journal.keep_field(field)
+        else:
+            _if_possible(f"what became of field {field.sha256}", lambda: self.journal.keep_field(field))
 
     def delete_field(self, sha256: str) -> bool:
         deleted = super().delete_field(sha256)
         self._redis.zrem(_USED, sha256)
         self.journal.forget_field(sha256)
         return deleted
+
+
+def _missing(names: Sequence[str], found: Sequence[object]) -> list[str]:
+    return [name for name, record in zip(names, found, strict=True) if record is None]
 
 
 def _if_possible(what: str, write: Callable[[], None]) -> None:
@@ -332,7 +293,6 @@ class Rebuilder:
 
 
 def _in_pages(names: Iterable[str], recall: Callable[[str], _Record | None]) -> Iterator[_Record]:
-    """What ``recall`` finds for each name, a page of names at a time, several at once."""
     left = iter(names)
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         while page := list(islice(left, _PAGE)):

@@ -6,11 +6,11 @@ Workers have the plain client: they wait for Redis, whose restart a job outlives
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 from redis import Redis
@@ -33,14 +33,6 @@ class CircuitOpenError(RedisConnectionError):
     """Redis did not answer a moment ago, and is not asked now."""
 
 
-@dataclass(frozen=True)
-class Call:
-    """One call that was let through."""
-
-    began: float
-    is_probe: bool
-
-
 class CircuitBreaker:
     """Closed: calls go through. Open: one call in ``probe_every_s`` goes through. For any number of threads."""
 
@@ -50,58 +42,46 @@ class CircuitBreaker:
         self._lock = threading.Lock()
         self._answered_at = clock()
         self._probe_at: float | None = None
-        self._probing = False
+        """Open since a call got no answer: when the next may try; infinite while one does."""
 
     @property
     def is_open(self) -> bool:
         return self._probe_at is not None
 
     @contextmanager
-    def call(self) -> Iterator[Call]:
-        """A call of the server. Raises CircuitOpenError in its place while the circuit is open."""
-        call = self._begin()
+    def call(self) -> Iterator[bool]:
+        """A call of the server, and whether it is a probe. Raises CircuitOpenError while the circuit is open."""
+        with self._lock:
+            began, is_probe = self._clock(), self._probe_at is not None
+            if self._probe_at is not None and began < self._probe_at:
+                raise CircuitOpenError("Redis does not answer")
+            self._probe_at = math.inf if is_probe else None
         try:
-            yield call
+            yield is_probe
         except (RedisConnectionError, RedisTimeoutError):
-            self._failed(call)
+            self._failed(began, is_probe)
             raise
-        except BaseException:
-            self._ended(call)
+        except BaseException:  # tells nothing of the server's state but that it was refused
+            if is_probe:
+                self._answered()
             raise
         self._answered()
-
-    def _begin(self) -> Call:
-        with self._lock:
-            now = self._clock()
-            if self._probe_at is None:
-                return Call(now, is_probe=False)
-            if self._probing or now < self._probe_at:
-                raise CircuitOpenError("Redis does not answer")
-            self._probing = True
-            return Call(now, is_probe=True)
 
     def _answered(self) -> None:
         with self._lock:
             self._answered_at = self._clock()
-            was_open, self._probe_at, self._probing = self.is_open, None, False
+            was_open, self._probe_at = self.is_open, None
         if was_open:
             logger.warning("Redis answers again")
 
-    def _failed(self, call: Call) -> None:
+    def _failed(self, began: float, is_probe: bool) -> None:
         """A call got no answer. Where others got theirs meanwhile, it was slow, and Redis is there."""
         with self._lock:
-            opens = self._answered_at <= call.began and not self.is_open
-            if opens or call.is_probe:
+            opens = self._answered_at <= began and not self.is_open
+            if opens or is_probe:
                 self._probe_at = self._clock() + self._probe_every_s
-            if call.is_probe:
-                self._probing = False
         if opens:
             logger.warning("Redis does not answer: calls fail at once until it does")
-
-    def _ended(self, call: Call) -> None:
-        """A call ended for a reason that tells nothing of the server's state but that it was refused."""
-        if call.is_probe:
-            self._answered()
 
 
 CALL_S = 4.0
@@ -140,9 +120,8 @@ class _RetryInTime(Retry):
                 time.sleep(pause)
 
 
-def _set_deadline(call: Call) -> None:
-    """Of what the calling thread does next. A probe is one attempt."""
-    _running.deadline = time.monotonic() + (_SOCKET_TIMEOUT_S if call.is_probe else CALL_S)
+def _set_deadline(is_probe: bool) -> None:
+    _running.deadline = time.monotonic() + (_SOCKET_TIMEOUT_S if is_probe else CALL_S)
 
 
 class BoundedPipeline(Pipeline):
@@ -151,8 +130,8 @@ class BoundedPipeline(Pipeline):
     breaker: CircuitBreaker
 
     def execute(self, raise_on_error: bool = True) -> list[Any]:
-        with self.breaker.call() as call:
-            _set_deadline(call)
+        with self.breaker.call() as is_probe:
+            _set_deadline(is_probe)
             return super().execute(raise_on_error)
 
 
@@ -162,8 +141,8 @@ class BoundedRedis(Redis):
     breaker: CircuitBreaker
 
     def execute_command(self, *args: Any, **options: Any) -> Any:
-        with self.breaker.call() as call:
-            _set_deadline(call)
+        with self.breaker.call() as is_probe:
+            _set_deadline(is_probe)
             return super().execute_command(*args, **options)  # type: ignore[no-untyped-call]
 
     def pipeline(self, transaction: bool = True, shard_hint: str | None = None) -> BoundedPipeline:

@@ -57,7 +57,6 @@ def redis_address(settings: Settings) -> str:
 
 
 def _with_password(url: str, password: str) -> str:
-    """The address with this password in place of its own."""
     parts = urlsplit(url)
     user, _, host = parts.netloc.rpartition("@")
     name = user.partition(":")[0]

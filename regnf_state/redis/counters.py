@@ -13,7 +13,7 @@ from redis import Redis
 from redis.exceptions import ResponseError
 
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord
-from regnf_state.redis.documents import Command, shown, text
+from regnf_state.redis.documents import Command, owned_key, shown, text
 from regnf_state.redis.unreadable import PREFIX
 
 COUNTERS_KEY = f"{PREFIX}counters"
@@ -125,8 +125,6 @@ OWNERS = f"{PREFIX}owners"
 _JOBS = f"{PREFIX}jobs:created"
 _FIELDS = f"{PREFIX}fields:created"
 _ACTIVE = f"{PREFIX}jobs:active"
-_FOUND = f"{PREFIX}owners:found"
-_FIND_EVERY_S = 3600
 _EVICTED_KEPT = 1000
 _EVICTED_KEPT_S = 7 * 24 * 3600
 _PAGE = 200
@@ -143,19 +141,10 @@ class Owners:
     def all(self) -> list[str]:
         return sorted(map(text, self._redis.smembers(OWNERS)))
 
-    def find(self) -> None:
-        """Look for those that another release has not noted, once an hour."""
-        if not self._redis.set(_FOUND, "1", nx=True, ex=_FIND_EVERY_S):
-            return
-        for index in (_JOBS, _FIELDS):
-            names = [text(key).removeprefix(f"{index}:") for key in self._redis.scan_iter(f"{index}:*", count=1000)]
-            if names:
-                self._redis.sadd(OWNERS, *names)
-
     def finished(self, owner: str | None = None) -> int:
         """How many jobs that have ended an owner has; None: all together."""
         created = _JOBS if owner is None else f"{_JOBS}:{owner}"
-        active = _ACTIVE if owner is None else f"{PREFIX}owner:{owner}:active"
+        active = _ACTIVE if owner is None else owned_key(owner, "active")
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.zcard(created)
             pipeline.scard(active)
@@ -190,7 +179,7 @@ class Owners:
 
     def note_evicted(self, owner: str, job_id: str) -> None:
         """So that whoever asks for it is told what became of it."""
-        key = f"{PREFIX}owner:{owner}:evicted"
+        key = owned_key(owner, "evicted")
         seconds, _ = self._redis.time()
         with self._redis.pipeline() as pipeline:
             pipeline.zrem(f"{_JOBS}:{owner}", job_id)  # also where its record was gone, and named no owner
@@ -200,11 +189,11 @@ class Owners:
             pipeline.execute()
 
     def was_evicted(self, owner: str, job_id: str) -> bool:
-        return self._redis.zscore(f"{PREFIX}owner:{owner}:evicted", job_id) is not None
+        return self._redis.zscore(owned_key(owner, "evicted"), job_id) is not None
 
     def bound(self, owner: str, of: str, key: str, ttl_s: int) -> None:
         """Count a short-lived key as one of the owner's; the oldest beyond ten thousand are deleted."""
-        index = f"{PREFIX}owner:{owner}:{of}"
+        index = owned_key(owner, of)
         seconds, _ = self._redis.time()
         with self._redis.pipeline() as pipeline:
             pipeline.zadd(index, {key: seconds})

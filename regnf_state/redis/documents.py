@@ -111,21 +111,17 @@ class RedisDocuments:
     # reading
 
     def _read(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
-        """The record, if there is one, and the time of reading. Raises UnreadableRecordError."""
         ((_, stored),), now = self._fetch_now(kind, [name])
         return self._record(kind, name, stored), now
 
     def _read_each(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record | None]:
-        """The record of each name, or None. One round trip. Raises UnreadableRecordError."""
-        return [self._record(kind, name, stored) for name, stored in self._fetch(kind, names)]
+        return [self._record(kind, name, stored) for name, stored in self._fetch_now(kind, names)[0]]
 
     def _read_many(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record]:
-        """The records that exist and can be read, in the order of their names."""
-        found = (self._readable(kind, name, stored) for name, stored in self._fetch(kind, names))
+        found = (self._readable(kind, name, stored) for name, stored in self._fetch_now(kind, names)[0])
         return [record for record in found if record is not None]
 
     def _read_to_create(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
-        """The same before a record is made. Raises as ``_before``."""
         ((_, stored),), now = self._fetch_now(kind, [name])
         return self._before(kind, name, stored), now
 
@@ -141,11 +137,7 @@ class RedisDocuments:
                 raise
             return None
 
-    def _fetch(self, kind: Kind[Any], names: Sequence[str]) -> list[tuple[str, Stored | None]]:
-        return self._fetch_now(kind, names)[0]
-
     def _fetch_now(self, kind: Kind[Any], names: Sequence[str]) -> tuple[list[tuple[str, Stored | None]], float]:
-        """What is held under each name, and the time of reading. One round trip."""
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:
                 ask(pipeline, kind.key(name))
@@ -161,14 +153,14 @@ class RedisDocuments:
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:
                 pipeline.hstrlen(kind.key(name), "document")
-            sizes = [_size_in(answer) for answer in pipeline.execute(raise_on_error=False)]
+            sizes = [unless_wrong_type(answer, 0) for answer in pipeline.execute(raise_on_error=False)]
         begin = 0
         while begin < len(names):
             end, held = begin + 1, sizes[begin]
             while end < len(names) and held + sizes[end] <= PAGE_BYTES:
                 held += sizes[end]
                 end += 1
-            for size, (name, stored) in zip(sizes[begin:end], self._fetch(kind, names[begin:end]), strict=True):
+            for size, (name, stored) in zip(sizes[begin:end], self._fetch_now(kind, names[begin:end])[0], strict=True):
                 yield name, size, stored
             begin = end
 
@@ -231,7 +223,7 @@ class RedisDocuments:
             return _decoded(kind, name, stored)
         except UnreadableRecordError as error:
             self._heal(kind, name, stored, error)
-            ((_, again),) = self._fetch(kind, [name])
+            ((_, again),), _ = self._fetch_now(kind, [name])
             if again is None:
                 raise
             return _decoded(kind, name, again)
@@ -247,7 +239,6 @@ class RedisDocuments:
             return None
 
     def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
-        """Set a record aside."""
         self.unreadable.set_aside(kind.name, kind.key(name), stored, error)
 
     def _require_known(self, kind: Kind[Any], name: str) -> None:
@@ -269,9 +260,9 @@ class RedisDocuments:
 
         Returns OK, CONFLICT, or the answer of the first of ``caps`` that would be exceeded.
         """
-        change = Change(key, expected_version, list(commands), record, caps)
-        answer: bytes | str = self._write(keys=[key], args=_arguments(change))
-        return text(answer)
+        return text(
+            self._write(keys=[key], args=_arguments(Change(key, expected_version, list(commands), record, caps)))
+        )
 
     def _compare_and_set_each(self, changes: Sequence[Change]) -> list[str]:
         """The same for each, in one round trip: what one answers says nothing of the others."""
@@ -284,7 +275,6 @@ class RedisDocuments:
 
 
 def _arguments(change: Change) -> list[str | int]:
-    """What ``_WRITE`` is given."""
     token = uuid4().hex
     writes = list(change.commands)
     if (record := change.record) is not None:
@@ -295,6 +285,11 @@ def _arguments(change: Change) -> list[str | int]:
     return [token, change.expected_version, json.dumps(change.caps), *(json.dumps(command) for command in writes)]
 
 
+def owned_key(owner: str, what: str) -> str:
+    """Where something is listed of one owner."""
+    return f"{PREFIX}owner:{owner}:{what}"
+
+
 def ask(pipeline: Any, key: str) -> None:
     """Ask for what is held of a record; ``stored_in`` reads the answer."""
     pipeline.hmget(key, "document", "version", "format")
@@ -302,20 +297,19 @@ def ask(pipeline: Any, key: str) -> None:
 
 def stored_in(answer: Any) -> Stored | None:
     """What was read under a key; None when there is nothing. Raises RedisError but for a key of another type."""
-    if is_wrong_type(answer):
+    held = unless_wrong_type(answer, None)
+    if held is None:
         return Stored(is_hash=False)
-    if isinstance(answer, Exception):
-        raise answer
-    return None if answer == [None, None, None] else Stored(True, *answer)
+    return None if held == [None, None, None] else Stored(True, *held)
 
 
-def _size_in(answer: Any) -> int:
-    """The bytes of a document; 0 of what is none. Raises RedisError but for a key of another type."""
+def unless_wrong_type(answer: Any, otherwise: Any) -> Any:
+    """An answer of a pipeline; ``otherwise`` where the key holds something else. Raises RedisError."""
     if is_wrong_type(answer):
-        return 0
+        return otherwise
     if isinstance(answer, Exception):
         raise answer
-    return int(answer)
+    return answer
 
 
 def is_wrong_type(answer: object) -> bool:

@@ -1,104 +1,184 @@
-"""The fair queue: callers take turns at the workers by the worker seconds that their work has cost.
+"""The fair queue: callers take turns at the workers, over RQ's lists (docs/adr/0009-fair-queue.md).
 
-Start-time fair queueing (Goyal, Vin and Cheng, 1996) over RQ's lists, see docs/adr/0009-fair-queue.md. The costs of a
-piece of work are estimated when it is taken, as those of its caller's last work of its kind, and put right when it has
-ended. A caller who was idle for long comes before those who were not, with a minute of work at most.
+A caller's waiting work is a line, first come first served; but jobs of batches stand behind all that was posted by
+itself, and its imports. Callers with a line take turns, one piece of work each: who has had a turn goes behind all
+others. One name lies in RQ's list, where the workers block; when a worker has taken it, the next call of any process
+puts the next one there. So no call relies on the one before it: the death of a process costs nothing.
+
+Keys, below the prefix:  line:{owner}   list of names        owners        sorted set: callers with a line, by turn
+                         entry:{name}   hash, see below      turn          how many turns there have been
+                         parked:{ref}   list of names        parkings      set: fields that something waits for
+An entry: owner, kind, since, batch (of one); while it waits for a field: parked.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 from redis import Redis
-from redis.client import Pipeline
 from redis.exceptions import ResponseError
 
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
-from regnf_state.redis.counters import COUNTERS_KEY
 from regnf_state.redis.documents import number, shown
-from regnf_state.redis.fair_script import SCRIPT
 from regnf_state.redis.unreadable import PREFIX
 
-# How far a caller asks for more than its fair share of the workers.
-
-_LATELY_S = 300
-_LEAST_WEIGHT = 1e-6
-
-
-def excess(redis: Redis, name: str) -> float:
-    """Of the owner of this work: 0.0 for no more than the share, 1.0 for twice as much.
-
-    What a caller asks for is what its work has cost the workers in the last minutes, this work included, and what its
-    waiting work will cost by the estimate: of two who have a worker each, the one whose work never ends asks for more.
-    Callers who have asked for nothing in the last minutes have no share, and a caller alone has no excess.
-    """
-    held: Any = redis.hget(f"{_PREFIX}entry:{name}", "owner")
-    seconds, _ = redis.time()
-    found: Any = redis.zrangebyscore(f"{_PREFIX}asked", seconds - _LATELY_S, seconds + _LATELY_S)
-    owner, callers = shown(held or ""), sorted({shown(one) for one in found})
-    if owner not in callers or len(callers) == 1:
-        return 0.0
-    with redis.pipeline(transaction=False) as pipeline:
-        for caller in callers:
-            _look_at(pipeline, caller)
-        answers: list[Any] = pipeline.execute()
-    rows = list(zip(answers[::4], answers[1::4], answers[2::4], answers[3::4], strict=True))
-    asked = [_asked(spent, (seconds - _LATELY_S) // 60, waiting, costs) for spent, _, waiting, costs in rows]
-    weights = [max(number(weight, 1.0), _LEAST_WEIGHT) for _, weight, _, _ in rows]
-    own = callers.index(owner)
-    share = math.fsum(asked) * weights[own] / math.fsum(weights)
-    return max(0.0, asked[own] / share - 1.0) if share > 0 else 0.0
-
-
-def _look_at(pipeline: Pipeline, caller: str) -> None:
-    pipeline.hgetall(f"{_PREFIX}spent:{caller}")
-    pipeline.hget(f"{_PREFIX}weights", caller)
-    pipeline.llen(f"{_PREFIX}line:{caller}")
-    pipeline.hmget(f"{_PREFIX}costs", f"{caller}|import", f"{caller}|registration")
-
-
-def _asked(spent: dict[Any, Any], oldest: int, waiting: int, costs: list[Any]) -> float:
-    """Worker seconds: those since the minute ``oldest``, and those of what waits, which may be of either kind."""
-    had = math.fsum(number(seconds) for minute, seconds in spent.items() if number(minute) > oldest)
-    known = [max(0.0, number(cost)) for cost in costs if cost is not None]
-    return max(0.0, had) + waiting * (math.fsum(known) / len(known) if known else 0.0)
-
-
 _PREFIX = f"{PREFIX}queue:"
-_FIRST_COST_S = 10.0
-"""What a caller's first work of a kind is taken to cost until it has run."""
-_CREDIT_S = 60.0
-"""How far behind the caller served last one may start that was idle: a few imports and a registration."""
-_LISTS = tuple(f"rq:queue:{name}" for name in (IMPORT_QUEUE_NAME, QUEUE_NAME))
-_NOT_DAMAGE = (
-    "OOM",
-    "MISCONF",
-    "READONLY",
-    "NOSCRIPT",
-    "BUSY",
-    "LOADING",
-    "NOPERM",
-    "MASTERDOWN",
-    "NOREPLICAS",
-    "denied",
-)
+LISTS = {f"rq:queue:{name}": name for name in (IMPORT_QUEUE_NAME, QUEUE_NAME)}
+"""Where workers take from, and the queues of these lists."""
+_NOT_DAMAGE = re.compile("OOM|MISCONF|READONLY|NOSCRIPT|BUSY|LOADING|NOPERM|MASTERDOWN|NOREPLICAS|denied")
 """What Redis says of a script that it does not run now, or not for us."""
+# One call is one step, which Redis runs whole or not at all.
+_SCRIPT = """
+local P, op, name = KEYS[1], ARGV[1], ARGV[2]
+local DAY = 86400
+local LISTS = {import = 'rq:queue:regnf-import', registration = 'rq:queue:regnf'}
+local time = redis.call('TIME')
+local now = string.format('%.6f', time[1] + time[2] / 1e6)
+
+local function entry_of(id) return P .. 'entry:' .. id end
+local function line_of(owner) return P .. 'line:' .. owner end
+
+-- what is no number, or none that turns can be, counts as if it were not there
+local function turns()
+  local found = tonumber(redis.call('GET', P .. 'turn') or '')
+  return found and math.abs(found) < 1e12 and found or 0
+end
+
+-- who had no line stands before whoever had the last turn, and behind all others
+local function join(owner, id, push, before)
+  if before then
+    redis.call('LINSERT', line_of(owner), 'BEFORE', before, id)
+  else
+    redis.call(push, line_of(owner), id)
+  end
+  redis.call('ZADD', P .. 'owners', 'NX', turns() - 0.5, owner)
+end
+
+-- the first job of a batch in the line: all before it was posted by itself, and is seldom much
+local function first_of_batch(owner)
+  for start = 0, redis.call('LLEN', line_of(owner)) - 1, 64 do
+    for _, id in ipairs(redis.call('LRANGE', line_of(owner), start, start + 63)) do
+      if redis.call('HEXISTS', entry_of(id), 'batch') == 1 then return id end
+    end
+  end
+end
+
+-- that a worker reports is told by what Redis lets expire: times in RQ's own lists are of the workers' clocks
+local function runs(id)
+  if redis.call('TYPE', 'rq:executions:' .. id).ok ~= 'zset' then return false end
+  for _, one in ipairs(redis.call('ZRANGE', 'rq:executions:' .. id, 0, -1)) do
+    if redis.call('EXISTS', 'rq:execution:' .. id .. ':' .. one) == 1 then return true end
+  end
+  return false
+end
+
+local function advance()
+  while redis.call('LLEN', LISTS.import) + redis.call('LLEN', LISTS.registration) == 0 do
+    local owner = redis.call('ZRANGE', P .. 'owners', 0, 0)[1]
+    if not owner then return end
+    local id, turn = redis.call('LPOP', line_of(owner)), turns() + 1
+    redis.call('SET', P .. 'turn', turn)
+    if redis.call('EXISTS', line_of(owner)) == 1 then
+      redis.call('ZADD', P .. 'owners', turn, owner)
+    else
+      redis.call('ZREM', P .. 'owners', owner)
+    end
+    local kind = id and redis.call('HGET', entry_of(id), 'kind')
+    if LISTS[kind] then
+      redis.call('EXPIRE', entry_of(id), DAY)
+      redis.call('RPUSH', LISTS[kind], id)
+    end
+  end
+end
+
+local function waits(id)
+  local entry = redis.call('HMGET', entry_of(id), 'owner', 'parked')
+  if entry[1] and redis.call('LPOS', line_of(entry[1]), id) then return true end
+  if entry[2] and redis.call('LPOS', P .. 'parked:' .. entry[2], id) then return true end
+  return redis.call('LPOS', LISTS.import, id) or redis.call('LPOS', LISTS.registration, id)
+end
+
+local function remove(id)
+  local entry = redis.call('HMGET', entry_of(id), 'owner', 'parked')
+  local found = redis.call('LREM', LISTS.import, 0, id) + redis.call('LREM', LISTS.registration, 0, id)
+  if entry[1] then
+    found = found + redis.call('LREM', line_of(entry[1]), 0, id)
+    if redis.call('EXISTS', line_of(entry[1])) == 0 then redis.call('ZREM', P .. 'owners', entry[1]) end
+  end
+  if entry[2] then found = found + redis.call('LREM', P .. 'parked:' .. entry[2], 0, id) end
+  redis.call('DEL', entry_of(id))
+  return found
+end
+
+local steps = {}
+
+-- what has been waiting already stays where it is; a leftover of a worker's death is replaced
+function steps.enqueue(owner, kind, batch, ...)
+  if waits(name) or runs(name) then return 0 end
+  remove(name)
+  redis.call('DEL', 'rq:job:' .. name)
+  redis.call('HSET', 'rq:job:' .. name, ...)
+  redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'since', now)
+  if batch == '1' then redis.call('HSET', entry_of(name), 'batch', 1) end
+  join(owner, name, 'RPUSH', batch ~= '1' and first_of_batch(owner))
+  return 1
+end
+
+function steps.turn() return 0 end
+
+function steps.holds() return (waits(name) or runs(name)) and 1 or 0 end
+
+function steps.remove()
+  if remove(name) == 0 then return 0 end
+  redis.call('DEL', 'rq:job:' .. name)
+  return 1
+end
+
+-- taken, but it cannot run before the import of this field has ended
+function steps.park(owner, kind, reference)
+  redis.call('HSETNX', entry_of(name), 'since', now)
+  redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'parked', reference)
+  redis.call('PERSIST', entry_of(name))
+  redis.call('RPUSH', P .. 'parked:' .. reference, name)
+  redis.call('SADD', P .. 'parkings', reference)
+  return 1
+end
+
+-- ``name`` is the field; those who have waited longest come first
+function steps.release()
+  local parked = redis.call('LRANGE', P .. 'parked:' .. name, 0, -1)
+  for index = #parked, 1, -1 do
+    local owner = redis.call('HGET', entry_of(parked[index]), 'owner')
+    if owner then
+      redis.call('HDEL', entry_of(parked[index]), 'parked')
+      join(owner, parked[index], 'LPUSH')
+    end
+  end
+  redis.call('DEL', P .. 'parked:' .. name)
+  redis.call('SREM', P .. 'parkings', name)
+  return #parked
+end
+
+local answer = steps[op](unpack(ARGV, 3))
+advance()
+return answer
+"""
 _Value = TypeVar("_Value")
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Line:
-    """What a caller has waiting. ``lead_s``: how far the caller has been served beyond the one served last."""
+    """What a caller has waiting, and for how long the first of it has waited."""
 
     owner: str
     waiting: int
     oldest_s: float
-    lead_s: float
 
 
 class Waiting(NamedTuple):
@@ -111,23 +191,18 @@ class Waiting(NamedTuple):
 
 
 class FairQueue:
-    """The waiting work of all callers. ``weights``: the shares of callers who have another one than 1. ``reserve_s``:
-    how long after a caller's last request or result one worker stays free for it; 0: none does.
-    """
+    """The waiting work of all callers."""
 
-    def __init__(self, redis: Redis, weights: Mapping[str, float] | None = None, reserve_s: float = 0.0) -> None:
+    def __init__(self, redis: Redis) -> None:
         self._redis = redis
-        self._weights = dict(weights or {})
-        self._reserve_s = reserve_s
-        self._script = redis.register_script(SCRIPT)
+        self._script = redis.register_script(_SCRIPT)
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
         """One step. Where the keys are damaged the queue begins anew, and the reaper queues what waited."""
         return self._mended(lambda: int(self._run(self._redis, step, name, *arguments)))
 
     def _run(self, client: Redis, step: str, name: str, *arguments: Any) -> Any:
-        fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY, _CREDIT_S, self._reserve_s]
-        return self._script(keys=[_PREFIX], args=[*fixed, *arguments], client=client)
+        return self._script(keys=[_PREFIX], args=[step, name, *arguments], client=client)
 
     def _mended(self, do: Callable[[], _Value]) -> _Value:
         """What ``do`` returns, on an empty queue if the keys of this one are damaged."""
@@ -137,39 +212,22 @@ class FairQueue:
             if not _tells_of_damage(error):
                 raise
             logger.error("the fair queue is damaged and begins anew: %s", error)
-        self._begin_anew()
-        return do()
-
-    def _begin_anew(self) -> None:
-        """Drop every key that the script uses; of RQ's lists those of another type only."""
-        damaged = [key for key in _LISTS if self._redis.type(key) != b"list"]
+        damaged = [key for key in LISTS if self._redis.type(key) != b"list"]
         held: list[Any] = [*self._redis.scan_iter(f"{_PREFIX}*", count=1000), *damaged]
         if held:
             self._redis.delete(*held)
+        return do()
 
-    def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any], of_batch: bool = False) -> bool:
-        """Put work at the end of its owner's line, or before the jobs of batches there; False when it waits or runs
+    def enqueue(self, *waiting: Waiting) -> list[bool]:
+        """Put each at the end of its owner's line, or before the jobs of batches there; False for what waits or runs
         already."""
-        return self.enqueue_each([Waiting(work, owner, payload, of_batch)])[0]
+        return self._mended(lambda: self._enqueue(waiting)) if waiting else []
 
-    def enqueue_each(self, waiting: Iterable[Waiting]) -> list[bool]:
-        """The same for several, in their order and in one round trip."""
-        steps = [
-            (
-                one.work.name,
-                *(one.owner, one.work.kind, self._weights.get(one.owner, 1.0), int(one.of_batch)),
-                *(part for pair in one.payload.items() for part in pair),
-            )
-            for one in waiting
-        ]
-        return self._mended(lambda: self._enqueue(steps)) if steps else []
-
-    def _enqueue(self, steps: Sequence[tuple[Any, ...]]) -> list[bool]:
-        if len(steps) == 1:
-            return [bool(self._run(self._redis, "enqueue", *steps[0]))]
+    def _enqueue(self, waiting: tuple[Waiting, ...]) -> list[bool]:
         with self._redis.pipeline(transaction=False) as pipeline:
-            for step in steps:
-                self._run(pipeline, "enqueue", *step)
+            for work, owner, payload, of_batch in waiting:
+                told = (part for pair in payload.items() for part in pair)
+                self._run(pipeline, "enqueue", work.name, owner, work.kind, int(of_batch), *told)
             answers = pipeline.execute(raise_on_error=False)
         for answer in answers:
             if isinstance(answer, Exception):
@@ -188,115 +246,72 @@ class FairQueue:
         """Take waiting work out; False when it does not wait."""
         return bool(self._step("remove", name))
 
-    def finish(self, name: str, seconds: float) -> None:
-        """Work that was taken has ended, and has cost so many worker seconds."""
-        self._step("finish", name, f"{max(0.0, seconds):.6f}")
-
     def park(self, work: Work, owner: str, reference: str) -> None:
-        """Have work that was taken wait for the import of a field, for nothing."""
+        """Have work that was taken wait for the import of a field."""
         self._step("park", work.name, owner, work.kind, reference)
 
     def release(self, reference: str) -> None:
-        """Put what waited for this field at the front of its line."""
+        """Put what waited for this field, whose import has ended, at the front of its line."""
         self._step("release", reference)
 
     def awaited(self) -> list[str]:
-        """The fields that something waits for."""
-        return sorted(
-            shown(reference) for reference in self._mended(lambda: self._redis.smembers(f"{_PREFIX}parkings"))
-        )
-
-    def spent(self, owner: str) -> dict[int, float]:
-        """An owner's worker seconds of the last hour by minute. What runs counts as the estimate says."""
-        held: Any = self._mended(lambda: self._redis.hgetall(f"{_PREFIX}spent:{owner}"))
-        oldest = int(self._redis.time()[0]) // 60 - 60
-        minutes = {int(number(minute)): max(0.0, number(seconds)) for minute, seconds in held.items()}
-        return {minute: seconds for minute, seconds in sorted(minutes.items()) if minute > oldest}
-
-    def excess(self, name: str) -> float:
-        """How far the owner of work asks for more than its fair share of the workers: ``fair_share.excess``."""
-        return self._mended(lambda: excess(self._redis, name))
+        """The fields whose import something waits for."""
+        return sorted(shown(field) for field in self._mended(lambda: self._redis.smembers(f"{_PREFIX}parkings")))
 
     def lines(self) -> list[Line]:
         """Every caller with work that waits, those whose turn is next first."""
         return self._mended(self._lines)
 
     def _lines(self) -> list[Line]:
-        owners, ready, clock, now = self._look()
+        owners, ready, seconds = self._look()
         with self._redis.pipeline(transaction=False) as pipeline:
-            for owner, _ in owners:
+            for owner in owners:
+                pipeline.lrange(f"{_PREFIX}line:{owner}", 0, 0)
                 pipeline.llen(f"{_PREFIX}line:{owner}")
-                pipeline.lindex(f"{_PREFIX}line:{owner}", 0)
             answers = pipeline.execute()
-            for name in answers[1::2]:
-                pipeline.hget(f"{_PREFIX}entry:{shown(name or '')}", "since")
-            since = pipeline.execute()
-        lines = [
-            Line(owner, count + (owner == ready), max(0.0, now - number(begun, now)), number(tag) - clock)
-            for (owner, tag), count, begun in zip(owners, answers[::2], since, strict=True)
-        ]
-        alone = ready is not None and all(owner != ready for owner, _ in owners)
-        return [*([Line(ready, 1, 0.0, 0.0)] if ready is not None and alone else []), *lines]
+            firsts = [shown(name) for name in (*ready, *(name for found in answers[::2] for name in found))]
+            for name in firsts:
+                pipeline.hmget(f"{_PREFIX}entry:{name}", "owner", "since")
+            entries = [(shown(owner), number(since, seconds)) for owner, since in pipeline.execute() if owner]
+        waiting = Counter(dict(zip(owners, answers[1::2], strict=True)))
+        waiting.update(owner for owner, _ in entries[: len(ready)])
+        oldest = dict(reversed(entries))
+        waits = [(owner, count, seconds - oldest.get(owner, seconds)) for owner, count in waiting.items() if count]
+        return [Line(owner, count, max(0.0, since)) for owner, count, since in waits]
 
-    def _look(self) -> tuple[list[tuple[str, float]], str | None, float, float]:
-        """The owners with their tags, the owner of what lies ready, the virtual clock, the server's time."""
+    def _look(self) -> tuple[list[str], list[bytes], float]:
         with self._redis.pipeline() as pipeline:
-            pipeline.zrange(f"{_PREFIX}owners", 0, -1, withscores=True)
-            pipeline.hmget(f"{_PREFIX}clock", "owner", "now")
-            pipeline.llen(f"rq:queue:{IMPORT_QUEUE_NAME}")
-            pipeline.llen(f"rq:queue:{QUEUE_NAME}")
+            pipeline.zrange(f"{_PREFIX}owners", 0, -1)
+            for key in LISTS:
+                pipeline.lrange(key, 0, 0)
             pipeline.time()
-            owners, (ready, clock), imports, registrations, (seconds, _) = pipeline.execute()
-        lies = ready is not None and imports + registrations > 0
-        tags = [(shown(owner), number(tag)) for owner, tag in owners]
-        return tags, shown(ready) if lies else None, number(clock), float(seconds)
+            owners, imports, registrations, (seconds, _) = pipeline.execute()
+        return [shown(owner) for owner in owners], imports + registrations, float(seconds)
 
     def position(self, work: Work) -> int | None:
         """The place of work in the order that is expected of what waits now; None when it is in no line."""
         return self._mended(lambda: self._position(work))
 
     def _position(self, work: Work) -> int | None:
+        owners, ready, _ = self._look()
+        if work.name.encode() in ready:
+            return 1
         held: Any = self._redis.hget(f"{_PREFIX}entry:{work.name}", "owner")
-        if held is None:
-            return None
-        mine = shown(held)
+        mine = shown(held or "")
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.lpos(f"{_PREFIX}line:{mine}", work.name)
-            pipeline.lpos(f"rq:queue:{work.queue_name}", work.name)
-            answers: list[int | None] = pipeline.execute()
-        place, lies = answers
-        if lies is not None:
-            return lies + 1
-        if place is None:
-            return None
-        owners, ready, _, _ = self._look()
-        costs, lengths = self._costs([owner for owner, _ in owners])
-        tags = dict(owners)
-        mark = tags.get(mine, 0.0) + place * costs.get(mine, _FIRST_COST_S)
-        others = (
-            min(lengths[owner], max(0, math.ceil((mark - tag) / costs[owner])))
-            for owner, tag in owners
-            if owner != mine
-        )
-        return 1 + place + (ready is not None) + sum(others)
-
-    def _costs(self, owners: list[str]) -> tuple[dict[str, float], dict[str, int]]:
-        """What one registration of each owner moves its tag by, and the length of its line."""
-        with self._redis.pipeline(transaction=False) as pipeline:
             for owner in owners:
-                pipeline.hget(f"{_PREFIX}costs", f"{owner}|registration")
-                pipeline.hget(f"{_PREFIX}weights", owner)
                 pipeline.llen(f"{_PREFIX}line:{owner}")
-            answers = pipeline.execute()
-        rows = zip(owners, answers[::3], answers[1::3], strict=True)
-        costs = {
-            owner: max(number(cost, _FIRST_COST_S), 1e-3) / max(number(weight, 1.0), 1e-6)
-            for owner, cost, weight in rows
-        }
-        return costs, dict(zip(owners, answers[2::3], strict=True))
+            answers: list[int | None] = pipeline.execute()
+        place, lengths = answers[0], [length or 0 for length in answers[1:]]
+        if place is None or mine not in owners:
+            return None
+        own = owners.index(mine)
+        before = [min(length, place + (turn < own)) for turn, length in enumerate(lengths) if turn != own]
+        return 1 + place + len(ready) + sum(before)
 
 
 def _tells_of_damage(error: ResponseError) -> bool:
     """Whether the script met a key of another type, or a value that it cannot reckon with: that stays until mended."""
     said = str(error)
-    return ("WRONGTYPE" in said or "user_script" in said) and not any(word in said for word in _NOT_DAMAGE)
+    return ("WRONGTYPE" in said or "user_script" in said) and not _NOT_DAMAGE.search(said)

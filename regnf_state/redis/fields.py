@@ -20,7 +20,7 @@ from regnf_state.record_store import LibraryEntry, NameTakenError, Page, Positio
 from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
 from regnf_state.redis.counters import OWNERS, Owners
-from regnf_state.redis.documents import Cap, Command, Kind, RedisDocuments, text
+from regnf_state.redis.documents import Cap, Command, Kind, RedisDocuments, owned_key, text
 from regnf_state.redis.unreadable import PREFIX, Stored
 
 # Where the entries of callers' libraries are listed in Redis.
@@ -30,24 +30,23 @@ from regnf_state.redis.unreadable import PREFIX, Stored
 #   digest
 
 
-def listed_key(owner: str) -> str:
-    """An owner's entries by the time that they were added."""
-    return f"{PREFIX}owner:{owner}:library"
-
-
 def name_key(owner: str, name: str) -> str:
     """Which field of an owner has an entry of this name."""
-    return f"{listed_key(owner)}:{hashlib.sha256(name.encode()).hexdigest()}"
+    return f"{owned_key(owner, 'library')}:{hashlib.sha256(name.encode()).hexdigest()}"
+
+
+def _by_time(key: str, name: str, time: float | None) -> Command:
+    """What lists a name by time in a sorted set; None: what takes it out."""
+    return ("ZREM", key, name) if time is None else ("ZADD", key, repr(time), name)
 
 
 def listed(record: FieldRecord) -> list[Command]:
     """What lists the entry of a field, if it has one."""
+    entries = owned_key(record.owner, "library")
     if record.library is None:
-        return [("ZREM", listed_key(record.owner), record.sha256)]
-    return [
-        ("SET", name_key(record.owner, record.library["name"]), record.sha256),
-        ("ZADD", listed_key(record.owner), repr(float(record.library["added"])), record.sha256),
-    ]
+        return [_by_time(entries, record.sha256, None)]
+    named: Command = ("SET", name_key(record.owner, record.library["name"]), record.sha256)
+    return [named, _by_time(entries, record.sha256, float(record.library["added"]))]
 
 
 def unlisted(record: FieldRecord) -> list[Command]:
@@ -56,7 +55,7 @@ def unlisted(record: FieldRecord) -> list[Command]:
         return []
     return [
         ("DEL", name_key(record.owner, record.library["name"])),
-        ("ZREM", listed_key(record.owner), record.sha256),
+        ("ZREM", owned_key(record.owner, "library"), record.sha256),
     ]
 
 
@@ -81,10 +80,6 @@ end
 """
 
 
-def _index(owner: str) -> str:
-    return f"{PREFIX}owner:{owner}:rejections"
-
-
 def _key(field: FieldRecord) -> str:
     asked = json.dumps([field.sha256, field.description, __version__, ENGINE_REVISION], sort_keys=True)
     return f"{PREFIX}rejection:{hashlib.sha256(asked.encode()).hexdigest()}"
@@ -97,7 +92,7 @@ class RedisRejections(RedisDocuments):
         """Keep why this upload was rejected, if that lies in the file."""
         if error.get("reason") not in OF_THE_FILE:
             return
-        keys = [_index(field.owner), _key(field)]
+        keys = [owned_key(field.owner, "rejections"), _key(field)]
         self._redis.eval(_PUT, 2, *keys, json.dumps(error), _KEPT_S, repr(self.now()), _MOST)
 
     def known_rejection(self, field: FieldRecord) -> dict[str, Any] | None:
@@ -120,43 +115,18 @@ FIELD = Kind("field", FieldRecord)
 
 
 def _created_keys(reference: str) -> tuple[str, str]:
-    """Where a field is listed: among all, and among its owner's."""
     return _CREATED, f"{_CREATED}:{owner_of(reference)}"
 
 
-def _stored_key(owner: str) -> str:
-    """What is kept of an owner, in bytes, by its fields, as long as these are not rejected."""
-    return f"{PREFIX}owner:{owner}:stored"
-
-
-def _rejected_key(owner: str) -> str:
-    """An owner's rejected fields, by time."""
-    return f"{PREFIX}owner:{owner}:rejected"
-
-
-def _originals_key(owner: str) -> str:
-    """An owner's fields whose uploads are kept after their import, by the time until then."""
-    return f"{PREFIX}owner:{owner}:originals"
-
-
-def _importing_key(owner: str) -> str:
-    """An owner's fields whose import has not ended."""
-    return f"{_VALIDATING}:{owner}"
-
-
 def _caps(record: FieldRecord, quota: Quota) -> list[Cap]:
-    key, caps = _stored_key(record.owner), list[Cap]()
+    key, caps = owned_key(record.owner, "stored"), list[Cap]()
     if quota.imports is not None:
-        caps.append(("SCARD", _importing_key(record.owner), 1, quota.imports, "QUOTA_IMPORTS"))
+        caps.append(("SCARD", owned_key(record.owner, "importing"), 1, quota.imports, "QUOTA_ACTIVE_JOBS"))
     if quota.fields is not None:
-        caps.append(("HLEN", key, 1, quota.fields, "QUOTA_FIELDS"))
+        caps.append(("HLEN", key, 1, quota.fields, "QUOTA_STORED"))
     if quota.stored_bytes is not None:
-        caps.append(("HVALS", key, record.kept_bytes, quota.stored_bytes, "QUOTA_STORED_BYTES"))
+        caps.append(("HVALS", key, record.kept_bytes, quota.stored_bytes, "QUOTA_STORED"))
     return caps
-
-
-def _attempts_key(sha256: str) -> str:
-    return f"{PREFIX}field:{sha256}:attempts"
 
 
 class RedisFieldRecords(RedisRejections):
@@ -169,43 +139,38 @@ class RedisFieldRecords(RedisRejections):
     def _save_field(
         self, expected_version: int, record: FieldRecord, more: Sequence[Command] = (), caps: Sequence[Cap] = ()
     ) -> str:
-        place = "SADD" if record.state == "validating" else "SREM"
+        owner, name, is_rejected = record.owner, record.sha256, record.state == "rejected"
+        importing = "SADD" if record.state == "validating" else "SREM"
+        stored = owned_key(owner, "stored")
         indexes: list[Command] = [
-            ("SADD", OWNERS, record.owner),
-            *((place, each, record.sha256) for each in (_VALIDATING, _importing_key(record.owner))),
-            *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
+            ("SADD", OWNERS, owner),
+            *((importing, each, name) for each in (_VALIDATING, owned_key(owner, "importing"))),
+            *(_by_time(each, name, record.created) for each in _created_keys(name)),
             *listed(record),
+            *more,
+            _by_time(_UNDRAWN, name, record.updated if record.views == "pending" else None),
+            _by_time(owned_key(owner, "rejected"), name, record.updated if is_rejected else None),
+            _by_time(owned_key(owner, "originals"), name, record.original_until),
+            ("HDEL", stored, name)
+            if is_rejected and record.original_until is None
+            else ("HSET", stored, name, str(record.kept_bytes)),
         ]
-        indexes += more
-        if record.views == "pending":
-            indexes.append(("ZADD", _UNDRAWN, repr(record.updated), record.sha256))
-        else:
-            indexes.append(("ZREM", _UNDRAWN, record.sha256))
-        rejected, until = _rejected_key(record.owner), record.original_until
-        if record.state == "rejected":
-            indexes.append(("ZADD", rejected, repr(record.updated), record.sha256))
-        else:
-            indexes.append(("ZREM", rejected, record.sha256))
-        if record.state == "rejected" and until is None:
-            indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
-        else:
-            indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.kept_bytes)))
-        originals = _originals_key(record.owner)
-        if until is None:
-            indexes.append(("ZREM", originals, record.sha256))
-        else:
-            indexes.append(("ZADD", originals, repr(until), record.sha256))
         return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
-    def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
+    def _change_field(
+        self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord], must_last: bool = False
+    ) -> FieldRecord:
         while True:
             known, now = self._current_field(sha256)
             changed = change(known, now)
             if self._save_field(known.version, changed, counters.of_field(known, changed)) == "OK":
+                self._note_field(changed, must_last)
                 return changed
 
+    def _note_field(self, field: FieldRecord, must_last: bool) -> None:
+        """A field has changed; ``must_last``: what is said of it must outlast Redis."""
+
     def _current_field(self, sha256: str) -> tuple[FieldRecord, float]:
-        """The field that is to be changed, and the time. Raises StaleAttemptError."""
         try:
             known, now = self._read(FIELD, sha256)
         except UnreadableRecordError as error:
@@ -219,8 +184,8 @@ class RedisFieldRecords(RedisRejections):
         if kind is FIELD and not error.newer:
             self._redis.srem(_VALIDATING, name)
             self._redis.zrem(_UNDRAWN, name)
-            self._redis.hdel(_stored_key(owner_of(name)), name)
-            self._redis.zrem(_originals_key(owner_of(name)), name)
+            self._redis.hdel(owned_key(owner_of(name), "stored"), name)
+            self._redis.zrem(owned_key(owner_of(name), "originals"), name)
 
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         """Store a new field, or return the one that exists (False).
@@ -242,19 +207,19 @@ class RedisFieldRecords(RedisRejections):
 
     def _first(self, record: FieldRecord) -> FieldRecord:
         """The new field, its attempts counted on from those at a deleted one: whatever still works at them is stale."""
-        before: Any = self._redis.get(_attempts_key(record.sha256))
+        before: Any = self._redis.get(f"{FIELD.key(record.sha256)}:attempts")
         return record if before is None else replace(record, attempt=record.attempt + int(before))
 
     def importing(self, owner: str) -> int:
         """How many of an owner's imports wait or run."""
-        return int(self._redis.scard(_importing_key(owner)))
+        return int(self._redis.scard(owned_key(owner, "importing")))
 
     def stored(self, owner: str) -> tuple[int, int]:
         """How many fields an owner has of which bytes are kept, and these bytes: few of the rejected ones.
 
         Of a ready field these are the bytes of its upload or of what the import made, whichever are more.
         """
-        sizes: Any = self._redis.hvals(_stored_key(owner))
+        sizes: Any = self._redis.hvals(owned_key(owner, "stored"))
         return len(sizes), sum(map(int, sizes))
 
     def restore_field(self, record: FieldRecord) -> bool:
@@ -309,18 +274,20 @@ class RedisFieldRecords(RedisRejections):
         Raises StaleAttemptError when it has changed since it was ``known``.
         """
         return self._change_field(
-            known.sha256, lambda now_held, now: transitions.reimported_field(now_held, known, description, label, now)
+            known.sha256,
+            lambda now_held, now: transitions.reimported_field(now_held, known, description, label, now),
+            must_last=True,
         )
 
     def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
         """The field as it was ``before`` that attempt, which has not begun. Raises StaleAttemptError."""
         return self._change_field(
-            before.sha256, lambda known, now: transitions.restored_field(known, before, attempt, now)
+            before.sha256, lambda known, now: transitions.restored_field(known, before, attempt, now), must_last=True
         )
 
     def fields_with_original(self, owner: str) -> list[FieldRecord]:
         """An owner's fields whose uploads are kept after their import, those whose time is over first, first."""
-        names: Any = self._redis.zrange(_originals_key(owner), 0, _LOOKED_AT - 1)
+        names: Any = self._redis.zrange(owned_key(owner, "originals"), 0, _LOOKED_AT - 1)
         return self._read_many(FIELD, [text(name) for name in names])
 
     def delete_field(self, sha256: str) -> bool:
@@ -331,21 +298,21 @@ class RedisFieldRecords(RedisRejections):
             commands: list[Command] = [
                 ("DEL", FIELD.key(sha256)),
                 *(("ZREM", each, sha256) for each in _created_keys(sha256)),
-                *(("SREM", each, sha256) for each in (_VALIDATING, _importing_key(owner_of(sha256)))),
+                *(("SREM", each, sha256) for each in (_VALIDATING, owned_key(owner_of(sha256), "importing"))),
                 ("ZREM", _UNDRAWN, sha256),
-                ("ZREM", _rejected_key(owner_of(sha256)), sha256),
-                ("HDEL", _stored_key(owner_of(sha256)), sha256),
-                ("ZREM", _originals_key(owner_of(sha256)), sha256),
+                ("ZREM", owned_key(owner_of(sha256), "rejected"), sha256),
+                ("HDEL", owned_key(owner_of(sha256), "stored"), sha256),
+                ("ZREM", owned_key(owner_of(sha256), "originals"), sha256),
                 *unlisted(known),
-                ("SET", _attempts_key(sha256), str(known.attempt), "EX", _ATTEMPTS_KEPT_S),
+                ("SET", f"{FIELD.key(sha256)}:attempts", str(known.attempt), "EX", _ATTEMPTS_KEPT_S),
             ]
             if self._compare_and_set(FIELD.key(sha256), known.version, commands) == "OK":
-                self.owners.bound(owner_of(sha256), "deleted", _attempts_key(sha256), int(_ATTEMPTS_KEPT_S))
+                self.owners.bound(owner_of(sha256), "deleted", f"{FIELD.key(sha256)}:attempts", int(_ATTEMPTS_KEPT_S))
                 return True
 
     def rejected_beyond(self, owner: str, kept: int, most: int) -> list[str]:
         """An owner's rejected fields beyond so many, the oldest first, ``most`` at most."""
-        beyond: Any = self._redis.zrange(_rejected_key(owner), 0, -kept - 1)
+        beyond: Any = self._redis.zrange(owned_key(owner, "rejected"), 0, -kept - 1)
         return [text(name) for name in beyond[:most]]
 
 
@@ -369,6 +336,7 @@ class RedisLibrary(RedisFieldRecords):
             changed = replace(field, version=field.version + 1, updated=now, library=said)
             answer = self._save_field(field.version, changed, *_renaming(field, notes))
             if answer == "OK":
+                self._note_field(changed, must_last=True)
                 return changed
             taken = notes is not None and answer == NameTakenError.reason
             if notes is not None and taken and self.entries_named(known.owner, [notes.name])[0] is not None:
@@ -385,7 +353,7 @@ class RedisLibrary(RedisFieldRecords):
             field = fields.get(key)
             entry = None if field is None else LibraryEntry.of(field)
             if key in held and (entry is None or entry.notes.name != name):
-                self._redis.delete(key)  # an earlier release, or damage, has taken the entry away
+                self._redis.delete(key)  # damage has taken the entry away
                 entry = None
             found.append(entry)
         return found
@@ -401,7 +369,7 @@ class RedisLibrary(RedisFieldRecords):
                 return False
             return part is None or part.casefold() in said["name"].casefold()
 
-        return self._page(listed_key(owner), FIELD, limit, before, wanted)
+        return self._page(owned_key(owner, "library"), FIELD, limit, before, wanted)
 
 
 def _renaming(field: FieldRecord, notes: EntryNotes | None) -> tuple[list[Command], list[Cap]]:

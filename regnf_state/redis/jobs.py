@@ -21,6 +21,7 @@ from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.record_store import Page, Position
 from regnf_state.records import (
     ACTIVE,
+    FINISHED,
     NO_QUOTA,
     JobEvent,
     JobNews,
@@ -35,7 +36,18 @@ from regnf_state.records import (
 from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
 from regnf_state.redis.counters import OWNERS
-from regnf_state.redis.documents import Cap, Change, Command, Kind, ask, is_wrong_type, stored_in, text
+from regnf_state.redis.documents import (
+    Cap,
+    Change,
+    Command,
+    Kind,
+    ask,
+    is_wrong_type,
+    owned_key,
+    stored_in,
+    text,
+    unless_wrong_type,
+)
 from regnf_state.redis.fields import RedisLibrary
 from regnf_state.redis.unreadable import PREFIX, Stored
 
@@ -49,15 +61,11 @@ def start_of(after: str | None) -> str:
 
 def events_in(answer: Any) -> list[JobEvent]:
     """The events in an answer to XREAD about one stream, in either protocol's shape; none where it is no stream."""
-    if is_wrong_type(answer):
-        return []
-    if isinstance(answer, Exception):
-        raise answer
-    chunks = (
-        [chunk for chunks in answer.values() for chunk in chunks]
-        if isinstance(answer, dict)
-        else [chunk for _, chunk in answer or []]
-    )
+    told = unless_wrong_type(answer, [])
+    if isinstance(told, dict):
+        chunks = [chunk for chunks in told.values() for chunk in chunks]
+    else:
+        chunks = [chunk for _, chunk in told or []]
     return [_event(entry) for chunk in chunks for entry in chunk]
 
 
@@ -91,31 +99,17 @@ JOB = Kind("job", JobRecord)
 
 
 def _created_keys(record: JobRecord) -> tuple[str, str]:
-    """Where a job is listed: among all, and among its owner's."""
     return _CREATED, f"{_CREATED}:{record.owner}"
 
 
-def _active_key(owner: str) -> str:
-    return f"{PREFIX}owner:{owner}:active"
-
-
 def _caps(owner: str, max_active: int, quota: Quota) -> list[Cap]:
-    """The bounds of a new job."""
     caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
     if quota.active_jobs is not None:
-        caps.append(("SCARD", _active_key(owner), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
+        caps.append(("SCARD", owned_key(owner, "active"), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
     elif quota.share_jobs:
         # no more than stay free: one greedy owner gets half of all, two get a third each
-        caps.append(("SCARD", f"{_active_key(owner)} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
+        caps.append(("SCARD", f"{owned_key(owner, 'active')} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
     return caps
-
-
-def _events_key(job_id: str) -> str:
-    return f"{PREFIX}job:{job_id}:events"
-
-
-def _gone_key(job_id: str) -> str:
-    return f"{PREFIX}job:{job_id}:gone"
 
 
 class RecordStore(RedisLibrary):
@@ -141,14 +135,13 @@ class RecordStore(RedisLibrary):
         return value if known is None else text(known)  # type: ignore[arg-type]
 
     def _commands(self, before: JobRecord | None, after: JobRecord) -> list[Command]:
-        """What has to change around a record when ``before`` becomes ``after``."""
-        key, events = JOB.key(after.id), _events_key(after.id)
+        key, events, gone = (f"{JOB.key(after.id)}{part}" for part in ("", ":events", ":gone"))
         commands: list[Command] = [
             *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
             ("SADD", OWNERS, after.owner),
             *(
                 ("SADD" if after.status in ACTIVE else "SREM", each, after.id)
-                for each in (_ACTIVE, _active_key(after.owner))
+                for each in (_ACTIVE, owned_key(after.owner, "active"))
             ),
         ]
         if after.status != "accepted":
@@ -165,15 +158,15 @@ class RecordStore(RedisLibrary):
         if after.finished is not None:
             expires = after.finished + self._retention_s
             commands.append(("ZADD", _EXPIRING, repr(expires), after.id))
-            gone = str(int((expires + self._retention_s) * 1000))
-            commands.append(("SET", _gone_key(after.id), after.owner, "PXAT", gone))
+            until = str(int((expires + self._retention_s) * 1000))
+            commands.append(("SET", gone, after.owner, "PXAT", until))
             commands += [("XTRIM", events, "MAXLEN", _EVENTS_KEPT_AT_END), ("COMPACT", events)]
             commands += [("PEXPIREAT", each, str(int(expires * 1000))) for each in (key, events)]
             commands += outbox.entering(before, after, expires)
         else:
             commands += [("PERSIST", each) for each in (key, events)]
             commands += outbox.forgetting(before) if before is not None and before.finished is not None else []
-            commands += [("ZREM", _EXPIRING, after.id), ("DEL", _gone_key(after.id))]
+            commands += [("ZREM", _EXPIRING, after.id), ("DEL", gone)]
         return commands
 
     def _change_job(self, job_id: str, change: Callable[[JobRecord, float], JobRecord]) -> JobRecord:
@@ -184,10 +177,14 @@ class RecordStore(RedisLibrary):
                 return known
             commands = self._commands(known, changed)
             if self._compare_and_set(JOB.key(job_id), known.version, commands, changed) == "OK":
+                if changed.status in FINISHED:
+                    self._note_end(changed)
                 return changed
 
+    def _note_end(self, job: JobRecord) -> None:
+        """A job has ended."""
+
     def _current_job(self, job_id: str) -> tuple[JobRecord, float]:
-        """The job that is to be changed, and the time. Raises StaleAttemptError."""
         try:
             known, now = self._read(JOB, job_id)
         except UnreadableRecordError as error:
@@ -255,7 +252,7 @@ class RecordStore(RedisLibrary):
 
     def _forget_ended(self, owner: str) -> bool:
         """Strike jobs off an owner's active ones that are not active: records that were set aside. Whether any was."""
-        key = f"{PREFIX}owner:{owner}:active"
+        key = owned_key(owner, "active")
         ended: Any = self._redis.sdiff([key, _ACTIVE])
         return bool(ended) and bool(self._redis.srem(key, *ended))
 
@@ -272,7 +269,7 @@ class RecordStore(RedisLibrary):
 
     def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
         """Several jobs in one round trip, in the order asked for; one that cannot be read keeps no other back."""
-        found = {name: self._held(name, stored) for name, stored in self._fetch(JOB, job_ids)}
+        found = {name: self._held(name, stored) for name, stored in self._fetch_now(JOB, job_ids)[0]}
         damaged = self.unreadable.among([JOB.key(name) for name, held in found.items() if held is None])
         for name in found:
             if JOB.key(name) in damaged:
@@ -301,7 +298,7 @@ class RecordStore(RedisLibrary):
         """How many jobs ``create_job`` takes of the owner now, and the reason that one more is refused for."""
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.scard(_ACTIVE)
-            pipeline.scard(_active_key(owner))
+            pipeline.scard(owned_key(owner, "active"))
             every, own = (held if isinstance(held, int) else 0 for held in pipeline.execute(raise_on_error=False))
         of_owner = max_active
         if quota.active_jobs is not None:
@@ -317,7 +314,7 @@ class RecordStore(RedisLibrary):
         """Whether a job of this id and owner was kept once and has outlived its retention."""
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.exists(JOB.key(job_id))
-            pipeline.get(_gone_key(job_id))
+            pipeline.get(f"{JOB.key(job_id)}:gone")
             held, gone = pipeline.execute()
         if held:
             return False
@@ -363,7 +360,7 @@ class RecordStore(RedisLibrary):
             if known is not None and known.status in ACTIVE:
                 raise StaleAttemptError(f"a job that is {known.status} is not deleted")
             version = known.version if known is not None else 0
-            commands: list[Command] = [("DEL", JOB.key(job_id), _events_key(job_id), _gone_key(job_id))]
+            commands: list[Command] = [("DEL", JOB.key(job_id), f"{JOB.key(job_id)}:events", f"{JOB.key(job_id)}:gone")]
             indexes = [_CREATED, _WAITING, _EXPIRING]
             if known is not None:
                 indexes.append(_created_keys(known)[1])
@@ -383,7 +380,7 @@ class RecordStore(RedisLibrary):
         expired = []
         names: Any = self._redis.zrangebyscore(_EXPIRING, "-inf", now)
         for job_id in map(text, names):
-            keys = [_EXPIRING, _CREATED, JOB.key(job_id), _events_key(job_id), _gone_key(job_id)]
+            keys = [_EXPIRING, _CREATED, JOB.key(job_id), f"{JOB.key(job_id)}:events", f"{JOB.key(job_id)}:gone"]
             if self._expire(keys=keys, args=[job_id, now]):
                 expired.append(job_id)
         return expired
@@ -396,7 +393,7 @@ class RecordStore(RedisLibrary):
     def events(self, job_id: str, after: str | None) -> list[JobEvent]:
         """Events after the given id (None: from the start). Raises ValueError when ``after`` is no event id."""
         with self._redis.pipeline(transaction=False) as pipeline:
-            pipeline.xread({_events_key(job_id): start_of(after)})
+            pipeline.xread({f"{JOB.key(job_id)}:events": start_of(after)})
             (answer,) = pipeline.execute(raise_on_error=False)
         return events_in(answer)
 
@@ -405,14 +402,14 @@ class RecordStore(RedisLibrary):
         with self._redis.pipeline(transaction=False) as pipeline:
             for job_id, after in positions:
                 ask(pipeline, JOB.key(job_id))
-                pipeline.xread({_events_key(job_id): start_of(after)})
+                pipeline.xread({f"{JOB.key(job_id)}:events": start_of(after)})
             answers = pipeline.execute(raise_on_error=False)
         found = zip(positions, map(stored_in, answers[::2]), answers[1::2], strict=True)
         return [JobNews(self._readable(JOB, name, held), events_in(entries)) for (name, _), held, entries in found]
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         """Ids of active jobs that need this field."""
-        names = sorted(map(text, self._redis.smembers(_active_key(owner_of(sha256)))))
+        names = sorted(map(text, self._redis.smembers(owned_key(owner_of(sha256), "active"))))
         for name, _, stored in self._fetch_in_portions(JOB, names):
             record = self._readable(JOB, name, stored)
             if record is not None and transitions.uses_field(record, sha256):

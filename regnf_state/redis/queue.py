@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import json
-import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,7 +17,7 @@ from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.queue import QUEUE_NAME, Work
 from regnf_state.records import JobRecord
 from regnf_state.redis.documents import shown
-from regnf_state.redis.fair_queue import FairQueue, Line, Waiting
+from regnf_state.redis.fair_queue import FairQueue, Waiting
 
 # What Redis holds of a piece of work in RQ's shape, a hash: written here, and believed only if written here.
 #
@@ -29,18 +27,13 @@ from regnf_state.redis.fair_queue import FairQueue, Line, Waiting
 # signed too.
 
 SIGNATURE = "regnf_signature"
-MAX_S = 24 * 3600
+_MAX_S = 24 * 3600
 """What RQ itself would allow a job; workers set the limit that counts from their own settings."""
 _FAILURE_KEPT_S = 60
-_MAX_DATA_BYTES = 4096
 _WRITTEN_BY_RQ = frozenset(
-    {"created_at", "enqueued_at", "started_at", "ended_at", "last_heartbeat", "worker_name", "status", "exc_info"}
+    ("created_at", "enqueued_at", "started_at", "ended_at", "last_heartbeat", "worker_name", "status", "exc_info")
 )
 """What RQ notes down of a job on its way. Nothing of it is used."""
-
-
-class PayloadError(ValueError):
-    """A hash that is not one of ours. Says what is wrong with it, and repeats nothing of it."""
 
 
 def made(work: Work, redis: Redis) -> Job:
@@ -51,7 +44,7 @@ def made(work: Work, redis: Redis) -> Job:
         connection=redis,
         id=work.name,
         origin=work.queue_name,
-        timeout=MAX_S,
+        timeout=_MAX_S,
         result_ttl=0,
         failure_ttl=_FAILURE_KEPT_S,
         status=JobStatus.QUEUED,
@@ -65,92 +58,70 @@ def signature(work: Work, key: str) -> str:
     return hmac.new(key.encode(), f"regnf-queue-1\n{work.function}\n{work.name}".encode(), hashlib.sha256).hexdigest()
 
 
-def written(work: Work, redis: Redis, key: str | None) -> dict[str, Any]:
-    """The hash of a piece of work that waits."""
-    fields: dict[str, Any] = made(work, redis).to_dict()
-    return fields | ({SIGNATURE: signature(work, key)} if key is not None else {})
+def written(work: Work, redis: Redis) -> dict[str, Any]:
+    """The hash of a piece of work that waits, not signed. RQ reads data that is not compressed as well: the bytes of
+    what is compressed depend on the release of zlib."""
+    job = made(work, redis)
+    return job.to_dict() | {"data": job.data}
 
 
-def read(queue_name: str, name: str, held: Mapping[bytes, bytes], redis: Redis, key: str | None) -> Work:
-    """The work that a name and its hash mean. Raises PayloadError unless the hash is as ``written`` makes it."""
-    try:
-        work = Work.named(queue_name, name)
-    except ValueError as error:
-        raise PayloadError(str(error)) from error
-    fields = {field.decode(errors="replace"): value for field, value in held.items()}
-    expected = {field: _bytes(value) for field, value in written(work, redis, None).items()}
-    if _data(fields.pop("data", b"")) != [work.function, None, [work.argument], {}]:
-        raise PayloadError("another function, or other arguments")
-    signed = fields.pop(SIGNATURE, b"")
-    if key is not None and not hmac.compare_digest(signed, signature(work, key).encode()):
-        raise PayloadError("not signed with the key of this service")
-    del expected["data"]
-    for field in fields.keys() | expected.keys():
-        if field not in _WRITTEN_BY_RQ and fields.get(field, b"") != expected.get(field, b""):
-            raise PayloadError(f"another {field}" if field in expected else "a member that is not ours")
-    return work
+def _believed(held: Mapping[bytes, bytes]) -> dict[str, bytes]:
+    fields = {shown(field): value for field, value in held.items() if value}
+    return {field: value for field, value in fields.items() if field not in _WRITTEN_BY_RQ}
 
 
-def _bytes(value: Any) -> bytes:
-    return value if isinstance(value, bytes) else str(value).encode()
-
-
-def _data(value: bytes) -> Any:
-    """What the payload names, decompressed up to a limit; None for what is no JSON."""
-    unpacker = zlib.decompressobj()
-    try:
-        plain = unpacker.decompress(value, _MAX_DATA_BYTES)
-        return json.loads(plain) if unpacker.eof else None
-    except (zlib.error, ValueError, RecursionError):
-        return None
-
-
-class JobQueue:
+class JobQueue(FairQueue):
     """Hands ids to workers, each at most once per attempt: enqueueing what is known already changes nothing.
 
-    RQ's lists, and the fair queue before them, which has ``weights`` and ``reserve_s``. ``key`` signs
-    what is put into Redis.
+    ``key`` signs what is put into Redis.
     """
 
-    def __init__(
-        self,
-        redis: Redis,
-        key: str | None = None,
-        weights: Mapping[str, float] | None = None,
-        reserve_s: float = 0.0,
-    ) -> None:
-        self._redis = redis
+    def __init__(self, redis: Redis, key: str | None = None) -> None:
+        super().__init__(redis)
         self._key = key
-        self.fair = FairQueue(redis, weights, reserve_s)
 
     def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
         """of_batch: it waits behind all that its owner has posted by itself, so that a batch holds nothing up."""
-        self._enqueue([(Work("registration", job_id, attempt), owner, of_batch)])
+        self.enqueue(self._waiting(Work("registration", job_id, attempt), owner, of_batch))
 
     def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
         """The same for several accepted jobs, in one round trip, in their order."""
-        self._enqueue([(Work("registration", job.id, job.attempt), job.owner, job.is_of_batch) for job in jobs])
+        self.enqueue(
+            *(self._waiting(Work("registration", job.id, job.attempt), job.owner, job.is_of_batch) for job in jobs)
+        )
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
         """Its owner is named in the field's reference."""
-        self._enqueue([(Work("import", sha256, attempt), owner_of(sha256), False)])
+        self.enqueue(self._waiting(Work("import", sha256, attempt), owner_of(sha256)))
 
-    def _enqueue(self, waiting: Sequence[tuple[Work, str, bool]]) -> None:
-        self.fair.enqueue_each(
-            Waiting(work, owner, written(work, self._redis, self._key), of_batch) for work, owner, of_batch in waiting
-        )
+    def _waiting(self, work: Work, owner: str, of_batch: bool = False) -> Waiting:
+        signed = {SIGNATURE: signature(work, self._key)} if self._key is not None else {}
+        return Waiting(work, owner, written(work, self._redis) | signed, of_batch)
+
+    def read(self, queue_name: str, name: str, held: Mapping[bytes, bytes]) -> Work:
+        """The work that a name and its hash mean. Raises ValueError unless the hash is one that this queue writes;
+        its message repeats nothing of the hash."""
+        work = Work.named(queue_name, name)
+        believed = _believed(held)
+        signed = believed.pop(SIGNATURE, b"")
+        encode: Any = self._redis.get_encoder().encode
+        if believed != _believed({encode(field): encode(value) for field, value in written(work, self._redis).items()}):
+            raise ValueError("not what this service writes")
+        if self._key is not None and not hmac.compare_digest(signed, signature(work, self._key).encode()):
+            raise ValueError("not signed with the key of this service")
+        return work
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
         """Whether the transport still knows of this attempt, waiting or running."""
-        return self.fair.holds(Work("registration", job_id, attempt).name)
+        return self.holds(Work("registration", job_id, attempt).name)
 
     def holds_import(self, sha256: str, attempt: int) -> bool:
-        return self.fair.holds(Work("import", sha256, attempt).name)
+        return self.holds(Work("import", sha256, attempt).name)
 
     def stop(self, job_id: str, attempt: int) -> None:
         """Take a waiting job out of the queue, or tell the worker to end a running one."""
         name = Work("registration", job_id, attempt).name
-        if self.fair.remove(name):
+        if self.remove(name):
             return
         worker: Any = self._redis.hget(f"rq:job:{name}", "worker_name")
         if worker:
@@ -158,38 +129,15 @@ class JobQueue:
 
     def drop_import(self, sha256: str, attempt: int) -> None:
         """Take a waiting import out of the queue: its field is gone. One that runs goes on, and finds that itself."""
-        self.fair.remove(Work("import", sha256, attempt).name)
+        self.remove(Work("import", sha256, attempt).name)
 
-    def turn(self) -> None:
-        """Hand the next in turn to the workers, if a process died before it did so."""
-        self.fair.turn()
-
-    def awaited(self) -> list[str]:
-        """The fields whose import registrations wait for, off the queue."""
-        return self.fair.awaited()
-
-    def release(self, reference: str) -> None:
-        """Queue what waited for this field: its import has ended."""
-        self.fair.release(reference)
-
-    def position(self, work: Work) -> int | None:
-        """1 for the work that is expected to be next; None for what does not wait in line."""
-        return self.fair.position(work)
-
-    def spent(self, owner: str) -> dict[int, float]:
-        """The worker seconds of an owner in the last hour, by minute (of the epoch)."""
-        return self.fair.spent(owner)
-
-    def lines(self) -> list[Line]:
-        """Every caller with work that waits."""
-        return self.fair.lines()
+    def live_hosts(self) -> list[str]:
+        """The hosts of the workers that have reported lately and have not signed off, one each."""
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for name in self._redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME):
+                pipeline.hmget(shown(name), "hostname", "death")
+            return [shown(host) for host, death in pipeline.execute() if host is not None and death is None]
 
     def live_workers(self) -> int:
         """How many workers have reported lately."""
-        names = [shown(name) for name in self._redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)]
-        with self._redis.pipeline(transaction=False) as pipeline:
-            for name in names:
-                pipeline.exists(name)
-                pipeline.hexists(name, "death")
-            answers = pipeline.execute()
-        return sum(bool(held) and not dead for held, dead in zip(answers[::2], answers[1::2], strict=True))
+        return len(self.live_hosts())

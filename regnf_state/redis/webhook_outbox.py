@@ -10,13 +10,14 @@ import logging
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal
 
+from pydantic import TypeAdapter, ValidationError
 from redis import Redis
 
 from regnf_state.records import LAST_TIME, JobRecord
 from regnf_state.redis.counters import count
-from regnf_state.redis.documents import Command, is_wrong_type, text
+from regnf_state.redis.documents import Command, text, unless_wrong_type
 from regnf_state.redis.unreadable import PREFIX
 
 logger = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ return false
 """
 _SETTLE = """
 if ARGV[1] == '' then redis.call('ZREM', KEYS[1], ARGV[2]) else redis.call('ZADD', KEYS[1], 'XX', ARGV[1], ARGV[2]) end
-if redis.pcall('HGET', KEYS[2], 'message') == ARGV[2] then redis.call('HSET', KEYS[2], unpack(ARGV, 3)) end
+if redis.pcall('HGET', KEYS[2], 'message') == ARGV[2] then redis.call('HSET', KEYS[2], 'delivery', ARGV[3]) end
 """
 
 
@@ -65,6 +66,7 @@ class Delivery:
     delivered_at: float | None = None
 
 
+_DELIVERY = TypeAdapter(Delivery)
 _UNREADABLE = Delivery("failed", last_error="RECORD_UNREADABLE")
 
 
@@ -124,7 +126,7 @@ def entering(before: JobRecord | None, after: JobRecord, expires: float) -> list
             ("ZADD", due_key(message.line), repr(after.finished), message.name),
             ("ZADD", _LINES, "NX", "0", message.line),
             ("DEL", key),
-            ("HSET", key, "message", message.name, "state", "pending", "sends", "0"),
+            ("HSET", key, "message", message.name),
             ("PEXPIREAT", key, str(int(expires * 1000))),
         ]
     return commands
@@ -166,14 +168,9 @@ class RedisOutbox:
 
     def settle(self, message: Message, delivery: Delivery, outcome: str = "dropped") -> None:
         """Write down how a send went: put the message off until ``next_at``, or be done with it."""
-        shown: dict[str, Any] = {"state": delivery.state, "sends": delivery.sends}
-        for name in ("last_status", "last_error", "next_at", "delivered_at"):
-            value = getattr(delivery, name)
-            shown[name] = "" if value is None else value
         due = "" if delivery.next_at is None else repr(delivery.next_at)
-        fields = [part for pair in shown.items() for part in pair]
-        key = _state_key(message.job_id, message.place)
-        self._settle(keys=[due_key(message.line), key], args=[due, message.name, *fields])
+        keys = [due_key(message.line), _state_key(message.job_id, message.place)]
+        self._settle(keys=keys, args=[due, message.name, _DELIVERY.dump_json(delivery)])
         count(self._redis, "webhook_sends", outcome)
 
     def deliveries(self, record: JobRecord) -> list[Delivery]:
@@ -182,7 +179,7 @@ class RedisOutbox:
             return []
         with self._redis.pipeline(transaction=False) as pipeline:
             for place in range(len(record.webhooks)):
-                pipeline.hgetall(_state_key(record.id, place))
+                pipeline.hmget(_state_key(record.id, place), "message", "delivery")
             return [_delivery(held) for held in pipeline.execute(raise_on_error=False)]
 
     def waiting(self) -> int:
@@ -192,25 +189,12 @@ class RedisOutbox:
 
 
 def _delivery(answer: Any) -> Delivery:
-    """The state that Redis holds of a message; members that are not known say nothing."""
-    if is_wrong_type(answer):
-        return _UNREADABLE
-    if isinstance(answer, Exception):
-        raise answer
-    found = {text(name): text(value) for name, value in answer.items()}
-    if not found:
-        return Delivery()
+    message, told = unless_wrong_type(answer, (None, "damaged"))
+    if told is None:
+        return Delivery("waiting" if message is None else "pending")
     try:
-        made = Delivery(
-            state=cast(DeliveryState, found["state"]),
-            sends=int(found["sends"]),
-            last_status=int(found["last_status"]) if found.get("last_status") else None,
-            last_error=found.get("last_error") or None,
-            next_at=float(found["next_at"]) if found.get("next_at") else None,
-            delivered_at=float(found["delivered_at"]) if found.get("delivered_at") else None,
-        )
-    except (KeyError, ValueError):
+        made = _DELIVERY.validate_json(told)
+    except ValidationError:
         return _UNREADABLE
     times = (made.next_at or 0.0, made.delivered_at or 0.0)
-    is_sound = made.state in get_args(DeliveryState) and all(0 <= time < LAST_TIME for time in times)
-    return made if is_sound else _UNREADABLE
+    return made if all(0 <= time < LAST_TIME for time in times) else _UNREADABLE

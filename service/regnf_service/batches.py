@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from regnf_core.pairs import short_result
+from regnf_service.concurrency import portions
 from regnf_service.fields.ingest import room_for_bytes
 from regnf_service.jobs.edits import manifest_of, result_of
 from regnf_service.jobs.submit import FieldLookup, check_fields, future_job_id, start
-from regnf_service.library import check_budget
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch, Pair
@@ -67,17 +67,8 @@ class Posting:
         self._fields = FieldLookup(services, caller)
 
     def portions(self) -> Iterator[Sequence[Line]]:
-        """A few lines at a time, so that other callers' requests are served in between."""
-        few: list[Line] = []
-        names = 0
-        for line in self.lines:
-            few.append(line)
-            names += 1 + len(_fields_of(line))
-            if names >= _NAMES_AT_ONCE or len(few) == _AT_ONCE:
-                yield few
-                few, names = [], 0
-        if few:
-            yield few
+        """A few lines at a time."""
+        return portions(self.lines, lambda line: 1 + len(_fields_of(line)), _NAMES_AT_ONCE, _AT_ONCE)
 
     def check(self, lines: Sequence[Line]) -> None:
         """Refuse what POST /register would refuse, and find out which jobs there are."""
@@ -108,7 +99,7 @@ class Posting:
             line.is_done = is_told and status in ("running", "successful")
 
     def require_room(self) -> None:
-        """Raises Problem QUOTA_BATCHES, QUOTA_STORED_BYTES, QUOTA_ACTIVE_JOBS, QUEUE_FULL, QUOTA_WORKER_SECONDS.
+        """Raises Problem QUOTA_ACTIVE_JOBS, QUOTA_STORED, QUEUE_FULL.
 
         Then nothing is started.
         """
@@ -117,7 +108,6 @@ class Posting:
         new = {line.job for line in self.lines if line.is_new}
         if not new:
             return
-        check_budget(services, caller)
         free, reason = services.records.room_for_jobs(caller, services.settings.max_queued_jobs, services.quota)
         if len(new) > free:
             detail = f"The lines need {len(new)} new jobs; there is room for {free}. Nothing was started."
@@ -125,7 +115,6 @@ class Posting:
             raise Problem(reason, detail, headers=RETRY_LATER, extra=fitting)
 
     def _fitting(self, free: int) -> int:
-        """How many of the first lines need no more than so many new jobs."""
         new: set[str | None] = set()
         for place, line in enumerate(self.lines):
             new |= {line.job} if line.is_new else set()
@@ -139,12 +128,13 @@ class Posting:
         while len(kept) >= services.settings.quota_batches:
             ended = next((entry for entry in reversed(kept) if not _is_active(services, caller, entry.key)), None)
             if ended is None:
-                raise Problem("QUOTA_BATCHES", headers=RETRY_LATER)
+                detail = "You have the maximum number of batches, and none has ended. Wait for one."
+                raise Problem("QUOTA_ACTIVE_JOBS", detail, headers=RETRY_LATER)
             services.batches.delete(caller, ended.key.rpartition("/")[2])
             kept.remove(ended)
         room = room_for_bytes(services, caller)
         if room is not None and len(self._batch().text()) > room:
-            raise Problem("QUOTA_STORED_BYTES")
+            raise Problem("QUOTA_STORED")
 
     def submit(self, lines: Sequence[Line]) -> None:
         """Start their jobs, as POST /register does. Raises what that raises, where it is not of one line alone."""
@@ -179,7 +169,6 @@ def _fields_of(line: Line) -> list[str]:
 
 
 def _is_active(services: Services, caller: str, key: str) -> bool:
-    """Whether a job of a stored batch waits or runs."""
     try:
         batch = services.batches.find(caller, key.rpartition("/")[2])
     except UnreadableRecordError:
@@ -290,7 +279,6 @@ def _possible(pair: Pair, job: _Held) -> tuple[str, ...]:
 
 
 def _result(services: Services, pair: Pair, job: _Held) -> dict[str, Any]:
-    """What is told of a pair that has ended."""
     told: dict[str, Any] = {"line": pair.line, "key": pair.key, "job": pair.job}
     if pair.error is not None:
         return told | {"status": "refused", "error": pair.error}

@@ -6,7 +6,7 @@ import asyncio
 import random
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial, wraps
@@ -15,11 +15,12 @@ from typing import Any, ParamSpec, TypeVar
 from anyio import CapacityLimiter, to_thread
 from anyio.lowlevel import RunVar
 
-from regnf_service.problem import CLOSE, RETRY_LATER, Problem
+from regnf_service.problem import RETRY_LATER, Problem
 
 _LOOK_EVERY_S = 0.02
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
+_Item = TypeVar("_Item")
 whose: ContextVar[str] = ContextVar("whose", default="")
 """Whom the work at hand is done for: a caller, without tokens an address; "" for the service itself."""
 
@@ -121,6 +122,20 @@ def blocking(route: Callable[_Given, _Result]) -> Callable[_Given, Awaitable[_Re
     return run
 
 
+def portions(items: Iterable[_Item], size: Callable[[_Item], int], most: int, count: int) -> Iterator[list[_Item]]:
+    """A few at a time, so that other callers' requests are served in between: of this size, or as many."""
+    few: list[_Item] = []
+    total = 0
+    for item in items:
+        few.append(item)
+        total += size(item)
+        if total >= most or len(few) == count:
+            yield few
+            few, total = [], 0
+    if few:
+        yield few
+
+
 async def pause(seconds: float, stopping: asyncio.Event) -> bool:
     """Sleep, or less if the service stops. Returns whether it does."""
     try:
@@ -132,32 +147,33 @@ async def pause(seconds: float, stopping: asyncio.Event) -> bool:
 
 
 class Slots:
-    """At most ``most`` for each caller; ``reason`` is what a caller that has as many is told. For one thread."""
+    """At most ``most`` for each caller, of ``what``. For one thread."""
 
-    def __init__(self, most: int, reason: str) -> None:
+    def __init__(self, most: int, what: str) -> None:
         self._most = most
-        self._reason = reason
+        self._what = what
         self._taken: Counter[str] = Counter()
 
-    def take(self, caller: str) -> None:
-        """Take one; give it back with ``free``. Raises Problem."""
-        if self._taken[caller] >= self._most:
-            raise Problem(self._reason, headers=RETRY_LATER | CLOSE)
-        self._taken[caller] += 1
+    def take(self, caller: str, count: int = 1) -> None:
+        """Take so many; give them back with ``free``. Raises Problem."""
+        if self._taken[caller] + count > self._most:
+            detail = f"At most {self._most} {self._what} at once are taken. Wait until one of yours has ended."
+            raise Problem("TOO_MANY_REQUESTS_AT_ONCE", detail, headers=RETRY_LATER)
+        self._taken[caller] += count
 
-    def free(self, caller: str) -> None:
-        self._taken[caller] -= 1
+    def free(self, caller: str, count: int = 1) -> None:
+        self._taken[caller] -= count
         if not self._taken[caller]:
             del self._taken[caller]
 
     @contextmanager
-    def held(self, caller: str) -> Iterator[None]:
-        """One for as long as the context lasts. Raises Problem."""
-        self.take(caller)
+    def held(self, caller: str, count: int = 1) -> Iterator[None]:
+        """So many for as long as the context lasts. Raises Problem."""
+        self.take(caller, count)
         try:
             yield
         finally:
-            self.free(caller)
+            self.free(caller, count)
 
     async def emptied(self, seconds: float) -> None:
         """Wait until none is taken, at most this long."""
@@ -221,17 +237,17 @@ class Claim:
         self._held = 0
 
     def arrive(self, size: int) -> None:
-        """Count bytes that came. Raises Problem QUOTA_STORED_BYTES."""
+        """Count bytes that came. Raises Problem QUOTA_STORED."""
         self.arrived += size
         self.hold(self.arrived)
 
     def hold(self, size: int) -> None:
-        """Hold this many bytes at least. Raises Problem QUOTA_STORED_BYTES."""
+        """Hold this many bytes at least. Raises Problem QUOTA_STORED."""
         more = size - self._held
         if more <= 0:
             return
         if self._room is not None and self._claimed[self._caller] + more > self._room:
-            raise Problem("QUOTA_STORED_BYTES", headers=CLOSE)
+            raise Problem("QUOTA_STORED")
         self._claimed[self._caller] += more
         self._held = size
 
@@ -253,7 +269,7 @@ class UnderWay:
     def claim(self, caller: str, room: int | None, declared: int | None) -> Iterator[Claim]:
         """A claim for as long as the context lasts.
 
-        All claims of a caller together have ``room`` bytes; None: no bound. Raises Problem QUOTA_STORED_BYTES.
+        All claims of a caller together have ``room`` bytes; None: no bound. Raises Problem QUOTA_STORED.
         """
         claim = Claim(self._claimed, caller, room)
         try:

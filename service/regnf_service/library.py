@@ -2,45 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-
 from regnf_core.library_entries import EntryNotes
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.record_store import LibraryEntry
 from regnf_state.records import FieldRecord
-
-# What a caller's work may cost the workers in an hour.
-
-_WINDOW_MINUTES = 60
-
-
-def check_budget(services: Services, caller: str, headers: Mapping[str, str] | None = None) -> None:
-    """Refuse new work of a caller whose work of the last hour has used up the budget.
-
-    Measured seconds count, of failed work too. Raises Problem QUOTA_WORKER_SECONDS.
-    """
-    budget = services.settings.quota_worker_seconds_per_hour
-    if budget is None:
-        return
-    wait_s = seconds_until_free(services.queue.spent(caller), budget, services.records.now())
-    if wait_s:
-        raise Problem("QUOTA_WORKER_SECONDS", headers={**(headers or {}), "Retry-After": str(wait_s)})
-
-
-def seconds_until_free(spent: Mapping[int, float], budget: float, now: float) -> int:
-    """When enough of what was spent is an hour ago, whole seconds from now; 0: now."""
-    total = sum(spent.values())
-    for minute, seconds in sorted(spent.items()):
-        if total < budget:
-            break
-        total -= seconds
-        free_at = (minute + _WINDOW_MINUTES) * 60
-        if total < budget:
-            return max(1, math.ceil(free_at - now))
-    return 0
 
 
 def find_entry(services: Services, caller: str, name: str) -> LibraryEntry:
@@ -53,7 +20,7 @@ def find_entry(services: Services, caller: str, name: str) -> LibraryEntry:
 
 def add_entry(services: Services, caller: str, sha256: str, notes: EntryNotes) -> tuple[LibraryEntry, bool]:
     """The entry, and whether it is new. Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IN_LIBRARY,
-    QUOTA_WORKER_SECONDS, NameTakenError."""
+    NameTakenError."""
     field = services.records.get_field(reference_of(caller, sha256))
     if field is None:
         raise Problem("FIELD_NOT_FOUND")
@@ -64,7 +31,6 @@ def add_entry(services: Services, caller: str, sha256: str, notes: EntryNotes) -
         return held, False
     if held is not None:
         raise Problem("FIELD_IN_LIBRARY")
-    check_budget(services, caller)
     field = services.records.set_entry(field, notes)
     if field.state == "ready" and field.symmetry is None:
         services.queue.enqueue_import(field.sha256, field.attempt)  # its model is made, and its symmetry found

@@ -12,8 +12,6 @@ from typing import Any
 from regnf_state.reasons import REASONS, problem_document
 
 RETRY_LATER = {"Retry-After": "5"}
-CLOSE = {"Connection": "close"}
-"""The connection cannot be used again when the body was not read to its end."""
 MAX_ERRORS = 32
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 

@@ -1,21 +1,21 @@
-"""The HTTP server of `regnf serve` and of the images: uvicorn, with limits on connections."""
+"""The HTTP server of `regnf serve` and of the images: uvicorn, and the application that it serves."""
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import gc
 import logging
+import resource
 import signal
 import socket
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import FrameType
-from typing import Any, cast
+from typing import Any
 
 import uvicorn
 from fastapi import Depends, FastAPI
@@ -26,15 +26,13 @@ from starlette.staticfiles import StaticFiles
 from regnf_core import __version__
 from regnf_service.concurrency import in_thread, pause
 from regnf_service.http import problems
-from regnf_service.http.connections import ClientClock, Connections
 from regnf_service.http.contract import build_contract
-from regnf_service.http.guarded_protocol import GuardedProtocol
 from regnf_service.http.hosts import OriginGate, allowed_hosts, cors_layer, cors_origins
-from regnf_service.http.middleware import Buckets, RequestContext, RequestGate, TokenGate, TurnGate
+from regnf_service.http.middleware import RequestContext, RequestGate, TokenGate, TurnGate
 from regnf_service.http.query import refuse_unknown_parameters
-from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter, WriteGate
+from regnf_service.http.rate_limits import RateGate, RateLimiter
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
-from regnf_service.metrics import Measured, Metrics, raise_limit, served, shared_out
+from regnf_service.metrics import Metrics, served
 from regnf_service.services import Services
 from regnf_service.tokens import Callers, read_callers
 from regnf_service.upkeep.housekeeping import Housekeeper
@@ -42,7 +40,7 @@ from regnf_service.upkeep.reaper import Reaper
 from regnf_service.webhooks.service import deliver_until_stopped, webhooks_of
 from regnf_state.journal.journal import StorageMismatchError, claim_storage
 from regnf_state.journal.journaled_records import Rebuilder
-from regnf_state.settings import MIB, Settings
+from regnf_state.settings import Settings
 from regnf_state.stores import Stores, open_stores
 
 # Ending long answers when the process is told to stop.
@@ -60,25 +58,20 @@ def stopping_on_signals(stopping: asyncio.Event) -> Iterator[None]:
         yield
         return
     loop = asyncio.get_running_loop()
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-
-    def listener(earlier: Any) -> Callable[[int, FrameType | None], None]:
-        def listen(number: int, frame: FrameType | None) -> None:
-            loop.call_soon_threadsafe(stopping.set)
-            if callable(earlier):
-                earlier(number, frame)
-
-        return listen
-
     # a signal without a Python handler keeps its default, which ends the process anyway
-    handled = [number for number in _SIGNALS if callable(before[number])]
-    for number in handled:
-        signal.signal(number, listener(before[number]))
+    earlier = {number: handler for number in _SIGNALS if callable(handler := signal.getsignal(number))}
+
+    def listen(number: int, frame: FrameType | None) -> None:
+        loop.call_soon_threadsafe(stopping.set)
+        earlier[signal.Signals(number)](number, frame)
+
+    for number in earlier:
+        signal.signal(number, listen)
     try:
         yield
     finally:
-        for number in handled:
-            signal.signal(number, before[number])
+        for number, handler in earlier.items():
+            signal.signal(number, handler)
 
 
 # What the application does beside requests: it finds lost jobs, sends webhooks, serves metrics, and stops in order.
@@ -95,12 +88,8 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
         app.openapi()  # takes a while, so not during the first request
         await in_thread(_check_storage, services)
         reaping = asyncio.create_task(_reap(services))
-        delivering = asyncio.create_task(
-            deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
-        )
-        at = services.settings
-        scrapes = served(metrics.registry, allowed_hosts(at), at.metrics_address)
-        with scrapes, stopping_on_signals(services.stopping):
+        delivering = asyncio.create_task(deliver_until_stopped(services.webhooks, services.records, services.stopping))
+        with served(metrics.registry, services.settings.metrics_address), stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
         # the server has interrupted the uploads that were running, and does not wait until they are cleaned up
@@ -124,7 +113,6 @@ def _check_storage(services: Services) -> None:
 
 
 async def _reap(services: Services) -> None:
-    """Look after lost jobs every fifteen seconds until the service stops."""
     records, queue, redis, blobs = services.records, services.queue, services.redis, services.blobs
     rebuilder = Rebuilder(records, queue, blobs)
     housekeeper = Housekeeper(records, blobs, redis, services.settings)
@@ -152,9 +140,8 @@ def create_app(
     settings: Settings | None = None,
     stores: Stores | None = None,
     limiter: RateLimiter | None = None,
-    connections: Connections | None = None,
 ) -> FastAPI:
-    """The application over the given stores, or over those that the settings name; ``connections`` are its server's.
+    """The application over the given stores, or over those that the settings name.
 
     Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable, HostsError likewise.
     """
@@ -162,10 +149,10 @@ def create_app(
     callers = read_callers(settings.api_tokens)
     stores = stores or open_stores(settings, retries=None, storage_wait_s=_STORAGE_WAIT_S)
     if limiter is None and settings.calls_per_s:
-        limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
+        limiter = RateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
     webhooks = webhooks_of(settings, stores.redis)
     services = Services(settings, stores.redis, stores.records, stores.blobs, stores.queue, webhooks)
-    metrics = Metrics(services, connections)
+    metrics = Metrics(services)
     app = FastAPI(
         title="regnf",
         version=__version__,
@@ -198,16 +185,13 @@ def _middleware(
         allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
     )
     limits = [Middleware(RequestGate, slots=services.requests)]
-    if settings.writes_per_s:
-        limits.append(Middleware(WriteGate, buckets=Buckets(settings.writes_per_s, settings.write_limit_burst)))
     if limiter is not None:
         limits.append(Middleware(RateGate, limiter=limiter))
     origins = cors_origins(settings)
     hosts = Middleware(OriginGate, hosts=allowed_hosts(settings), origins=origins)
     turns = Middleware(TurnGate, callers=callers if settings.needs_token else {})
     return [
-        Middleware(RequestContext),
-        Middleware(Measured, metrics=metrics),
+        Middleware(RequestContext, count=metrics.count),
         turns,
         hosts,
         *cors_layer(origins),
@@ -225,9 +209,10 @@ def _include_routers(app: FastAPI, **how: Any) -> None:
 
 _DRAIN_S = 5
 """How long open requests may go on once the process is told to stop."""
-_MOST_UNREAD = 64 * MIB
-_EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-_SHED = 64
+_MOST_HEAD_BYTES = 16 * 1024
+_IDLE_S = 75
+"""How long a connection stays open between two requests: longer than a proxy keeps one that it may use again."""
+_MOST_DESCRIPTORS = 65536
 _SWITCH_S = 0.001
 """After how long a thread that computes lets the next one on: a call passes through several, and each time waits for
 those of others. The interpreter's own 5 ms make that a tenth of a second beside four of them."""
@@ -236,22 +221,18 @@ _COLLECTIONS = (2_000, 50, 1_000)
 logger = logging.getLogger(__name__)
 
 
-class GuardedServer(uvicorn.Server):
-    """Serves one application on sockets that it is given."""
+class Server(uvicorn.Server):
+    """Serves one application on sockets that it is given. Slow clients are for the proxy in front."""
 
     def __init__(self, settings: Settings) -> None:
-        share = shared_out(raise_limit(), settings.max_connections)
-        half = share.connections if settings.behind_proxy else max(1, share.connections // 2)
-        of_address = min(settings.max_connections_per_address or half, share.connections)
-        self._connections = Connections(share.connections, of_address, _MOST_UNREAD)
-        clock = ClientClock(settings.header_timeout_s, settings.upload_stall_s, settings.min_bytes_per_s)
-        self._settings = settings
+        raise_descriptor_limit()
         config = uvicorn.Config(
-            self._application,
+            lambda: create_app(settings),
             factory=True,
-            http=cast(Any, partial(GuardedProtocol, connections_held=self._connections, clock=clock)),
+            http="h11",
             ws="none",
-            backlog=share.backlog,
+            timeout_keep_alive=_IDLE_S,
+            h11_max_incomplete_event_size=_MOST_HEAD_BYTES,
             log_config=None,
             access_log=False,
             server_header=False,
@@ -261,27 +242,22 @@ class GuardedServer(uvicorn.Server):
         )
         super().__init__(config)
 
-    def _application(self) -> FastAPI:
-        return create_app(self._settings, connections=self._connections)
-
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        asyncio.get_running_loop().set_exception_handler(self._note)
         await super().startup(sockets)
         sys.setswitchinterval(_SWITCH_S)
         _collect_seldom()
 
-    def _note(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """The loop reports each connection that it cannot accept, with a traceback: make room instead."""
-        error = context.get("exception")
-        if isinstance(error, OSError) and error.errno in _EXHAUSTED:
-            logger.warning("no descriptor for a new connection: connections that keep the server waiting are closed")
-            self._connections.shed(_SHED)
-        else:
-            loop.default_exception_handler(context)
+
+def raise_descriptor_limit() -> None:
+    """Allow this process as many open files as the system does, up to a number that is enough."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _MOST_DESCRIPTORS)
+    if resource.RLIM_INFINITY != soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _collect_seldom() -> None:
-    """Thousands of connections are many objects: each full garbage collection stops every answer for .2 to .5 s.
+    """Thousands of connections are many objects: each full garbage collection stops every answer for 0.2 to 0.5 s.
 
     What is loaded by now stays for good and is left out.
     """

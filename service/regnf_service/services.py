@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import time
-from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Protocol
 from weakref import WeakValueDictionary
 
 from anyio import CapacityLimiter, to_thread
 from redis import Redis
 
 from regnf_service.concurrency import Slots, UnderWay, Waiters, pause
-from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.webhooks.targets import Webhooks
 from regnf_state.batches import Batches
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.pieces import Pieces
-from regnf_state.records import JobNews, Quota, quota_of
+from regnf_state.records import JobNews, quota_of
 from regnf_state.redis.queue import JobQueue
 from regnf_state.room import Originals, Room
 from regnf_state.settings import Settings
@@ -42,134 +36,31 @@ class JobWatch:
         self._look = look
         self._stopping = stopping
         self._limiter = CapacityLimiter(1)
-        self._asked: dict[Position, list[asyncio.Future[JobNews]]] = {}
+        self._asked: dict[Position, asyncio.Future[JobNews]] = {}
         self._next_round = 0.0
         self._rounds: asyncio.Task[None] | None = None
 
     async def news(self, job_id: str, after: str | None) -> JobNews:
         """The job, and its events after ``after``, as the next round finds them. Raises what ``look`` raises."""
-        answer: asyncio.Future[JobNews] = asyncio.get_running_loop().create_future()
-        self._asked.setdefault((job_id, after), []).append(answer)
+        answer = self._asked.setdefault((job_id, after), asyncio.get_running_loop().create_future())
         if self._rounds is None or self._rounds.done():
             self._rounds = asyncio.create_task(self._run())
-        return await answer
+        return await asyncio.shield(answer)  # others may wait for the same
 
     async def _run(self) -> None:
-        """Rounds for as long as a stream asks."""
         while self._asked:
             await pause(self._next_round - time.monotonic(), self._stopping)
             asked, self._asked = self._asked, {}
             self._next_round = time.monotonic() + _ROUND_S
-            # a stream that its client has left no longer waits for an answer
-            waiting = {position: left for position, answers in asked.items() if (left := _open(answers))}
-            if waiting:
-                await self._answer(waiting)
-
-    async def _answer(self, asked: dict[Position, list[asyncio.Future[JobNews]]]) -> None:
-        try:
-            found = await to_thread.run_sync(self._look, list(asked), limiter=self._limiter)
-        except Exception as error:  # noqa: BLE001 -- every stream that asked raises it
-            for answer in (answer for answers in asked.values() for answer in _open(answers)):
-                answer.set_exception(error)
-            return
-        for answers, news in zip(asked.values(), found, strict=True):
-            for answer in _open(answers):
+            try:
+                found = await to_thread.run_sync(self._look, list(asked), limiter=self._limiter)
+            except Exception as error:  # noqa: BLE001 -- every stream that asked raises it
+                for answer in asked.values():
+                    answer.set_exception(error)
+                    answer.exception()  # looked at, whether or not its streams are still there
+                continue
+            for answer, news in zip(asked.values(), found, strict=True):
                 answer.set_result(news)
-
-
-def _open(answers: list[asyncio.Future[JobNews]]) -> list[asyncio.Future[JobNews]]:
-    return [answer for answer in answers if not answer.done()]
-
-
-# How many uploads a caller may have at once. One that is too slow loses its place when another asks for it.
-
-_LOOK_EVERY_S = 0.02
-_GRACE_S = 1.0
-"""How far an upload may be behind the slowest pace before it loses its place: a few round trips of a bad line."""
-_MOST_WAIT_S = 10.0
-"""How long another waits for a place: until several hundred before it have each had theirs for that time."""
-
-
-class Sender(Protocol):
-    """Who sends an upload."""
-
-    def behind_s(self) -> float:
-        """By how much it is slower than it has to be; negative: faster."""
-        ...
-
-    def cut(self) -> None:
-        """End its upload."""
-        ...
-
-
-class UploadSlots:
-    """At most ``most`` for each caller. For one event loop."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._held: dict[str, list[Sender]] = {}
-        self._lines: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
-        self._under_way: Counter[str] = Counter()
-
-    @property
-    def taken(self) -> int:
-        """How many uploads of all callers are under way, those that lost their place and are being cleared up too."""
-        return self._under_way.total()
-
-    async def emptied(self, seconds: float) -> None:
-        """Wait until none is under way, at most this long."""
-        deadline = time.monotonic() + seconds
-        while self.taken and time.monotonic() < deadline:
-            await asyncio.sleep(_LOOK_EVERY_S)
-
-    @asynccontextmanager
-    async def held(self, caller: str, sender: Sender, count: int = 1) -> AsyncIterator[None]:
-        """So many places for as long as the context lasts.
-
-        Where all are taken, it waits its turn for a moment, unless all have been fast. Raises Problem TOO_MANY_UPLOADS.
-        """
-        await self._wait(caller, count)
-        held = self._held.setdefault(caller, [])
-        held += [sender] * count
-        self._under_way[caller] += count
-        try:
-            yield
-        finally:
-            self._under_way[caller] -= count
-            if not self._under_way[caller]:
-                del self._under_way[caller]
-            self._remove(caller, sender)
-
-    async def _wait(self, caller: str, count: int) -> None:
-        line = self._lines.setdefault(caller, asyncio.Lock())
-        if not line.locked() and self._has_room(caller, count):
-            return
-        try:
-            async with asyncio.timeout(_MOST_WAIT_S), line:
-                while not self._has_room(caller, count):
-                    await asyncio.sleep(_LOOK_EVERY_S)
-        except TimeoutError as error:
-            raise _refusal() from error
-
-    def _has_room(self, caller: str, count: int) -> bool:
-        """Whether there is room, if need be in place of the slowest. Raises Problem when none can become so slow."""
-        while len(held := self._held.get(caller, [])) + count > self._most:
-            slowest = max(held, key=lambda sender: sender.behind_s(), default=None)
-            behind = -math.inf if slowest is None else slowest.behind_s()
-            if slowest is None or behind + _MOST_WAIT_S < _GRACE_S:
-                raise _refusal()
-            if behind < _GRACE_S:
-                return False
-            slowest.cut()
-            self._remove(caller, slowest)
-        return True
-
-    def _remove(self, caller: str, sender: Sender) -> None:
-        held = [other for other in self._held.get(caller, []) if other is not sender]
-        if held:
-            self._held[caller] = held
-        else:
-            self._held.pop(caller, None)
 
 
 class Assemblies:
@@ -187,78 +78,34 @@ class Assemblies:
             yield
 
 
-def _refusal() -> Problem:
-    return Problem("TOO_MANY_UPLOADS", headers=RETRY_LATER | CLOSE)
-
-
 _ASSEMBLIES = 4
 """Each holds a copy of a whole upload for a moment."""
 
 
-@dataclass(frozen=True)
 class Services:
     """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
 
-    settings: Settings
-    redis: Redis
-    records: JournaledRecordStore
-    blobs: BlobStore
-    queue: JobQueue
-    webhooks: Webhooks
-    stopping: asyncio.Event = field(default_factory=asyncio.Event)
-    waiters: Waiters = field(default_factory=Waiters)
-
-    @cached_property
-    def quota(self) -> Quota:
-        """What each caller may have."""
-        return quota_of(self.settings)
-
-    @cached_property
-    def room(self) -> Room:
-        """Room for new records."""
-        return Room(self.records, self.blobs, self.redis, self.settings)
-
-    @cached_property
-    def originals(self) -> Originals:
-        """The uploads that stay after their import."""
-        return Originals(self.records, self.blobs, self.settings)
-
-    @cached_property
-    def pieces(self) -> Pieces:
-        """Uploads that come in pieces and are not finished."""
-        return Pieces(self.blobs, self.settings)
-
-    @cached_property
-    def batches(self) -> Batches:
-        """Batches of registrations."""
-        return Batches(self.blobs)
-
-    @cached_property
-    def requests(self) -> Slots:
-        """Requests that are in progress."""
-        return Slots(self.settings.max_requests_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
-
-    @cached_property
-    def uploads(self) -> UploadSlots:
-        """Uploads that are under way."""
-        return UploadSlots(self.settings.max_uploads_per_caller)
-
-    @cached_property
-    def assembling(self) -> Assemblies:
-        """Uploads whose pieces are being put together."""
-        return Assemblies(_ASSEMBLIES)
-
-    @cached_property
-    def under_way(self) -> UnderWay:
-        """The bytes of these uploads."""
-        return UnderWay()
-
-    @cached_property
-    def streams(self) -> Slots:
-        """Event streams that are being read."""
-        return Slots(self.settings.max_streams_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
-
-    @cached_property
-    def job_watch(self) -> JobWatch:
-        """What all event streams look through."""
-        return JobWatch(self.records.news, self.stopping)
+    def __init__(
+        self,
+        settings: Settings,
+        redis: Redis,
+        records: JournaledRecordStore,
+        blobs: BlobStore,
+        queue: JobQueue,
+        webhooks: Webhooks,
+    ) -> None:
+        self.settings, self.redis, self.records = settings, redis, records
+        self.blobs, self.queue, self.webhooks = blobs, queue, webhooks
+        self.stopping = asyncio.Event()
+        self.waiters = Waiters()
+        self.quota = quota_of(settings)
+        self.room = Room(records, blobs, redis, settings)
+        self.originals = Originals(records, blobs, settings)
+        self.pieces = Pieces(blobs, settings)
+        self.batches = Batches(blobs)
+        self.requests = Slots(settings.max_requests_per_caller, "requests")
+        self.uploads = Slots(settings.max_uploads_per_caller, "uploads")
+        self.streams = Slots(settings.max_streams_per_caller, "event streams")
+        self.assembling = Assemblies(_ASSEMBLIES)
+        self.under_way = UnderWay()
+        self.job_watch = JobWatch(records.news, self.stopping)

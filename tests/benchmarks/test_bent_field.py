@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from pathlib import Path
 
-import pytest
 import torch
 from torch import Tensor
 
 from benchmarks.robust.bent_field import BentField
+from benchmarks.robust.plain_field import PlainField
+from regnf_core import open_field
 from regnf_core.fields.composite import BoxField
 
 BOX = BoxField((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
@@ -33,30 +34,14 @@ def test_the_gradient_is_that_of_the_value() -> None:
         assert slope.abs().max() > 0.1
 
 
-def test_errors_have_the_deviation_and_correlation_asked_for() -> None:
-    amplitude, length = 0.01, 0.3
-    points = places(400)
-    aside = torch.tensor([length, 0.0, 0.0])
-    here, there = [], []
-    for seed in range(60):
-        field = BentField(BOX, amplitude, length, seed)
-        here.append(field.signed_distance(points) - BOX.signed_distance(points))
-        there.append(field.signed_distance(points + aside) - BOX.signed_distance(points + aside))
-    a, b = torch.stack(here), torch.stack(there)
-    assert float(a.std()) == pytest.approx(amplitude, rel=0.05)
-    assert abs(float(a.mean())) < 0.05 * amplitude
-    assert float((a * b).mean() / a.square().mean()) == pytest.approx(math.exp(-0.5), abs=0.05)
+# The plain module and the evaluator: two ways to one field.
+
+ROOM = Path(__file__).parents[2] / "examples" / "data" / "mix-room.safetensors"
 
 
-def test_seeds_bend_differently_and_reproducibly() -> None:
-    points = places(50)
-    first, again, other = (BentField(BOX, 0.01, 0.1, seed).signed_distance(points) for seed in (1, 1, 2))
-    assert torch.equal(first, again)
-    assert not torch.allclose(first, other, atol=1e-3)
-
-
-def test_a_moved_field_is_the_same() -> None:
-    field, points = BentField(BOX, amplitude=0.05, length=0.2, seed=3), places(50)
-    moved = field.to("cpu")
-    assert moved is not field
-    assert torch.equal(moved.signed_distance(points), field.signed_distance(points))
+def test_both_evaluators_give_the_same_field() -> None:
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    value, gradient = open_field(ROOM).signed_distance_and_gradient(points)
+    plain_value, plain_gradient = PlainField(ROOM).value_and_gradient(points)
+    assert torch.allclose(value, plain_value, atol=1e-5)
+    assert torch.allclose(gradient, plain_gradient, atol=1e-3)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from benchmarks.attacks.deaths import Deaths
+from benchmarks.service_load.soak import Plan, judged, soak
 
 
 class Clock:
@@ -61,14 +64,14 @@ def test_time_is_counted_from_the_last_death(deaths: Deaths, clock: Clock) -> No
     assert (deaths.last_end(5.0), deaths.last_end(60.0)) == (30.0, 60.0)
 
 
-def test_while_one_is_under_way_no_time_counts(clock: Clock) -> None:
-    deaths = Deaths(clock)
-    seen = []
+# The reduced form of benchmarks.service_load.soak: real jobs while their processes and Redis are killed.
 
-    def deed() -> bool:
-        clock.now = 7.0
-        seen.append((deaths.last_end(0.0), deaths.since(5.0)))
-        return True
 
-    deaths.during("worker", deed)
-    assert seen == [(7.0, 1)]
+@pytest.mark.long
+def test_every_job_ends_as_it_should_while_its_process_and_redis_are_killed(tmp_path: Path) -> None:
+    actions = (("job", 2), ("redis", 1))
+    plan = Plan(9, seed=1, clients=4, workers=1, questions=1, actions=actions, pauses_s=(0.3, 1.0), max_actions=4)
+    run = soak(tmp_path, plan)
+    assert judged(run) == []
+    assert run.outcomes.total() == 9
+    assert run.done.total() == 4

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.guard.__main__ import ROOT, report, tree_of
-from benchmarks.guard.cases import cases
+from benchmarks.guard.__main__ import report
 from benchmarks.guard.fields import DEMO, ROOM, write_grid
 from benchmarks.guard.measure import STAGES, processor_seconds, stages
 from regnf_core import open_field
@@ -28,12 +27,6 @@ def test_reports_medians_and_the_range_of_the_ratios() -> None:
     assert "200 / 100" in text
 
 
-def test_the_present_tree_is_taken_as_it_is(tmp_path: Path) -> None:
-    with tree_of(".", tmp_path / "unused") as tree:
-        assert tree == ROOT
-    assert not (tmp_path / "unused").exists()
-
-
 def test_times_each_run_and_finds_the_stages() -> None:
     def search_poses(number: int) -> int:
         return sum(range(20_000 + number))
@@ -42,11 +35,6 @@ def test_times_each_run_and_finds_the_stages() -> None:
     found = stages(search_poses, 2)
     assert found["search"] > 0.0
     assert found["covariance"] == 0.0
-
-
-def test_names_each_case_once() -> None:
-    names = [case.name for case in cases()]
-    assert len(names) == len(set(names)) >= 10
 
 
 def test_the_grid_is_the_room(tmp_path: Path) -> None:

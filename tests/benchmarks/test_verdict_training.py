@@ -63,19 +63,6 @@ def test_a_known_law_is_found_again() -> None:
     assert abs(float(np.mean(1 / (1 + np.exp(-left_out)))) - float(evidence.right.mean())) < 0.005
 
 
-def test_the_poses_that_count_are_right_on_average() -> None:
-    """Every third pose is right less often than the law says; calibrated on these, that is what is said of them."""
-    evidence, _ = drawn(3000, 5)
-    rarer = (np.arange(3000) % 3 == 0) & (np.random.default_rng(6).uniform(size=3000) < 0.5)
-    evidence = replace(evidence, right=np.where(rarer, 0.0, evidence.right))
-    third = np.arange(3000) % 3 == 0
-    _, by_all = train(evidence)
-    _, by_third = train(replace(evidence, calibrated=third))
-    said_by_all, said = (float(np.mean(1 / (1 + np.exp(-one[third])))) for one in (by_all, by_third))
-    assert abs(said - float(evidence.right[third].mean())) < 0.005
-    assert said_by_all > said + 0.1
-
-
 def test_the_stored_model_says_the_same() -> None:
     evidence, _ = drawn(800, 2)
     model, _ = train(evidence)
@@ -90,15 +77,6 @@ def test_a_feature_that_speaks_the_wrong_way_does_not_count() -> None:
     turned[:, NAMES.index("hidden")] = evidence.right + 0.01 * turned[:, NAMES.index("hidden")]
     model, _ = train(replace(evidence, features=turned))
     assert "hidden" not in model.to_dict()["terms"]  # more that is hidden must not make a pose likelier
-
-
-def test_ambiguity_is_no_error_of_the_probability() -> None:
-    rows = []
-    for number in range(30):
-        values = dict.fromkeys(NAMES, 0.5 + 0.1 * (number % 3))
-        rows.append(row(number, RIGHT if number % 3 else WRONG, **values) | {"listed_mssd": RIGHT})
-    found = trained([*rows, {**rows[0], "listed_mssd": WRONG, "world": "tsdf-9-long"}])
-    assert found.table.startswith("21 registrations of 6 worlds, 20 with a right pose.")
 
 
 def test_a_lead_over_other_answers_counts() -> None:
@@ -120,28 +98,6 @@ def test_a_lead_over_other_answers_counts() -> None:
 
 def _auroc_of(table: str) -> float:
     return float(table.split("AUROC ")[1].split(",")[0])
-
-
-def test_leads_are_by_the_odds_of_the_model_that_is_given() -> None:
-    """Pairs of candidates of which ``tail`` says which one is right; the model that is given knows it, so the lead says
-    it too."""
-    draw = np.random.default_rng(7)
-    rows = []
-    for number in range(300):
-        right = number % 2 == 0
-        rows.append(row(number, RIGHT if right else WRONG, True, (1,), tail=draw.uniform(0.0, 0.2) + 0.5 * (not right)))
-        rows.append(row(number, WRONG, False, (-1,), tail=draw.uniform(0.5, 0.7)))
-    given = {"bias": 0.0, "terms": {"tail": {"knots": [0.0, 1.0], "values": [0.0, -5.0]}}}
-    models = trained(rows, alone=ProbabilityModel.from_dict(given)).model
-    assert set(models) == {"among"}
-    assert models["among"]["terms"][LEAD]["knots"][-1] <= 5.0 * 0.7, "leads are differences of what the model says"
-
-
-def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
-    rows = [row(number, WRONG if number % 2 else RIGHT, offset=0.01 * (number % 2)) for number in range(100)]
-    assert "offset" in trained(rows).model["alone"]["terms"]
-    del rows[7]["features"]["offset"]
-    assert "offset" not in trained(rows).model["alone"]["terms"]
 
 
 @pytest.mark.parametrize("model", [LOOK_ALIKE, SIMILAR])

@@ -35,15 +35,19 @@ Serve = Callable[[Answers], str]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Run:
-    """``run(*arguments)``: the command `regnf` with these arguments. It asks a service again without a pause."""
+    """``run(*arguments)``: the command `regnf` with these arguments. It asks a service again without a pause.
+
+    Fails unless it ends with ``code``, where that is given.
+    """
     monkeypatch.setattr("regnf_client.client.SyncDriver.sleep", lambda *_: None)
     monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # set by the command otherwise, for all tests that follow
 
-    def call(*arguments: object) -> Outcome:
+    def call(*arguments: object, code: int | None = None) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["regnf", *(str(argument) for argument in arguments)])
-        code = command()
+        ended = command()
         captured = capfd.readouterr()
-        return Outcome(code, captured.out, captured.err)
+        assert code in (None, ended), captured.err
+        return Outcome(ended, captured.out, captured.err)
 
     return call
 

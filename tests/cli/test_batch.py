@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -49,44 +49,6 @@ def results(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.with_suffix(".results.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("member", ["initial_transform", "ground_truth"])
-def test_a_pose_may_be_said_in_either_direction(folder: Path, member: str) -> None:
-    into_scene = [[0.5, 0, 0, 1], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
-    into_object = [[2.0, 0.0, 0.0, -2.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-    (folder / "pose.json").write_text(json.dumps({"T_scene_object": into_scene}))
-    said = [into_object, {"T_object_scene": {"matrix": into_object}}, {"T_scene_object": into_scene}, "pose.json"]
-    path = write(folder, [pair(**{member: one}) for one in (*said, [1, 2])])
-    *read, wrong = read_pairs(path)
-    meant = into_object if member == "initial_transform" else {"T_object_scene": into_object}
-    assert [one.request[member] if one.request else one.error for one in read] == [meant] * len(said)
-    assert wrong.error is not None
-    assert wrong.error.reason == "INVALID_TRANSFORM"
-
-
-@pytest.mark.parametrize(
-    ("member", "value", "reason"),
-    [
-        (
-            "initial_transform",
-            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-            "INITIAL_TRANSFORM_UNSUPPORTED",
-        ),
-        (
-            "ground_truth",
-            {"T_object_scene": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
-            "INVALID_REQUEST",
-        ),
-    ],
-)
-def test_a_search_refuses_what_is_of_one_object(
-    run: Run, folder: Path, member: str, value: object, reason: str
-) -> None:
-    """As a service does; nothing that is given is passed over."""
-    path = write(folder, [pair(object=None, candidates=["armchair.safetensors"], **{member: value})])
-    assert run("batch", str(path), "--processes", "1").code == 1
-    assert [one["error"]["reason"] for one in results(path)] == [reason]
-
-
 def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> None:
     lines: list[dict[str, Any] | str] = [
         pair(key="a"),
@@ -96,8 +58,7 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
         pair(key="search", object=None, candidates=["dining-chair.safetensors", "armchair.safetensors"]),
     ]
     path = write(folder, lines)
-    outcome = run("batch", path, "--processes", 1)
-    assert outcome.code == 1, outcome.stderr
+    outcome = run("batch", path, "--processes", 1, code=1)
     found = {one["line"]: one for one in results(path)}
     reasons = {line: one["error"]["reason"] for line, one in found.items() if one["status"] == "failed"}
     assert reasons == {2: "DETECTION_OUTSIDE_SCENE", 3: "MALFORMED_JSON", 4: "FILE_NOT_FOUND"}
@@ -109,34 +70,13 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
     assert "3 failed" in outcome.stdout
 
 
-def test_a_second_run_does_what_is_left(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[int] = []
-
-    def pretend(one: FilePair) -> dict[str, Any]:
-        done.append(one.line)
-        return (
-            {"status": "failed", "error": {"reason": "X", "detail": "x"}}
-            if one.key == "bad"
-            else {"status": "successful"}
-        )
-
-    monkeypatch.setattr(batch_here, "register_pair", pretend)
-    path = write(folder, [pair(seed=1), pair(seed=2, key="bad")])
-    assert run("batch", path, "--processes", 1).code == 1
-    write(folder, [pair(seed=1), pair(seed=2, key="bad"), pair(seed=3)])
-    with path.with_suffix(".results.jsonl").open("a") as file:
-        file.write('{"id": "torn')
-    assert run("batch", path, "--processes", 1).code == 1
-    assert done == [1, 2, 2, 3]
-    assert len(results(path)) == 4
-    write(folder, [pair(seed=3), pair(seed=1)])
-    assert run("batch", path, "--processes", 1).code == 0
-    assert done == [1, 2, 2, 3], "both were done, wherever they stand now"
-
-
 def test_a_file_that_holds_no_results_is_left_as_it_is(run: Run, folder: Path) -> None:
     path = write(folder, [pair()])
     other = folder / "notes.txt"
+    for torn in ("", "{", '{"id": "b'):
+        other.write_text(torn)
+        ResultsFile(other)
+        assert other.read_text() == "", "a first line that is torn is cut off"
     for held in (b"not mine\n", b"not mine", b"\xa0\0\n\xff", b'{"id": "a", "status": "successful"}\nmine'):
         other.write_bytes(held)
         outcome = run("batch", path, "--output", other)
@@ -148,39 +88,67 @@ def test_a_file_that_holds_no_results_is_left_as_it_is(run: Run, folder: Path) -
     assert path.read_bytes() == before
 
 
-def test_a_table_is_read_too(folder: Path) -> None:
-    path = folder / "pairs.csv"
-    with path.open("w", newline="") as file:
-        rows = csv.DictWriter(file, ["key", "scene", "object", "detection", "seed"])
-        rows.writeheader()
-        rows.writerow({"key": "a", **pair(options=None), "seed": 7})
-        rows.writerow({"key": "b", **pair(options=None)})
-    first, second = read_pairs(path)
-    assert (first.key, first.line, first.scene) == ("a", 2, str(folder / "mix-room.safetensors"))
-    assert (first.request or {})["seed"] == 7
-    assert (second.request or {})["seed"] == 0
-    box = json.loads((folder / "detection.json").read_text())
-    assert (first.request or {})["detection"]["center"] == pytest.approx(box["center"])
+UNIT = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+NO_PAIRS: list[tuple[str | dict[str, Any], str]] = [
+    ("7", "INVALID_REQUEST"),
+    (pair(detections=[]), "INVALID_REQUEST"),
+    (pair(object=None), "INVALID_REQUEST"),
+    (pair(candidates=["armchair.safetensors"]), "INVALID_REQUEST"),
+    (pair(seed=-1), "INVALID_REQUEST"),
+    (pair(options={"robust": {"rotation": 3}}), "INVALID_OPTIONS"),
+    (pair(detection="nothing.json"), "FILE_NOT_FOUND"),
+    (pair(object=7), "INVALID_REQUEST"),
+    (pair(initial_transform=[1, 2]), "INVALID_TRANSFORM"),
+    (pair(ground_truth=[1, 2]), "INVALID_TRANSFORM"),
+]
 
 
 def test_what_is_no_pair_says_why(folder: Path) -> None:
-    lines: list[dict[str, Any] | str] = [
-        "7",
-        pair(detections=[]),
-        pair(object=None),
-        pair(candidates=["armchair.safetensors"]),
-        pair(seed=-1),
-        pair(options={"robust": {"rotation": 3}}),
-        pair(detection="nothing.json"),
-        pair(object=7),
-    ]
-    found = list(read_pairs(write(folder, lines)))
-    assert [one.error and one.error.reason for one in found] == [
-        "INVALID_REQUEST", "INVALID_REQUEST", "INVALID_REQUEST", "INVALID_REQUEST", "INVALID_REQUEST",
-        "INVALID_OPTIONS", "FILE_NOT_FOUND", "INVALID_REQUEST",
-    ]  # fmt: skip
-    assert found[1].error is not None
-    assert "detection" in (found[1].error.hint or "")
+    found = list(read_pairs(write(folder, [line for line, _ in NO_PAIRS])))
+    assert [one.error and one.error.reason for one in found] == [reason for _, reason in NO_PAIRS]
+    assert "detection" in ((found[1].error and found[1].error.hint) or "")
+
+
+@pytest.mark.parametrize("member", ["initial_transform", "ground_truth"])
+def test_a_pose_may_be_said_in_either_direction(folder: Path, member: str) -> None:
+    into_scene = [[0.5, 0, 0, 1], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
+    into_object = [[2.0, 0.0, 0.0, -2.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    (folder / "pose.json").write_text(json.dumps({"T_scene_object": into_scene}))
+    said = [into_object, {"T_object_scene": {"matrix": into_object}}, {"T_scene_object": into_scene}, "pose.json"]
+    read = read_pairs(write(folder, [pair(**{member: one}) for one in said]))
+    meant = into_object if member == "initial_transform" else {"T_object_scene": into_object}
+    assert [one.request[member] if one.request else one.error for one in read] == [meant] * len(said)
+
+
+def test_a_search_refuses_what_is_of_one_object(run: Run, folder: Path) -> None:
+    """As a service does; nothing that is given is passed over."""
+    search = {"object": None, "candidates": ["armchair.safetensors"]}
+    wrong = [pair(**search, initial_transform=UNIT), pair(**search, ground_truth={"T_object_scene": UNIT})]
+    path = write(folder, wrong)
+    assert run("batch", path, "--processes", 1).code == 1
+    assert [one["error"]["reason"] for one in results(path)] == ["PRESET_UNSUITABLE", "INVALID_REQUEST"]
+
+
+def test_a_second_run_does_what_is_left(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    failed = {"status": "failed", "error": {"reason": "X", "detail": "x"}}
+
+    def pretend(one: FilePair) -> dict[str, Any]:
+        done.append(one.line)
+        return failed if one.key == "bad" else {"status": "successful"}
+
+    monkeypatch.setattr(batch_here, "register_pair", pretend)
+    path = write(folder, [pair(seed=1), pair(seed=2, key="bad")])
+    assert run("batch", path, "--processes", 1).code == 1
+    write(folder, [pair(seed=1), pair(seed=2, key="bad"), pair(seed=3)])
+    with path.with_suffix(".results.jsonl").open("a") as file:
+        file.write('{"id": "torn' + "x" * 10_000)
+    assert run("batch", path, "--processes", 1).code == 1
+    assert done == [1, 2, 2, 3]
+    assert len(results(path)) == 4
+    write(folder, [pair(seed=3), pair(seed=1)])
+    assert run("batch", path, "--processes", 1).code == 0
+    assert done == [1, 2, 2, 3], "both were done, wherever they stand now"
 
 
 def test_several_processes_find_the_same(folder: Path) -> None:
@@ -194,17 +162,14 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
     import regnf_client
     from regnf_client import PairResult
 
-    class Pretended:
-        def __init__(self, *_: object, **__: object) -> None: ...
-        def __enter__(self) -> Pretended:
-            return self
-
-        def __exit__(self, *_: object) -> None: ...
+    class Pretended(nullcontext[Any]):
+        def __init__(self, *_: object, **__: object) -> None:
+            super().__init__(self)
 
         def batch(self, requests: Iterator[Any]) -> Iterator[PairResult]:
             for index, one in enumerate(requests):
-                assert one.more["pictures"] is (one.seed == 3)  # as the file says, else none
-                told = {"status": "successful", "verdict": "registered", "job": f"job {one.seed}"}
+                assert one["pictures"] is (one["seed"] == 3)  # as the file says, else none
+                told = {"status": "successful", "verdict": "registered", "job": f"job {one['seed']}"}
                 matrix = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
                 back = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
                 poses = {"T_scene_object": back, "T_object_scene": matrix, "probability": 0.9}
@@ -215,18 +180,5 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
     assert run("batch", path, "--server", "http://localhost:1").code == 1
     found = {one["line"]: one for one in results(path)}
     assert (found[1]["job"], found[3]["job"], found[2]["status"]) == ("job 1", "job 3", "failed")
-    assert found[3]["T_object_scene"]["scale"] == pytest.approx(2.0)
-    assert found[3]["T_scene_object"]["scale"] == pytest.approx(0.5)
-    assert found[3]["probability"] == 0.9
-    assert found[3]["key"] == "c"
-
-
-def test_a_torn_line_is_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "results.jsonl"
-    path.write_text('{"id": "a", "status": "successful"}\n' + '{"id": "b", "note": "' + "x" * 10_000)
-    ResultsFile(path)
-    assert path.read_text() == '{"id": "a", "status": "successful"}\n'
-    for torn in ("", "{", '{"id": "b'):
-        path.write_text(torn)
-        ResultsFile(path)
-        assert path.read_text() == ""
+    assert [found[3][name]["scale"] for name in ("T_object_scene", "T_scene_object")] == pytest.approx([2.0, 0.5])
+    assert (found[3]["probability"], found[3]["key"]) == (0.9, "c")

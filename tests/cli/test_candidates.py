@@ -13,7 +13,7 @@ from PIL import Image
 from regnf_core.errors import Candidate, FieldFormatError
 from regnf_core.importing.gate import gate
 from tests.cli.conftest import DATA, Run, Serve, field
-from tests.core.importing.gate.test_candidates import octahedron
+from tests.core.importing.gate.test_candidates import two_scales
 
 ASKED = (Candidate("it's smooth", {"hash": {"interpolation": "smoothstep"}}, b"png"), Candidate("b", {"sign": -1}))
 
@@ -49,6 +49,9 @@ def test_each_line_can_be_pasted(run: Run, tmp_path: Path) -> None:
     assert lines_of(outcome.stderr, "--description") == [smooth, said | {"sign": -1}]
     outcome = run("convert", tmp_path / "a.ckpt", tmp_path / "a.safetensors")
     assert lines_of(outcome.stderr, "--description") == [dict(one.description) for one in ASKED]
+    outcome = run("inspect", tmp_path / "a.ckpt", "--candidates", tmp_path / "absent" / "new")
+    assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "INVALID_OPTIONS")
+    assert "mkdir -p" in outcome.stderr
 
 
 @pytest.mark.usefixtures("asking")
@@ -57,30 +60,17 @@ def test_a_registration_names_the_option_of_the_field(use: str, run: Run, tmp_pa
     fields = {"scene": DATA / "mix-room.safetensors", "object": DATA / "armchair.safetensors"}
     fields[use] = tmp_path / "a.ckpt"
     fields[use].write_bytes(b"PK\x03\x04")
-    outcome = run("register", *fields.values(), "--detection", DATA / "detection.json")
-    assert outcome.code == 2
+    outcome = run("register", *fields.values(), "--detection", DATA / "detection.json", code=2)
     assert len(lines_of(outcome.stderr, f"--{use}-description")) == 2
 
 
-@pytest.mark.usefixtures("asking")
-def test_pictures_are_written_where_they_were_made(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "a.ckpt").write_bytes(b"PK\x03\x04")
-    outcome = run("inspect", tmp_path / "a.ckpt", "--candidates", tmp_path / "new")
-    assert outcome.code == 2
-    assert {path.name: path.read_bytes() for path in (tmp_path / "new").iterdir()} == {"1.png": b"png"}
-    assert f"wrote {tmp_path / 'new' / '1.png'}\n" in outcome.stderr
-    outcome = run("inspect", tmp_path / "a.ckpt", "--candidates", tmp_path / "absent" / "new")
-    assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "INVALID_OPTIONS")
-    assert "mkdir -p" in outcome.stderr
-
-
 def test_a_line_and_a_picture_of_a_real_file(run: Run, tmp_path: Path) -> None:
-    upload = octahedron(tmp_path)
-    outcome = run("inspect", upload, "--candidates", tmp_path / "new", "--description", '{"output_tanh": 0}')
-    assert outcome.code == 2
+    upload = two_scales(tmp_path)
+    outcome = run("inspect", upload, "--candidates", tmp_path / "new", "--description", '{"label": "pot"}', code=2)
     assert f"LAYOUT_AMBIGUOUS {upload}: " in outcome.stderr
+    assert f"wrote {tmp_path / 'new' / '1.png'}\n" in outcome.stderr
     lines = lines_of(outcome.stderr, "--description")
-    (number,) = (number for number, line in enumerate(lines, 1) if line["activation"] == "relu")
+    (number,) = (number for number, line in enumerate(lines, 1) if line["input_scale"] == 1.0)
     with Image.open(tmp_path / "new" / f"{number}.png") as picture:
         assert picture.size == (576, 192)
     assert run("inspect", upload, "--description", json.dumps(lines[number - 1])).code == 0
@@ -104,7 +94,6 @@ def test_a_service_asks_as_well(run: Run, serve: Serve, tmp_path: Path) -> None:
 
     fields = (tmp_path / "a.ckpt", DATA / "armchair.safetensors")
     said = ("--scene-description", '{"label": "room"}')
-    outcome = run("register", *fields, "--detection", DATA / "detection.json", *said, "--server", serve(answer))
-    assert outcome.code == 2, outcome.stderr
+    outcome = run("register", *fields, "--detection", DATA / "detection.json", *said, "--server", serve(answer), code=2)
     assert f"LAYOUT_AMBIGUOUS {tmp_path / 'a.ckpt'}: which?" in outcome.stderr
     assert lines_of(outcome.stderr, "--scene-description") == [{"label": "room", "sign": 1}]

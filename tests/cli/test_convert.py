@@ -28,8 +28,7 @@ def test_a_mesh_becomes_a_safe_field_and_a_grid(run: Run, tmp_path: Path) -> Non
     trimesh.creation.icosphere(subdivisions=3, radius=0.5).export(tmp_path / "ball.glb")
     (tmp_path / "said.json").write_text('{"label": "ball"}')
     safe, grid = tmp_path / "ball.safetensors", tmp_path / "ball.npz"
-    outcome = run("convert", tmp_path / "ball.glb", safe, "--description", tmp_path / "said.json")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run("convert", tmp_path / "ball.glb", safe, "--description", tmp_path / "said.json", code=0)
     assert outcome.stdout.startswith(f"{safe}: mesh, ")
     assert (read_description(safe)["kind"], read_description(safe)["label"]) == ("mesh", "ball")
     assert open_field(safe).signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.5, abs=0.01)
@@ -39,8 +38,7 @@ def test_a_mesh_becomes_a_safe_field_and_a_grid(run: Run, tmp_path: Path) -> Non
 
 
 def test_a_field_becomes_a_mesh(run: Run, tmp_path: Path) -> None:
-    outcome = run("convert", DATA / "armchair.safetensors", tmp_path / "chair.ply", "--resolution", 24)
-    assert outcome.code == 0, outcome.stderr
+    outcome = run("convert", DATA / "armchair.safetensors", tmp_path / "chair.ply", "--resolution", 24, code=0)
     assert "triangles" in outcome.stdout
     assert trimesh.load_mesh(tmp_path / "chair.ply").is_watertight
 
@@ -52,28 +50,9 @@ def test_what_is_read_is_not_overwritten(run: Run, tmp_path: Path) -> None:
     link.symlink_to(mesh)
     before = mesh.read_bytes()
     for given, output in ((mesh, mesh), (mesh, link), (link, mesh)):
-        outcome = run("convert", given, output)
-        assert outcome.code == 2
+        outcome = run("convert", given, output, code=2)
         assert outcome.stderr.startswith(f"INVALID_OPTIONS {output}: it is read, and would be overwritten")
     assert mesh.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("output", "reason"),
-    [
-        ("chair.stl", "INVALID_OPTIONS"),
-        ("absent/chair.ply", "INVALID_OPTIONS"),
-        ("chair.safetensors", "FORMAT_NOT_RECOGNIZED"),
-        ("chair.ply", "FORMAT_NOT_RECOGNIZED"),
-    ],
-)
-@pytest.mark.usefixtures("cache")
-def test_refusals(output: str, reason: str, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "field.ckpt").write_bytes(bytes(8) + b"{" if reason == "INVALID_OPTIONS" else b"\x07" * 4000)
-    outcome = run("convert", tmp_path / "field.ckpt", tmp_path / output)
-    assert outcome.code == 2
-    assert outcome.stderr.startswith(f"{reason} ")
-    assert {path.name for path in tmp_path.iterdir()} <= {"field.ckpt", "cache"}
 
 
 @pytest.mark.usefixtures("cache")
@@ -81,11 +60,10 @@ def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) 
     ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_RADIUS).apply_translation(BALL_CENTER)
     box = trimesh.creation.box(extents=2.0 * BOX_HALF).apply_translation(BOX_CENTER)
     trimesh.util.concatenate([ball, box]).export(tmp_path / "scene.glb")
-    seen = images()
+    seen = images(count=4)
     write_dataset(seen, tmp_path / "images")
     safe = tmp_path / "scene.safetensors"
-    outcome = run("convert", tmp_path / "scene.glb", safe, "--images", tmp_path / "images")
-    assert outcome.code == 0, outcome.stderr
+    run("convert", tmp_path / "scene.glb", safe, "--images", tmp_path / "images", code=0)
     kept, made = observation_of(open_field(safe)), observe(seen, 160)
     assert kept is not None
     assert made is not None
@@ -100,28 +78,19 @@ def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) 
 
 @pytest.mark.usefixtures("cache")
 def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Path) -> None:
-    trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(tmp_path / "ball.glb")
+    trimesh.creation.icosphere(subdivisions=1, radius=0.5).export(tmp_path / "ball.glb")
     # Half a turn about x: a camera at (0, 0, 1.5) that looks down on the ball.
     poses = [f"{index} {0.1 * index} 0 1.5 1 0 0 0" for index in range(3)]
     (tmp_path / "poses.txt").write_text("\n".join(poses))
-    said = ("--intrinsics", "100,100,64,48,128,96")
+    said = ("--intrinsics", "25,25,16,12,32,24")
     safe = tmp_path / "ball.safetensors"
-    outcome = run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said)
-    assert outcome.code == 0, outcome.stderr
-    told = "records which parts were observed"
-    assert told in run("inspect", safe).stdout
-    assert told not in run("inspect", DATA / "armchair.safetensors").stdout
+    run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said, code=0)
+    assert "records which parts were observed" in run("inspect", safe).stdout
     observation = observation_of(open_field(safe))
     assert observation is not None
-    assert observation.at(torch.tensor([[0.0, 0.0, 0.499], [0.0, 0.0, -0.499], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]
-    refusals = {
-        "CAMERAS_OF_ANOTHER_FRAME": ("--cameras", tmp_path / "poses.txt", *said, "--camera-axes", "opengl"),
-        "CAMERAS_INTRINSICS_MISSING": ("--cameras", tmp_path / "poses.txt"),
-        "INVALID_OPTIONS": said,
-    }
-    for reason, options in refusals.items():
-        outcome = run("convert", tmp_path / "ball.glb", safe, *options)
-        assert outcome.code != 0
-        assert reason in outcome.stderr
-    turned = run("convert", tmp_path / "ball.glb", safe, *refusals["CAMERAS_OF_ANOTHER_FRAME"])
-    assert "say --camera-axes opencv" in " ".join(turned.stderr.split())
+    assert observation.at(torch.tensor([[0.0, 0.0, 0.49], [0.0, 0.0, -0.49], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]
+    options = ("--cameras", tmp_path / "poses.txt", *said, "--camera-axes", "opengl")
+    refused = run("convert", tmp_path / "ball.glb", safe, *options, code=2).stderr
+    assert "CAMERAS_OF_ANOTHER_FRAME" in refused
+    assert "say --camera-axes opencv" in " ".join(refused.split())
+    assert "INVALID_OPTIONS" in run("convert", tmp_path / "ball.glb", safe, *said, code=2).stderr

@@ -9,14 +9,16 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.cli.conftest import DATA
+from tests.cli.test_batch import QUICK
 from tests.contract.live import eventually
 
 SIGNALED = """
-import os, signal, sys
+import os, sys
 
 class At:
     "Sends a signal to this process when a module is asked for."
@@ -27,7 +29,6 @@ class At:
             os.kill(os.getpid(), number)
 
 module, number = sys.argv[1], int(sys.argv[2])
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # below nohup it is ignored
 sys.argv = ["regnf", *sys.argv[3:]]
 from regnf_cli.main import main
 sys.meta_path.insert(0, At())
@@ -35,49 +36,52 @@ main()
 """
 ROOM, CHAIR, BOX = (str(DATA / name) for name in ("mix-room.safetensors", "armchair.safetensors", "detection.json"))
 PAIR = [ROOM, CHAIR, "--detection", BOX]
+REGISTER, CONVERT = ["register", *PAIR], ["convert", CHAIR, "a.ply"]
+SERVE = ["serve", "--port", "0", "--state-dir", "state"]
 CUT_OFF = [
-    *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "torch", "regnf_core.library")],
-    ("SIGTERM", "torch", ["register", *PAIR]),
-    ("SIGINT", "torch", ["inspect", CHAIR]),
-    ("SIGTERM", "regnf_core.surface.isosurface", ["convert", CHAIR, "chair.ply"]),
-    ("SIGINT", "regnf_core.rendering.job", ["render", ROOM, "--size", "24x18", "--frames", "1"]),
-    ("SIGHUP", "regnf_cli.supervisor", ["serve", "--port", "0", "--state-dir", "state"]),
-    ("SIGINT", "httpx", ["register", *PAIR, "--server", "http://127.0.0.1:9"]),
-    ("SIGINT", "regnf_cli.doctor", ["doctor"]),
+    ("SIGINT", "typer", REGISTER),
+    ("SIGTERM", "torch", REGISTER),
+    ("SIGHUP", "regnf_cli.supervisor", SERVE),
+    ("SIGINT", "httpx", [*REGISTER, "--server", "http://127.0.0.1:9"]),
     ("SIGINT", "regnf_cli.batch", ["batch", BOX]),
     ("SIGINT", "rich.markdown", ["manual", "api"]),
 ]
 ELSEWHERE = [
-    *[("SIGINT", name, ["register", *PAIR]) for name in ("rich", "pydantic", "regnf_cli.report", "numpy")],
-    *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch._C", "torch.nn")],
-    *[("SIGINT", name, ["register", *PAIR]) for name in ("scipy.spatial", "PIL.Image")],
-    ("SIGHUP", "torch", ["register", *PAIR]),
-    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
-    ("SIGINT", "regnf_cli.inspect", ["inspect", CHAIR]),
-    *[("SIGINT", name, ["convert", CHAIR, "chair.ply"]) for name in ("igl", "igl.pyigl_core")],
-    ("SIGINT", "pydantic_settings", ["serve", "--port", "0", "--state-dir", "state"]),
+    *[("SIGINT", name, REGISTER) for name in ("rich", "pydantic", "regnf_cli.report", "numpy", "regnf_cli.register")],
+    *[("SIGINT", name, REGISTER) for name in ("torch", "torch._C", "torch.nn", "scipy.spatial", "PIL.Image")],
+    ("SIGINT", "regnf_core.library", REGISTER),
+    ("SIGTERM", "regnf_core.surface.isosurface", CONVERT),
+    ("SIGHUP", "torch", REGISTER),
+    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.registration", "torch")],
+    ("SIGINT", "regnf_core.viewing.artifacts", ["search", *PAIR]),
+    *[("SIGINT", name, ["inspect", CHAIR]) for name in ("regnf_cli.inspect", "torch")],
+    *[("SIGINT", name, CONVERT) for name in ("igl", "igl.pyigl_core")],
+    ("SIGINT", "regnf_core.rendering.job", ["render", ROOM, "--size", "24x18", "--frames", "1"]),
+    ("SIGINT", "regnf_cli.doctor", ["doctor"]),
+    ("SIGINT", "pydantic_settings", SERVE),
 ]
 """Every other place where a signal may come; their processes take a minute together."""
 
 
-def run(arguments: Sequence[str], folder: Path, **how: object) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {
-        "XDG_CACHE_HOME": str(folder / "cache"),
-        "TMPDIR": str(folder / "tmp"),
-        "COLUMNS": "120",
-    }
+def heard() -> None:
+    """Below nohup, and in the background of a script, signals are ignored from the start."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def run(arguments: Sequence[str], folder: Path, **how: Any) -> subprocess.CompletedProcess[str]:
+    own = {"XDG_CACHE_HOME": str(folder / "cache"), "TMPDIR": str(folder / "tmp"), "COLUMNS": "120"}
     (folder / "tmp").mkdir(exist_ok=True)
-    return subprocess.run(  # type: ignore[call-overload,no-any-return]
-        [sys.executable, *arguments], cwd=folder, env=environment, text=True, timeout=250, check=False,
-        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | how,
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=os.environ | own, text=True, timeout=100, check=False,
+        preexec_fn=heard, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | how,
     )  # fmt: skip
 
 
 def left(folder: Path) -> list[str]:
     """What lies there beside the caches, with what they have left in the folder for temporary files."""
-    return [one.name for one in folder.iterdir() if one.name not in ("cache", "tmp", "state")] + [
-        one.name for one in (folder / "tmp").iterdir()
-    ]
+    there = [one.name for one in folder.iterdir() if one.name not in ("cache", "tmp", "state")]
+    return there + [one.name for one in (folder / "tmp").iterdir()]
 
 
 @pytest.mark.parametrize(
@@ -96,27 +100,32 @@ def test_a_signal_ends_a_command_silently(name: str, module: str, command: list[
 
 def test_an_interrupted_batch_ends_its_processes_silently(tmp_path: Path) -> None:
     """A terminal sends Ctrl+C to every process of the group."""
-    pair = {"scene": ROOM, "object": CHAIR, "detection": BOX}
-    (tmp_path / "pairs.jsonl").write_text("".join(json.dumps(pair | {"seed": seed}) + "\n" for seed in range(40)))
+    pair = {"scene": ROOM, "object": CHAIR, "detection": BOX, "options": QUICK}
+    (tmp_path / "pairs.jsonl").write_text("".join(json.dumps(pair | {"seed": seed}) + "\n" for seed in range(90)))
     results = tmp_path / "pairs.results.jsonl"
     command = [sys.executable, "-m", "regnf_cli.main", "batch", "pairs.jsonl", "--processes", "2"]
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
+        start_new_session=True, preexec_fn=heard,
     ) as running:  # fmt: skip
         eventually(lambda: results.is_file() and results.read_text().count("\n") >= 1, "the first result")
         os.killpg(running.pid, signal.SIGINT)
         stdout, stderr = running.communicate(timeout=60)
     assert (running.returncode, stdout) == (130, "")
     said = [line for line in stderr.splitlines() if line.strip() and "0:00:" not in line and "━" not in line]
-    assert said == [f"40 pairs, 0 done; results in {results.name}", "interrupted: the same command goes on from here"]
+    assert said == [f"90 pairs, 0 done; results in {results.name}", "interrupted: the same command goes on from here"]
 
 
-SWALLOWED = """
-import os, signal, sys
+FRAME = """
+import os, signal, sys, time
 sys.argv = ["regnf", "manual", "api"]
 from regnf_cli import main as regnf
+{run}
+regnf._run = run
+regnf.main()
+"""
+FINALIZER = """
 class Finalized:
     def __del__(self):
         os.kill(os.getpid(), signal.SIGINT)
@@ -124,20 +133,8 @@ class Finalized:
 def run():
     Finalized()
     while True: signal.pause()
-regnf._run = run
-regnf.main()
 """
-
-
-def test_an_interrupt_in_a_finalizer_is_not_lost(tmp_path: Path) -> None:
-    done = run(["-c", SWALLOWED], tmp_path)
-    assert (done.returncode, done.stderr) == (130, "")
-
-
 CLEANING = """
-import os, signal, sys, time
-sys.argv = ["regnf", "manual", "api"]
-from regnf_cli import main as regnf
 def run():
     try:
         os.kill(os.getpid(), signal.SIGINT)
@@ -145,46 +142,37 @@ def run():
     finally:
         time.sleep(3 * regnf._AGAIN_AFTER_S)
         print("cleaned", flush=True)
-regnf._run = run
-regnf.main()
 """
-
-
-def test_an_interrupt_does_not_interrupt_the_cleaning(tmp_path: Path) -> None:
-    done = run(["-c", CLEANING], tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "cleaned\n", "")
-
-
 HELD = """
-import os, signal, sys
-sys.argv = ["regnf", "manual", "api"]
-from regnf_cli import main as regnf
 def run():
     import igl
     sys.kept = igl.winding_number
     sys.modules["kept"] = [igl, sys.kept]
     os.kill(os.getpid(), signal.SIGINT)
     while True: pass
-regnf._run = run
-regnf.main()
 """
 
 
-def test_compiled_libraries_do_not_complain_of_what_is_left_over(tmp_path: Path) -> None:
-    done = run(["-c", HELD], tmp_path)
-    assert (done.returncode, done.stderr) == (130, "")
-
-
 @pytest.mark.parametrize(
-    "command",
+    ("program", "printed"),
     [
-        ["register", "--help"],
-        ["manual", "api"],
-        ["--version"],
-        ["inspect", CHAIR],
-        *(pytest.param(one, marks=pytest.mark.long) for one in (["--help"], ["manual"], ["doctor"])),
+        pytest.param(FINALIZER, "", id="in a finalizer it is not lost"),
+        pytest.param(CLEANING, "cleaned\n", id="it does not interrupt the cleaning"),
+        pytest.param(HELD, "", id="compiled libraries do not complain of what is left over"),
     ],
-    ids=" ".join,
+)
+def test_an_interrupt_wherever_it_comes(program: str, printed: str, tmp_path: Path) -> None:
+    done = run(["-c", FRAME.format(run=program)], tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, printed, "")
+
+
+def some_long(short: list[list[str]], long: list[list[str]]) -> pytest.MarkDecorator:
+    marked = [pytest.param(one, marks=pytest.mark.long) for one in long]
+    return pytest.mark.parametrize("command", [*short, *marked], ids=" ".join)
+
+
+@some_long(
+    [["register", "--help"], ["manual", "api"], ["--version"]], [["inspect", CHAIR], ["--help"], ["manual"], ["doctor"]]
 )
 def test_a_closed_pipe_is_no_rejection(command: list[str], tmp_path: Path) -> None:
     reading, writing = os.pipe()
@@ -194,7 +182,7 @@ def test_a_closed_pipe_is_no_rejection(command: list[str], tmp_path: Path) -> No
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 
 
-@pytest.mark.parametrize("command", [["manual", "api"], ["--version"], ["--help"], ["inspect", PAIR[1]]], ids=" ".join)
+@some_long([["manual", "api"], ["--version"]], [["--help"], ["inspect", CHAIR]])
 def test_a_full_output_says_so(command: list[str], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = run(["-m", "regnf_cli.main", *command], tmp_path, stdout=full)
@@ -205,14 +193,12 @@ def test_a_full_output_says_so(command: list[str], tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["convert", PAIR[1], "made/chair.ply"],
-        ["render", PAIR[0], "--size", "64x48", "--frames", "1", "--output", "new/below"],
-        ["register", *PAIR, "--output", "new/below"],
-    ],
-    ids=lambda command: command[0],
+BELOW = ["--output", "new/below"]
+
+
+@some_long(
+    [["convert", CHAIR, "made/chair.ply", "--resolution", "24"]],
+    [["render", ROOM, "--size", "64x48", "--frames", "1", *BELOW], [*REGISTER, *BELOW]],
 )
 def test_a_full_disk_leaves_nothing(command: list[str], tmp_path: Path) -> None:
     """A limit of the size of files stands in for it: the write fails in the same place."""
@@ -222,9 +208,6 @@ def test_a_full_disk_leaves_nothing(command: list[str], tmp_path: Path) -> None:
         "from regnf_cli.main import main; main()"
     )
     done = run(["-c", limited, *command], tmp_path)
-    assert done.returncode == 2, done.stderr
-    assert "FILE_UNUSABLE" in done.stderr
-    assert "Make room" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert left(tmp_path) == ["made"]
+    told = [words in done.stderr for words in ("FILE_UNUSABLE", "Make room", "Traceback")]
+    assert (done.returncode, told, left(tmp_path)) == (2, [True, True, False], ["made"]), done.stderr
     assert list((tmp_path / "made").iterdir()) == []

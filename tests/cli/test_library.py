@@ -14,15 +14,12 @@ from regnf_cli import main as cli
 from regnf_core.errors import RegnfError
 from regnf_core.library_entries import EntryNotes
 from regnf_core.library_folder import INDEX, FolderEntry, LibraryFolder, digest_of, open_archive, write_archive
+from tests.cli.conftest import Outcome, Run
+from tests.core.importing.archives import zip_bytes
 from tests.live_stack import DATA
 
 CHAIR = DATA / "armchair.safetensors"
-SYMMETRY = {"order": 4, "axis": [0, 0, 1], "continuous": False}
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr("sys.argv", ["regnf", *map(str, arguments)])
-    return cli.command()
+SYMMETRY = '{"order": 4, "axis": [0, 0, 1], "continuous": false}'
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +28,9 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> LibraryFolder:
     folder = tmp_path_factory.mktemp("library")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        said = ("--tag", "seat", "--unit", "m")
-        assert run(patch, "library", "add", "arm chair", CHAIR, *said, "--library", folder) == 0
+        said = ["--tag", "seat", "--unit", "m", "--library", str(folder)]
+        patch.setattr("sys.argv", ["regnf", "library", "add", "arm chair", str(CHAIR), *said])
+        assert cli.command() == 0
     return LibraryFolder(folder)
 
 
@@ -47,43 +45,36 @@ def test_an_entry_has_field_picture_and_symmetry(shelf: LibraryFolder) -> None:
 
 
 def test_from_one_library_to_another_and_into_a_search(
-    shelf: LibraryFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    shelf: LibraryFolder, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive, other = tmp_path / "chairs.zip", tmp_path / "other"
-    assert run(monkeypatch, "library", "export", archive, "--library", shelf.folder) == 0
+
+    def library(command: str, *said: object, folder: Path = other, code: int = 0) -> Outcome:
+        return run("library", command, *said, "--library", folder, code=code)
+
+    library("export", archive, folder=shelf.folder)
     first = archive.read_bytes()
-    assert run(monkeypatch, "library", "export", archive, "--library", shelf.folder) == 0
+    library("export", archive, folder=shelf.folder)
     assert archive.read_bytes() == first, "the same library gives the same bytes"
-    assert run(monkeypatch, "library", "import", archive, "--library", shelf.folder) == 2
-    assert "LIBRARY_NAME_TAKEN" in capsys.readouterr().err
-    assert run(monkeypatch, "library", "import", archive, "--skip-taken", "--library", shelf.folder) == 0
-    assert run(monkeypatch, "library", "import", archive, "--library", other) == 0
+    assert "LIBRARY_NAME_TAKEN" in library("import", archive, folder=shelf.folder, code=2).stderr
+    library("import", archive, "--skip-taken", folder=shelf.folder)
+    library("import", archive)
     assert LibraryFolder(other).entries() == shelf.entries()
-    edit = ("library", "edit", "arm chair", "--library", other)
-    assert run(monkeypatch, *edit, "--rename", "stool", "--tag", "none", "--symmetry", json.dumps(SYMMETRY)) == 0
+    library("edit", "arm chair", "--rename", "stool", "--tag", "none")
     (stool,) = LibraryFolder(other).entries()
     assert (stool.notes.name, stool.notes.tags, stool.notes.unit) == ("stool", (), "m")
-    assert (stool.symmetry or {})["order"] == 4
-    capsys.readouterr()
-    again = ("library", "edit", "stool", "--library", other, "--symmetry")
     found = (shelf.get("arm chair").symmetry or {})["order"]
-    for said, order, source in (
-        ("none", 1, "said"),
-        ("detected", found, "detected"),
-        (json.dumps(SYMMETRY), 4, "said"),
-    ):
-        assert run(monkeypatch, *again, said) == 0
-        capsys.readouterr()
-        assert run(monkeypatch, "library", "list", "--library", other, "--json") == 0
-        (listed,) = json.loads(capsys.readouterr().out)
+    for said, order, source in (("none", 1, "said"), ("detected", found, "detected"), (SYMMETRY, 4, "said")):
+        library("edit", "stool", "--symmetry", said)
+        (listed,) = json.loads(library("list", "--json").stdout)
         assert (listed["symmetry_source"], listed["symmetry"]["order"]) == (source, order)
     monkeypatch.setenv("REGNF_LIBRARY", str(other))
     search = ("search", DATA / "mix-room.safetensors", "--detection", DATA / "detection.json", "--json")
-    assert run(monkeypatch, *search, "--tag", "seat") == 2
-    assert "no entries with the tag" in capsys.readouterr().err
-    assert run(monkeypatch, *search) == 0
-    assert json.loads(capsys.readouterr().out)["candidates"][0]["object"] == "stool"
-    assert run(monkeypatch, "library", "remove", "stool", "--library", other) == 0
+    missing = run(*search, "--tag", "seat")
+    assert (missing.code, "no entries with the tag" in missing.stderr) == (2, True)
+    ranked = run(*search)
+    assert (ranked.code, json.loads(ranked.stdout)["candidates"][0]["object"]) == (0, "stool")
+    library("remove", "stool")
     assert sorted(path.name for path in other.iterdir()) == [".lock", INDEX]
 
 
@@ -101,9 +92,7 @@ def written(tmp_path: Path, entry: tuple[FolderEntry, Path], change: Callable[[d
     with zipfile.ZipFile(good) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     change(members)
-    with zipfile.ZipFile(bad, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in members.items():
-            archive.writestr(name, data)
+    bad.write_bytes(zip_bytes(list(members.items())))
     return bad
 
 
@@ -152,23 +141,17 @@ def test_archives_that_were_changed_are_refused(
 def test_files_that_are_no_archives_are_refused(tmp_path: Path, entry: tuple[FolderEntry, Path]) -> None:
     write_archive(tmp_path / "good.zip", [entry])
     whole = (tmp_path / "good.zip").read_bytes()
+    index = json.dumps({"format": 1, "entries": []}) + " " * 100_000
+    packed = zip_bytes([(INDEX, index.encode())], zipfile.ZIP_DEFLATED)
     for data, reason in (
         (b"", "FILE_EMPTY"),
         (b"no archive", "ARCHIVE_PREFIXED_DATA"),
         (whole + b"more", "ARCHIVE_TRAILING_DATA"),
         (whole[:-30], "FILE_TRUNCATED"),
+        (packed, "ARCHIVE_COMPRESSED_ENTRY"),
     ):
         path = tmp_path / "bad.zip"
         path.write_bytes(data)
         with pytest.raises(RegnfError) as caught, open_archive(path):
             pass
         assert caught.value.reason == reason
-
-
-def test_compressed_members_are_refused(tmp_path: Path, entry: tuple[FolderEntry, Path]) -> None:
-    path = tmp_path / "packed.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(INDEX, json.dumps({"format": 1, "entries": []}) + " " * 100_000)
-    with pytest.raises(RegnfError) as caught, open_archive(path):
-        pass
-    assert caught.value.reason == "ARCHIVE_COMPRESSED_ENTRY"

@@ -12,26 +12,21 @@ import pytest
 from typer.testing import CliRunner
 
 from regnf_cli.commands import app_of
+from regnf_core.editing.storing import write_field
 from regnf_core.errors import RegnfError
 from tests.contract.live import DEADLINE_S, eventually
-from tests.core.analytic import AnalyticField, boxes, sphere
+from tests.core.analytic import boxes, sphere
 from tests.listing import below
 
 T = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -0.25], [0.0, 0.0, 0.0, 1.0]]
-
-
-def write_grid_of(field: AnalyticField, path: Path) -> None:
-    from regnf_core.editing.storing import write_field
-
-    write_field(field, path, 24)
 
 
 @pytest.fixture(scope="module")
 def fields(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fields")
     bounds = [[-1.0, -1.0, -0.1], [1.0, 1.0, 1.0]]
-    write_grid_of(boxes([([-1.0, -1.0, -0.1], [1.0, 1.0, 0.0])], bounds), folder / "room.safetensors")
-    write_grid_of(sphere(0.25, bounds=[[-0.4] * 3, [0.4] * 3]), folder / "ball.safetensors")
+    write_field(boxes([([-1.0, -1.0, -0.1], [1.0, 1.0, 0.0])], bounds), folder / "room.safetensors", 24)
+    write_field(sphere(0.25, bounds=[[-0.4] * 3, [0.4] * 3]), folder / "ball.safetensors", 24)
     return folder
 
 
@@ -53,7 +48,8 @@ def test_an_edit_names_its_files_from_its_own_folder(fields: Path, tmp_path: Pat
 def test_a_command_that_is_terminated_leaves_nothing_behind(fields: Path, tmp_path: Path) -> None:
     """SIGTERM is what schedulers and service managers send."""
     output = tmp_path / "out"
-    said = ("render", str(fields / "room.safetensors"), "--mode", "volume", "--frames", "500", "--output", str(output))
+    size = ["--mode", "volume", "--size", "192x144", "--frames", "500"]
+    said = ["render", str(fields / "room.safetensors"), *size, "--output", str(output)]
     with subprocess.Popen([sys.executable, "-m", "regnf_cli.main", *said], stderr=subprocess.PIPE) as command:
         eventually(lambda: output.is_dir() and any(path.suffix == ".png" for path in below(output)), "the first frame")
         command.terminate()

@@ -156,7 +156,7 @@ def line(number: int, status: str) -> str:
 
 
 def test_a_refused_batch_is_an_error() -> None:
-    problem = {"reason": "QUOTA_BATCHES", "detail": "enough"}
+    problem = {"reason": "QUOTA_ACTIVE_JOBS", "detail": "enough"}
     with pytest.raises(ServiceError) as caught:
         list(pretended(lambda _: httpx.Response(429, json=problem)).batch([Pair("0" * 64, "1" * 64, BOX)]))
-    assert caught.value.reason == "QUOTA_BATCHES"
+    assert caught.value.reason == "QUOTA_ACTIVE_JOBS"

@@ -38,19 +38,16 @@ def test_entries_come_change_and_go(world: World, client: Client, tmp_path: Path
         assert caught.value.reason == "LIBRARY_ENTRY_NOT_FOUND"
 
 
-def test_what_is_wrong_is_said_before_anything_is_sent(client: Client) -> None:
+def test_an_entry_stands_for_its_field_and_what_is_wrong_is_said_at_once(world: World, client: Client) -> None:
+    entries = [client.library.add(name, world.ready_field(name), ["seat"]) for name in ("chair", "stool")]
+    scene = world.ready_field("scene")
+    job = client.submit(scene, entries[0], BOX)
+    assert client.submit(scene, entries[0].field, BOX).id == job.id
     with pytest.raises(InvalidInputError) as caught:
         client.library.add("a/b", "0" * 64)
     assert caught.value.reason == "LIBRARY_ENTRY_INVALID"
     with pytest.raises(InvalidInputError):
         client.library.get("../fields")
-
-
-def test_an_entry_stands_for_its_field(world: World, client: Client) -> None:
-    entries = [client.library.add(name, world.ready_field(name), ["seat"]) for name in ("chair", "stool")]
-    scene = world.ready_field("scene")
-    job = client.submit(scene, entries[0], BOX)
-    assert client.submit(scene, entries[0].field, BOX).id == job.id
 
 
 def test_the_awaited_client_has_it_too(world: World) -> None:

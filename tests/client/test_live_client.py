@@ -1,22 +1,27 @@
-"""The client with a real service and its worker: from files to poses and pictures."""
+"""The client with a real service and its worker: from files to poses and pictures; batches, and the library."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
-from regnf_client import AsyncClient, Client, Result, ServiceError, WaitTimeoutError
+from regnf_client import AsyncClient, Client, Pair, Result, ServiceError, WaitTimeoutError
 from tests.client.transports import Counted
-from tests.contract.live import Live
+from tests.contract.live import Live, eventually
+from tests.devdata import ROOT
 from tests.live_stack import DATA, LIVE, QUICK
 
 pytestmark = LIVE
+FAR = {"min": [50, 50, 50], "max": [51, 51, 51]}
 UPRIGHT = {"up_axis": "z"}
 ROOM, CHAIR = DATA / "mix-room.safetensors", DATA / "armchair.safetensors"
 BOX = json.loads((DATA / "detection.json").read_text())
@@ -43,9 +48,7 @@ def test_a_pose_from_files(found: Result) -> None:
     point = np.array([[0.1, 0.2, 0.3]])
     assert np.allclose(found.apply(point), point @ TRUTH[:3, :3].T + TRUTH[:3, 3], atol=0.01)
     assert np.allclose(found.T_scene_object @ found.T_object_scene, np.eye(4), atol=1e-9)
-    assert found.covariance is not None
-    assert found.covariance.shape == (7, 7)
-    assert found.source == str(CHAIR)
+    assert (np.shape(found.covariance), found.source) == ((7, 7), str(CHAIR))
 
 
 def test_fields_that_the_service_has_are_not_sent(live_stack: Live, found: Result) -> None:
@@ -60,8 +63,7 @@ def test_what_a_box_may_be(client: Client) -> None:
     low, high = np.array(BOX["center"]) - np.array(BOX["size"]) / 2, np.array(BOX["center"]) + np.array(BOX["size"]) / 2
     jobs = [client.submit(ROOM, CHAIR, box, QUICK) for box in (BOX, (low, high), {"min": low, "max": high})]
     assert len({job.id for job in jobs[1:]}) == 1
-    assert client.wait(jobs[0]).finished
-    assert client.wait(jobs[1]).finished
+    assert all(client.wait(job).finished for job in jobs[:2])
 
 
 def test_files_of_a_result(client: Client, found: Result, tmp_path: Path) -> None:
@@ -116,21 +118,15 @@ def test_events_as_they_come(client: Client) -> None:
     assert job.id in {one.id for one in client.jobs("successful")}
 
 
-def test_a_search_among_files(client: Client) -> None:
+def test_searches_and_batches_of_one_scene(client: Client) -> None:
     ranked = client.search(ROOM, [ROOM, CHAIR], BOX, UPRIGHT)
     assert ranked.candidates is not None
     assert ranked.source == ranked.candidates[0].source == str(CHAIR)
     assert {one.source for one in ranked.candidates} == {str(ROOM), str(CHAIR)}
-
-
-def test_each_detection_with_each_object(client: Client) -> None:
-    far = {"min": [50, 50, 50], "max": [51, 51, 51]}
-    outcomes = client.register_batch(ROOM, [BOX, far], [CHAIR], options=UPRIGHT, seed=4713)
+    outcomes = client.register_batch(ROOM, [BOX, FAR], [CHAIR], options=UPRIGHT, seed=4713)
     assert [(one.detection, one.object) for one in outcomes] == [(0, 0), (1, 0)]
-    assert outcomes[0].result is not None
-    assert outcomes[1].result is None
-    assert outcomes[1].error is not None
-    assert outcomes[1].error.reason == "DETECTION_OUTSIDE_SCENE"
+    assert [one.result is None for one in outcomes] == [False, True]
+    assert [one.error and one.error.reason for one in outcomes] == [None, "DETECTION_OUTSIDE_SCENE"]
 
 
 def test_a_rendering(client: Client, found: Result) -> None:
@@ -169,3 +165,46 @@ def test_the_same_to_be_awaited(live_stack: Live, found: Result, tmp_path: Path)
                 await client.job("nothing")
 
     asyncio.run(program())
+
+
+def test_files_in_results_out(live_stack: Live) -> None:
+    pairs = [Pair(ROOM, CHAIR, BOX, UPRIGHT, seed=5100 + number, key=str(number)) for number in range(2)]
+    with Client(live_stack.address) as client:
+        found = {one.key: one for one in client.batch([*pairs, Pair(ROOM, CHAIR, FAR, key="far")], timeout_s=250)}
+        whole = client.result(found["0"])  # type: ignore[arg-type]
+    assert {found[str(number)].status for number in range(2)} == {"successful"}
+    assert found["far"].error is not None
+    assert found["far"].error.reason == "DETECTION_OUTSIDE_SCENE"
+    np.testing.assert_array_equal(found["0"].T_object_scene, whole.T_object_scene)  # type: ignore[arg-type]
+    assert found["0"].verdict == whole.verdict
+
+
+def test_the_pipeline_sorts_what_comes_back(live_stack: Live, tmp_path: Path) -> None:
+    (tmp_path / "data").symlink_to(DATA)
+    pair: dict[str, Any] = {"scene": "data/mix-room.safetensors", "object": "data/armchair.safetensors"}
+    lines = [
+        {**pair, "key": "good", "detection": BOX, "options": {"up_axis": "z"}, "seed": 4711},
+        {**pair, "key": "far", "detection": FAR},
+    ]
+    (tmp_path / "pairs.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    example = ROOT / "examples" / "05_pipeline.py"
+    command = [sys.executable, str(example), live_stack.address, str(tmp_path / "pairs.jsonl"), str(tmp_path / "out")]
+    for _ in range(2):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=250, check=False)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == "1 in failed.jsonl, 1 in used.jsonl\n"
+    (used,) = map(json.loads, (tmp_path / "out" / "used.jsonl").read_text().splitlines())
+    (failed,) = map(json.loads, (tmp_path / "out" / "failed.jsonl").read_text().splitlines())
+    assert (used["key"], len(used["poses"][0])) == ("good", 4)
+    assert (failed["key"], failed["reason"]) == ("far", "DETECTION_OUTSIDE_SCENE")
+
+
+def test_a_worker_finds_an_entrys_symmetry(live_stack: Live, tmp_path: Path) -> None:
+    with Client(live_stack.address) as client:
+        made = client.library.add("a dining chair", DATA / "dining-chair.safetensors", ["seat"])
+        found = eventually(lambda: client.library.get(made.name).symmetry, "the symmetry of the entry", 120)
+        assert found == {"order": 1, "axis": None, "continuous": False}
+        assert client.library.get(made.name).symmetry_source == "detected"
+        carried = client.library.download(made.name, tmp_path / "chair.safetensors")
+        assert carried.read_bytes()[8:9] == b"{"
+        client.library.remove(made.name)

@@ -11,8 +11,6 @@ from anyio.from_thread import start_blocking_portal
 
 
 class _BodyStream(httpx.AsyncByteStream):
-    """A request's body, a message for each of its pieces."""
-
     def __init__(self, pieces: Iterable[bytes]) -> None:
         self._pieces = pieces
 
@@ -44,5 +42,4 @@ class AppTransport(httpx.BaseTransport):
 
 
 def client_of(app: Any, **options: Any) -> httpx.Client:
-    """A client of the application; close it, or use it as a context manager."""
     return httpx.Client(transport=AppTransport(app), base_url="http://localhost", timeout=30, **options)

@@ -14,7 +14,6 @@ NDJSON = {"Content-Type": "application/x-ndjson"}
 
 
 def pairs(world: World, count: int, **changes: Any) -> list[dict[str, Any]]:
-    """So many requests that differ in their seeds."""
     request = world.valid_request()
     return [{**request, "seed": number, "key": f"pair {number}", **changes} for number in range(count)]
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -25,7 +25,6 @@ _Value = TypeVar("_Value")
 
 
 def eventually(look: Callable[[], _Value | None], what: str, deadline_s: float = DEADLINE_S) -> _Value:
-    """What ``look`` returns once that is truthy. Fails after the deadline."""
     end = time.monotonic() + deadline_s
     while not (value := look()):
         assert time.monotonic() < end, f"{what} did not come about within {deadline_s} s"
@@ -35,8 +34,6 @@ def eventually(look: Callable[[], _Value | None], what: str, deadline_s: float =
 
 @dataclass
 class Live:
-    """A running service: its address, its folder and the API's process."""
-
     port: int
     folder: Path
     api: subprocess.Popen[bytes]
@@ -50,7 +47,6 @@ class Live:
         return httpx.Client(base_url=self.address, timeout=60)
 
     def connect(self) -> socket.socket:
-        """A bare connection, for clients that misbehave."""
         return socket.create_connection(("127.0.0.1", self.port), timeout=DEADLINE_S)
 
     def peak_memory(self) -> int:
@@ -71,31 +67,30 @@ class Live:
 @contextmanager
 def live_service(folder: Path, with_worker: bool = True, **settings: object) -> Iterator[Live]:
     """Start everything; the API answers once this yields, and is ready if it has a worker."""
-    with private_redis() as redis_url, socket.create_server(("127.0.0.1", 0)) as listener:
+    with private_redis() as redis_url, socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:
         plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         usual = {"redis_url": redis_url, "state_dir": folder, "max_upload_bytes": MAX_UPLOAD, "device": "cpu"}
         environment = plain | variables(**usual | settings)
-        command = ["regnf_cli.api_process", str(listener.fileno())]
-        with _process(folder, "api", command, environment, listener.fileno()) as api:
-            if not with_worker:
-                live = Live(listener.getsockname()[1], folder, api, None)
-                eventually(lambda: _status(live, "/healthz") == 200, f"the API; {live.log()}")
-                yield live
-                return
-            with _process(folder, "worker", ["regnf_worker.main"], environment) as worker:
-                live = Live(listener.getsockname()[1], folder, api, worker)
-                eventually(lambda: _status(live, "/readyz") == 200, f"readiness; {live.log()}")
-                yield live
+
+        def start(name: str, *module: str, passed: tuple[int, ...] = ()) -> subprocess.Popen[bytes]:
+            return stack.enter_context(_process(folder / f"{name}.log", [*module], environment, passed))
+
+        number = listener.fileno()
+        api = start("api", "regnf_cli.api_process", str(number), passed=(number,))
+        worker = start("worker", "regnf_worker.main") if with_worker else None
+        live = Live(listener.getsockname()[1], folder, api, worker)
+        awaited = "/readyz" if with_worker else "/healthz"
+        eventually(lambda: _status(live, awaited) == 200, f"{awaited}; {live.log()}")
+        yield live
 
 
 @contextmanager
 def _process(
-    folder: Path, name: str, module: list[str], environment: dict[str, str], *passed: int
+    log: Path, module: list[str], environment: dict[str, str], passed: tuple[int, ...]
 ) -> Iterator[subprocess.Popen[bytes]]:
-    with (folder / f"{name}.log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", *module], env=environment, stdout=log, stderr=log, pass_fds=passed
-        )
+    with log.open("wb") as file:
+        command = [sys.executable, "-m", *module]
+        process = subprocess.Popen(command, env=environment, stdout=file, stderr=file, pass_fds=passed)
     try:
         yield process
     finally:

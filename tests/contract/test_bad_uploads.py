@@ -4,121 +4,54 @@ from __future__ import annotations
 
 import errno
 import json
-import time
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import Mock
 
-import anyio
+import httpx
 import pytest
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES
+from regnf_service.fields.uploads import Upload
+from regnf_service.http.body import _Collector
 from regnf_state.blobs.base import StorageFullError, StorageUnavailableError
-from tests.contract.bad_input import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
+from tests.contract.conftest import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
 pytestmark = pytest.mark.usefixtures("nothing_of_an_upload_stays")
 LEGACY_TAR = b"sys_info".ljust(257, b"\0") + b"ustar\0" + b"\0" * 600
+IN_PARTS = {"Content-Type": "multipart/form-data; boundary=x"}
+
+PUTS: list[tuple[str, bytes, dict[str, str], int, str]] = [
+    (f"/fields/{sha256(b'x')}", b"x", {}, 415, "FIELD_NOT_RECOGNIZED"),
+    (f"/fields/{sha256(TOO_LARGE)}", TOO_LARGE, {}, 413, "UPLOAD_TOO_LARGE"),
+    (PUT_GOOD, field_bytes("another"), {}, 400, "DIGEST_MISMATCH"),
+    (PUT_GOOD, GOOD, {"Content-Digest": announced(b"x")}, 400, "DIGEST_MISMATCH"),
+    (PUT_GOOD, GOOD, {"Content-Digest": "sha-256=:AAAA:"}, 400, "INVALID_DIGEST"),
+    (PUT_GOOD, GOOD, {"Content-Digest": "sha-256=0000"}, 400, "INVALID_DIGEST"),
+    (PUT_GOOD, GOOD, {"Content-Encoding": "gzip"}, 415, "UNSUPPORTED_MEDIA_TYPE"),
+    (PUT_GOOD, GOOD, IN_PARTS, 415, "UNSUPPORTED_MEDIA_TYPE"),
+    (PUT_GOOD, GOOD, {"Content-Length": str(len(GOOD) + 1)}, 400, "UPLOAD_INCOMPLETE"),
+    (PUT_GOOD, GOOD, {"Content-Length": str(len(GOOD) - 1)}, 400, "UPLOAD_INCOMPLETE"),
+    (PUT_GOOD, GOOD, {"Content-Length": "0x10"}, 400, "INVALID_HEADER"),
+    (PUT_GOOD.upper().replace("FIELDS", "fields"), GOOD, {}, 400, "INVALID_DIGEST"),
+    *((f"/fields/{name}", GOOD, {}, 400, "INVALID_DIGEST") for name in ("abc", "0" * 4096, "%00", "%E2%80%AE")),
+    ("/fields/..%2f..%2fetc", GOOD, {}, 404, "NOT_FOUND"),
+]
+POSTS: list[tuple[str, bytes, dict[str, str], int, str]] = [
+    ("/fields", LEGACY_TAR, {}, 415, "FIELD_NOT_RECOGNIZED"),
+    ("/fields", GOOD, {"Content-Digest": announced(b"x")}, 400, "DIGEST_MISMATCH"),
+    ("/fields", GOOD, IN_PARTS, 400, "MALFORMED_MULTIPART"),
+]
 
 
-@pytest.mark.parametrize(
-    ("method", "path", "content", "headers", "status", "reason"),
-    [
-        pytest.param("PUT", f"/fields/{sha256(b'')}", b"", {}, 400, "UPLOAD_EMPTY", id="empty"),
-        pytest.param("PUT", f"/fields/{sha256(b'x')}", b"x", {}, 415, "FIELD_NOT_RECOGNIZED", id="one byte"),
-        pytest.param(
-            "PUT", f"/fields/{sha256(TOO_LARGE)}", TOO_LARGE, {}, 413, "UPLOAD_TOO_LARGE", id="too large by its header"
-        ),
-        pytest.param(
-            "PUT", PUT_GOOD, field_bytes("another"), {}, 400, "DIGEST_MISMATCH", id="under another file's hash"
-        ),
-        pytest.param(
-            "PUT", PUT_GOOD, GOOD, {"Content-Digest": announced(b"x")}, 400, "DIGEST_MISMATCH", id="digest mismatch"
-        ),
-        pytest.param(
-            "PUT",
-            PUT_GOOD,
-            GOOD,
-            {"Content-Digest": "sha-256=:AAAA:"},
-            400,
-            "INVALID_DIGEST",
-            id="digest of the wrong length",
-        ),
-        pytest.param(
-            "PUT", PUT_GOOD, GOOD, {"Content-Digest": "sha-256=0000"}, 400, "INVALID_DIGEST", id="malformed digest"
-        ),
-        pytest.param("PUT", PUT_GOOD, GOOD, {"Content-Encoding": "gzip"}, 415, "UNSUPPORTED_MEDIA_TYPE", id="gzip"),
-        pytest.param(
-            "PUT",
-            PUT_GOOD,
-            GOOD,
-            {"Content-Type": "multipart/form-data; boundary=x"},
-            415,
-            "UNSUPPORTED_MEDIA_TYPE",
-            id="multipart for one file",
-        ),
-        pytest.param(
-            "PUT",
-            PUT_GOOD,
-            GOOD,
-            {"Content-Length": str(len(GOOD) + 1)},
-            400,
-            "UPLOAD_INCOMPLETE",
-            id="shorter than declared",
-        ),
-        pytest.param(
-            "PUT",
-            PUT_GOOD,
-            GOOD,
-            {"Content-Length": str(len(GOOD) - 1)},
-            400,
-            "UPLOAD_INCOMPLETE",
-            id="longer than declared",
-        ),
-        pytest.param("PUT", PUT_GOOD, GOOD, {"Content-Length": "0x10"}, 400, "INVALID_HEADER", id="malformed length"),
-        pytest.param(
-            "PUT", PUT_GOOD.upper().replace("FIELDS", "fields"), GOOD, {}, 400, "INVALID_DIGEST", id="upper-case hash"
-        ),
-        pytest.param("PUT", "/fields/abc", GOOD, {}, 400, "INVALID_DIGEST", id="a hash too short"),
-        pytest.param("PUT", f"/fields/{'0' * 4096}", GOOD, {}, 400, "INVALID_DIGEST", id="a hash of 4 kB"),
-        pytest.param("PUT", "/fields/%00", GOOD, {}, 400, "INVALID_DIGEST", id="NUL for a hash"),
-        pytest.param("PUT", "/fields/%E2%80%AE", GOOD, {}, 400, "INVALID_DIGEST", id="RTL for a hash"),
-        pytest.param("PUT", "/fields/..%2f..%2fetc", GOOD, {}, 404, "NOT_FOUND", id="encoded traversal for a hash"),
-        pytest.param("POST", "/fields", PNG, {}, 415, "FIELD_NOT_RECOGNIZED", id="PNG"),
-        pytest.param("POST", "/fields", LEGACY_TAR, {}, 415, "FIELD_NOT_RECOGNIZED", id="legacy tar"),
-        pytest.param(
-            "POST",
-            "/fields",
-            GOOD,
-            {"Content-Digest": announced(b"x")},
-            400,
-            "DIGEST_MISMATCH",
-            id="digest mismatch without a name",
-        ),
-        pytest.param(
-            "POST",
-            "/fields",
-            GOOD,
-            {"Content-Type": "multipart/form-data"},
-            400,
-            "MALFORMED_MULTIPART",
-            id="no boundary",
-        ),
-        pytest.param(
-            "POST",
-            "/fields",
-            GOOD,
-            {"Content-Type": "multipart/form-data; boundary=x"},
-            400,
-            "MALFORMED_MULTIPART",
-            id="no parts",
-        ),
-    ],
-)
-def test_refused(
-    world: World, method: str, path: str, content: bytes, headers: dict[str, str], status: int, reason: str
-) -> None:
-    assert_refused(world.client.request(method, path, content=content, headers=headers), status, reason)
+@pytest.mark.parametrize(("method", "cases"), [("PUT", PUTS), ("POST", POSTS)], ids=["PUT", "POST"])
+def test_refused(world: World, method: str, cases: list[tuple[str, bytes, dict[str, str], int, str]]) -> None:
+    for path, content, headers, status, reason in cases:
+        assert_refused(world.client.request(method, path, content=content, headers=headers), status, reason)
+        assert world.blobs.blobs == {}, (path, headers)
 
 
 def test_too_large_is_noticed_by_count(world: World) -> None:
@@ -139,43 +72,6 @@ def test_an_unknown_kind_is_refused_before_the_rest_is_sent(world: World) -> Non
     assert sent == [begun]
 
 
-def raw_call(app: Any, messages: list[dict[str, Any]], headers: list[tuple[bytes, bytes]] | None = None) -> Any:
-    """PUT the good field with these ASGI messages, then silence; (status, body) of the answer."""
-    sent: list[dict[str, Any]] = []
-
-    async def call() -> None:
-        left = iter(messages)
-
-        async def receive() -> dict[str, Any]:
-            message = next(left, None)
-            if message is None:
-                await anyio.sleep_forever()
-            assert message is not None
-            return message
-
-        async def send(message: dict[str, Any]) -> None:
-            sent.append(message)
-
-        scope = {
-            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "PUT", "scheme": "http",
-            "path": PUT_GOOD, "raw_path": PUT_GOOD.encode(), "query_string": b"", "root_path": "",
-            "headers": [(b"host", b"localhost"), *(headers or [])],
-            "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 2),
-        }  # fmt: skip
-        await app(scope, receive, send)
-
-    anyio.run(call)
-    return sent[0]["status"], json.loads(b"".join(message.get("body", b"") for message in sent[1:]))
-
-
-def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any, any_redis: Any) -> None:
-    slow = make_world(tmp_path, any_redis, upload_stall_s=0.05)
-    status, problem = raw_call(slow.app, [{"type": "http.request", "body": GOOD[:100], "more_body": True}])
-    assert (status, problem["reason"]) == (408, "REQUEST_STALLED")
-    assert slow.blobs.blobs == {}
-    slow.client.close()
-
-
 @pytest.mark.parametrize(
     ("error", "status", "reason"),
     [
@@ -187,35 +83,111 @@ def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any,
 def test_storage_that_fails_keeps_nothing(
     world: World, monkeypatch: pytest.MonkeyPatch, error: OSError, status: int, reason: str
 ) -> None:
-    class Failing:
-        def write(self, data: bytes) -> int:
-            raise error
-
-        def commit(self, key: str) -> None:
-            raise AssertionError("nothing to commit")
-
-    @contextmanager
-    def writer() -> Iterator[Failing]:
-        yield Failing()
-
+    failing = Mock(**{"return_value.write.side_effect": error, "return_value.commit.side_effect": AssertionError})
     with monkeypatch.context() as patch:
-        patch.setattr(world.blobs, "writer", writer)
+        patch.setattr(world.blobs, "writer", contextmanager(lambda: iter([failing()])))
         answer = world.client.put(PUT_GOOD, content=GOOD)
     assert_refused(answer, status, reason)
     assert int(answer.headers["retry-after"]) > 0
 
 
-def test_two_uploads_of_one_hash_at_once_are_one_field(world: World) -> None:
-    from concurrent.futures import ThreadPoolExecutor
+# in parts
 
-    def slowly() -> Iterator[bytes]:
-        for start in range(0, len(GOOD), 100):
-            time.sleep(0.001)
-            yield GOOD[start : start + 100]
 
-    with ThreadPoolExecutor(8) as pool:
-        answers = list(pool.map(lambda _: world.client.put(PUT_GOOD, content=slowly()).status_code, range(8)))
-    assert sorted(answers) == [200] * 7 + [201]
-    assert world.queue.imports == [(sha256(GOOD), 1)]
-    assert world.blobs.blobs == {f"fields/{sha256(GOOD)}/original": GOOD}
-    assert world.client.delete(PUT_GOOD).status_code == 204
+def part(name: str, data: bytes, file: bool = False) -> bytes:
+    kind = f'form-data; name="{name}"' + ('; filename="f"' if file else "")
+    return f"--x\r\nContent-Disposition: {kind}\r\n\r\n".encode() + data + b"\r\n"
+
+
+FILE = part("file", GOOD, file=True)
+END = b"--x--\r\n"
+
+
+def described(text: bytes) -> bytes:
+    return FILE + part("description", text)
+
+
+def send(world: World, body: bytes, **headers: str) -> httpx.Response:
+    return world.client.post("/fields", content=body, headers=IN_PARTS | headers)
+
+
+BODIES: dict[str, tuple[int, list[bytes]]] = {
+    "MALFORMED_MULTIPART": (400, [
+        b"".join(part(f"p{i}", b"") for i in range(100)),
+        b"--x\r\nContent-Disposition: form-data\r\n\r\nx\r\n",
+        part("description", b"{}"),
+        b'--x\r\nContent-Disposition: form-data; name="file"' + b";" * 2000 + b"\r\n\r\n",
+            FILE + FILE, described(b"{}") + part("description", b"{}"), b"--x\r\n" + b"X: y\r\n" * 20 + b"\r\nx\r\n",
+        b"--x\r\nX: " + b"y" * 9000 + b"\r\n\r\nx\r\n",
+        b'--x\r\nContent-Disposition: form-data; name="file"\r\nContent-Transfer-Encoding: base64\r\n\r\nAA\r\n',
+    ]),
+    "UPLOAD_INCOMPLETE": (400, [part("file", b"", file=True)]),
+    "UPLOAD_TOO_LARGE": (413, [part("file", TOO_LARGE, file=True)]),
+    "FIELD_NOT_RECOGNIZED": (415, [part("file", PNG, file=True)]),
+    "INVALID_DESCRIPTION": (422, [described(text) for text in (b'{"label": 5}', b'{"unknown": 5}',
+    b'{"level_mask": true}')]),
+    "MALFORMED_JSON": (400, [described(b"{"), described(json.dumps({"label": "\ud800"}).encode())]),
+    "REQUEST_TOO_LARGE": (413, [part("description", b" " * 20_000) + FILE]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reason", BODIES)
+def test_bodies_in_parts(world: World, reason: str) -> None:
+    status, bodies = BODIES[reason]
+    for body in bodies:
+        assert_refused(send(world, body + END), status, reason)
+
+
+def test_a_text_part_one_byte_too_long_is_refused_by_its_name(world: World) -> None:
+    for name, limit in (("upload", 272), ("description", 16384)):
+        answer = send(world, part(name, b"a" * (limit + 1)) + END)
+        problem = assert_refused(answer, 413, "REQUEST_TOO_LARGE")
+        assert problem["detail"] == f"The part {name} takes at most {limit} bytes."
+
+
+def test_a_digest_of_a_body_in_parts_is_compared_with_all_of_it(world: World) -> None:
+    whole = FILE + END
+    assert_refused(send(world, whole, **{"Content-Digest": announced(GOOD)}), 400, "DIGEST_MISMATCH")
+    assert world.blobs.blobs == {}
+    taken = send(world, whole, **{"Content-Digest": announced(whole)})
+    assert taken.status_code == 201
+    assert world.client.delete(taken.json()["links"]["self"]).status_code == 204
+
+
+def test_a_thousand_parts_are_refused_at_the_first_odd_one(world: World, tmp_path: Any, any_redis: Any) -> None:
+    large = make_world(tmp_path, any_redis, max_upload_bytes=1 << 20)
+    for name in ("p", "description"):
+        assert_refused(send(large, part(name, b"{}") * 1001 + END), 400, "MALFORMED_MULTIPART")
+    large.client.close()
+
+
+def test_boundaries(world: World) -> None:
+    """Breaks off before it, continued beyond all counting, with thousands of parameters, or none that can be used."""
+    assert_refused(send(world, FILE), 400, "MALFORMED_MULTIPART")
+    for kind in (f"*{'9' * 5000}=x", "=x" + ";" * 8000, f"={'y' * 71}", "=", '="'):
+        answer = send(world, FILE + END, **{"Content-Type": f"multipart/form-data; boundary{kind}"})
+        assert_refused(answer, 400, "MALFORMED_MULTIPART")
+
+
+def test_what_is_nearly_a_boundary_is_not_handed_on_in_crumbs(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A boundary of one character, and nearly that one in every few bytes: each would be an event of its own."""
+    pieces: list[int] = []
+    threads: set[str] = set()
+    feed, parse = Upload.feed, _Collector.feed
+
+    async def counted(upload: Upload, data: bytes | bytearray) -> None:
+        pieces.append(len(data))
+        await feed(upload, data)
+
+    def watched(collector: _Collector, data: bytes) -> Any:
+        threads.add(threading.current_thread().name)
+        return parse(collector, data)
+
+    monkeypatch.setattr(Upload, "feed", counted)
+    monkeypatch.setattr(_Collector, "feed", watched)
+    crumbs = GOOD + b"\r\n--xxy" * 300
+    answer = send(world, part("file", crumbs, file=True) + END)
+    assert (answer.status_code, answer.json()["bytes"]) == (201, len(crumbs))
+    assert len(pieces) <= 2
+    assert all("AnyIO worker" in name for name in threads), "not on the event loop, where everybody would wait"
+    assert world.client.delete(answer.json()["links"]["self"]).status_code == 204

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from typing import Any
 
 import httpx
 import pytest
+from starlette.responses import PlainTextResponse
 
 from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
-from regnf_service.http.connections import Connections
+from regnf_service.concurrency import Slots
+from regnf_service.http.middleware import RequestGate
 from regnf_state.pieces import view_key
 from regnf_state.redis.documents import RedisDocuments
 from tests.contract.live import Live, eventually, live_service
@@ -51,9 +51,7 @@ def pieces(world: World, path: str, method: str = "GET") -> list[int]:
     return sizes
 
 
-@pytest.fixture
-def large(world: World) -> dict[str, str]:
-    """A world in which every file is large; the addresses of these."""
+def test_files_are_sent_a_block_at_a_time(world: World) -> None:
     sha256 = world.ready_field("large")
     world.client.post("/library", json={"name": "large", "field": sha256})
     for name in (PICTURE_NAME, *MESH_NAMES):
@@ -61,27 +59,16 @@ def large(world: World) -> dict[str, str]:
     world.blobs.put(f"fields/{sha256}/field.safetensors", LARGE)
     job = world.submit()
     world.succeed(job, {"aligned.glb": LARGE})
-    return {
-        "preview": f"/fields/{sha256}/preview.png",
-        "mesh": f"/fields/{sha256}/mesh.glb",
-        "coarse mesh": f"/fields/{sha256}/mesh.glb?detail=coarse",
-        "library file": "/library/large/file",
-        "artifact": f"/jobs/{job}/artifacts/aligned.glb",
-    }
-
-
-@pytest.mark.parametrize("name", ["preview", "mesh", "coarse mesh", "library file", "artifact"])
-def test_files_are_sent_a_block_at_a_time(world: World, large: dict[str, str], name: str) -> None:
-    sizes = pieces(world, large[name])
-    assert sum(sizes) == len(LARGE)
-    assert max(sizes) <= MIB
-    if name != "library file":
-        assert world.client.head(large[name]).headers["content-length"] == str(len(LARGE))
-        assert sum(pieces(world, large[name], "HEAD")) == 0, "nothing is read for a HEAD"
+    shown = [f"/fields/{sha256}/{name}" for name in ("preview.png", "mesh.glb", "mesh.glb?detail=coarse")]
+    for path in (*shown, f"/jobs/{job}/artifacts/aligned.glb", "/library/large/file"):
+        sizes = pieces(world, path)
+        assert (sum(sizes), max(sizes) <= MIB) == (len(LARGE), True), path
+        if "library" not in path:
+            assert world.client.head(path).headers["content-length"] == str(len(LARGE))
+            assert sum(pieces(world, path, "HEAD")) == 0, "nothing is read for a HEAD"
 
 
 def many_jobs(world: World, count: int) -> list[str]:
-    """Jobs whose records are large, newest first."""
     ids = []
     for seed in range(count):
         ids.insert(0, world.submit(seed=seed))
@@ -99,48 +86,37 @@ def many_fields(world: World, count: int) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("path", "member", "name", "make"),
-    [("/jobs", "jobs", "id", many_jobs), ("/fields", "fields", "sha256", many_fields)],
+    ("kind", "name", "filtered", "make"),
+    [("jobs", "id", "status=failed", many_jobs), ("fields", "sha256", "label=nope", many_fields)],
 )
-def test_pages_of_large_records_are_short(
-    world: World, path: str, member: str, name: str, make: Callable[[World, int], list[str]]
+def test_pages_of_large_records_are_short_and_read_a_few_at_a_time(
+    world: World, monkeypatch: pytest.MonkeyPatch, kind: str, name: str, filtered: str, make: Any
 ) -> None:
     """All 40 of them have 3.2 MB."""
-    if member == "jobs":
-        world.valid_request()
-    made = make(world, 40)
-    seen: list[str] = []
-    token: str | None = ""
+    world.valid_request()
+    made, seen, token = make(world, 40), list[str](), ""
+    at_once = watched(monkeypatch)
     while token is not None:
-        answer = world.client.get(path, params={"limit": 200} | ({"page_token": token} if token else {}))
+        answer = world.client.get(f"/{kind}", params={"limit": 200} | ({"page_token": token} if token else {}))
         assert len(answer.content) <= MIB
-        seen += [one[name] for one in answer.json()[member]]
+        seen += [one[name] for one in answer.json()[kind]]
         token = answer.json()["next_page_token"]
     assert seen[: len(made)] == made, "each exactly once"
     assert len(seen) == len(set(seen))
-
-
-@pytest.mark.parametrize("path", ["/jobs?status=failed", "/jobs?limit=200", "/fields?label=nope", "/fields?limit=200"])
-def test_large_records_are_read_a_few_at_a_time(world: World, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
-    """Of each caller's records, however large, a few are in memory at once."""
-    many = many_jobs if "jobs" in path else many_fields
-    world.valid_request()
-    many(world, 40)
-    at_once = watched(monkeypatch)
-    assert world.client.get(path).status_code == 200
+    assert world.client.get(f"/{kind}?{filtered}").status_code == 200
     assert max(at_once) * 80_000 <= 1.5 * MIB
 
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many records each look into Redis has read, from now on."""
     seen: list[int] = []
-    fetch = RedisDocuments._fetch
+    fetch = RedisDocuments._fetch_now
 
     def counted(self: RedisDocuments, kind: Any, names: Any) -> Any:
         seen.append(len(names))
         return fetch(self, kind, names)
 
-    monkeypatch.setattr(RedisDocuments, "_fetch", counted)
+    monkeypatch.setattr(RedisDocuments, "_fetch_now", counted)
     return seen
 
 
@@ -164,7 +140,6 @@ def test_a_filter_looks_at_a_few_hundred_records_a_call(
 
 
 def stored(world: World, known: str, name: str) -> dict[str, str]:
-    """What is stored of a field, under another name."""
     held = {key.decode(): value.decode() for key, value in world.redis.hgetall(f"regnf:field:{known}").items()}
     return held | {"document": held["document"].replace(known, name)}
 
@@ -192,65 +167,46 @@ def test_a_library_that_a_batch_names_in_every_line_is_read_once(world: World, m
 # what waits to be read
 
 
-@dataclass(eq=False)
-class Reader:
-    """A connection whose client reads nothing since a moment."""
+async def unread(world_app: Any, caller: str, sizes: list[int]) -> list[int]:
+    """The statuses of answers of these sizes to one caller, none of which is read while the others are made."""
+    statuses: list[int] = []
+    read = asyncio.Event()
 
-    since: float
-    site: str = "127.0.0.1"
-    ended: bool = field(default=False)
+    async def send(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            statuses.append(message["status"])
+        elif statuses[-1] == 200:
+            await read.wait()
 
-    def due(self) -> float:
-        return math.inf
-
-    def must_make_room_by(self) -> float:
-        return math.inf
-
-    def has_sent(self) -> bool:
-        return False
-
-    def stuck_since(self) -> float:
-        return self.since
-
-    def end(self, *, politely: bool) -> None:
-        assert not politely
-        self.ended = True
+    async with asyncio.TaskGroup() as group:
+        for size in sizes:
+            scope = {
+                "type": "http", "method": "GET", "path": "/openapi.yaml", "size": size, "headers": [],
+                "state": {"caller": caller, "request_id": "x"},
+            }  # fmt: skip
+            group.create_task(world_app(scope, None, send))
+            await asyncio.sleep(0.01)
+        read.set()
+    return statuses
 
 
-def test_the_bytes_that_nobody_reads_have_a_bound_at_every_moment() -> None:
+def test_the_bytes_that_nobody_reads_have_a_bound_for_each_caller() -> None:
+    async def answer(scope: Any, receive: Any, send: Any) -> None:
+        await PlainTextResponse("x" * scope["size"])(scope, receive, send)
+
+    gate = RequestGate(answer, Slots(100, "requests"))
+
     async def run() -> None:
-        held = Connections(100, 100, most_unread=400)
-        alice = [Reader(float(number)) for number in (5, 3, 9)]
-        for one in alice:
-            held.admit(one)
-            held.note_unread(one, "alice", 40)
-        assert [one.ended for one in alice] == [False, True, False], "a caller has a quarter: the longest goes"
-        held.note_unread(alice[0], "alice", 10)
-        held.note_unread(alice[2], "alice", 90)
-        assert not any(one.ended for one in (alice[0], alice[2]))
-        others = [Reader(1.0) for _ in range(4)]
-        for number, one in enumerate(others):
-            held.admit(one)
-            held.note_unread(one, f"caller {number}", 90)
-        assert [one.ended for one in (*alice, *others)] == [True] * 3 + [False] * 4, "all together have a bound too"
-        left = [one for one in (*alice, *others) if not one.ended]
-        for one in left:
-            held.note_unread(one, "whoever", 0)
-            held.remove(one)
-        assert len(held) == 0
-        assert held.ended["unread"] == 3
+        assert await unread(gate, "alice", [9 * MIB] * 3) == [200, 200, 429]
+        assert await unread(gate, "alice", [100]) == [200], "what was read counts no more"
+        assert not gate._unread
 
     asyncio.run(run())
 
 
 @pytest.fixture(scope="module")
-def unread(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    with live_service(
-        tmp_path_factory.mktemp("unread"), with_worker=False, metrics_address=f"127.0.0.1:{port}"
-    ) as started:
-        started.metrics_port = port  # type: ignore[attr-defined]
+def unread_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    with live_service(tmp_path_factory.mktemp("unread"), with_worker=False) as started:
         yield started
 
 
@@ -264,27 +220,17 @@ def silent(live: Live, path: str) -> socket.socket:
 
 
 @pytest.mark.parametrize("path", ["/openapi.yaml", "/static/vendor/three.bundle.min.js", "/openapi.json"])
-def test_answers_that_nobody_reads_take_little_memory(unread: Live, path: str) -> None:
+def test_answers_that_nobody_reads_take_little_memory(unread_service: Live, path: str) -> None:
     """Each time 400 of them, of up to half a megabyte: 100 MB and more if they were held whole."""
-    with unread.client() as client, ExitStack() as stack:
+    with unread_service.client() as client, ExitStack() as stack:
         size = len(client.get(path).content)
-        before = unread.peak_memory()
-        ended = cut_off(unread)
+        before = unread_service.peak_memory()
         for _ in range(400):
-            stack.enter_context(silent(unread, path))
-        assert eventually(lambda: cut_off(unread) > ended or 400 * size < 16 * MIB, "the first that is cut off", 20)
-        assert client.get("/healthz").status_code == 200
-        assert unread.peak_memory() - before <= 64 * MIB
-        assert len(client.get(path).content) == size, "whoever reads is served"
-
-
-def cut_off(live: Live) -> int:
-    """How many connections were closed because nobody read."""
-    text = httpx.get(f"http://127.0.0.1:{live.metrics_port}/metrics").text  # type: ignore[attr-defined]
-    found = [
-        line.split()[-1] for line in text.splitlines() if 'regnf_connections_refused_total{cause="unread"}' in line
-    ]
-    return int(float(found[0])) if found else 0
+            stack.enter_context(silent(unread_service, path))
+        assert eventually(lambda: client.get("/healthz").status_code == 200, "an answer", 20)
+        assert unread_service.peak_memory() - before <= 96 * MIB
+    with unread_service.client() as client:
+        assert eventually(lambda: len(client.get(path).content) == size, "a whole answer once they are gone", 20)
 
 
 def test_large_bodies_of_one_caller_are_bounded_by_the_number_of_its_uploads(worlds: Callable[..., World]) -> None:

@@ -31,7 +31,6 @@ class Held:
         self.count = 0
 
     def hold(self, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, meant: Callable[..., bool]) -> None:
-        """Wrap a function of ``owner``."""
         function = getattr(owner, name)
 
         @wraps(function)
@@ -73,7 +72,6 @@ async def _asked(ask: Callable[[httpx.AsyncClient], Awaitable[Any]], client: htt
 
 
 async def answered(answer: Awaitable[httpx.Response]) -> int:
-    """The status, within the time limit of a test."""
     async with asyncio.timeout(PATIENCE_S):
         return (await answer).status_code
 

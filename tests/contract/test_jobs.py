@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
+from itertools import product
 from typing import Any
 
-from tests.contract.world import NOBODY, World, assert_refused
+import httpx
+import pytest
+from prometheus_client import generate_latest
+
+from regnf_state.reasons import REASONS
+from regnf_state.records import FieldRecord
+from tests.contract.world import NOBODY, RESULT, World, assert_refused, field_bytes
 from tests.stores import expire
 
 
@@ -17,42 +25,17 @@ def test_the_document_follows_the_record(world: World) -> None:
     assert waiting.headers["retry-after"] == "1"
     assert "cancel" in waiting.json()["links"]
     world.run(job_id)
-    world.records.update_job(job_id, 1, phase="optimizing", progress=0.5, engine={"version": "0.1.0", "device": "cpu"})
+    engine = {"version": "0.1.0", "device": "cpu"}
+    world.records.update_job(job_id, 1, phase="optimizing", progress=0.5, engine=engine)
     running = world.client.get(f"/jobs/{job_id}").json()
-    assert [running[name] for name in ("status", "phase", "progress", "queue_position")] == [
-        "running",
-        "optimizing",
-        0.5,
-        None,
-    ]
-    assert running["engine"] == {"version": "0.1.0", "device": "cpu"}
+    expected = {"status": "running", "phase": "optimizing", "progress": 0.5, "queue_position": None, "engine": engine}
+    assert {name: running[name] for name in expected} == expected
     assert running["started_at"].endswith("Z")
-
-
-def test_a_finished_job_says_when_it_expires(world: World) -> None:
-    job_id = world.submit()
     world.succeed(job_id)
     answer = world.client.get(f"/jobs/{job_id}")
     assert "retry-after" not in answer.headers
     assert answer.json()["expires_at"] > answer.json()["finished_at"]
     assert answer.json()["links"]["result"] == f"/jobs/{job_id}/result"
-
-
-def test_an_etag_saves_the_body_until_something_changes(world: World) -> None:
-    job_id = world.submit()
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    unchanged = world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag})
-    assert (unchanged.status_code, unchanged.content) == (304, b"")
-    world.run(job_id)
-    assert world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag}).status_code == 200
-
-
-def test_a_heartbeat_is_no_change(world: World) -> None:
-    job_id = world.submit()
-    world.run(job_id)
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    world.records.heartbeat(job_id, 1)
-    assert world.client.get(f"/jobs/{job_id}", headers={"If-None-Match": etag}).status_code == 304
 
 
 def test_waiting_ends_with_the_job(world: World) -> None:
@@ -62,16 +45,6 @@ def test_waiting_ends_with_the_job(world: World) -> None:
     answer = world.client.get(f"/jobs/{job_id}", params={"wait": 20})
     worker.join()
     assert answer.json()["status"] == "successful"
-
-
-def test_waiting_with_an_etag_ends_at_the_first_change(world: World) -> None:
-    job_id = world.submit()
-    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
-    worker = threading.Timer(0.1, world.run, (job_id,))
-    worker.start()
-    answer = world.client.get(f"/jobs/{job_id}", params={"wait": 20}, headers={"If-None-Match": etag})
-    worker.join()
-    assert (answer.status_code, answer.json()["status"]) == (200, "running")
 
 
 def test_lists_go_page_by_page_and_by_status(world: World) -> None:
@@ -103,17 +76,8 @@ def test_the_event_stream_tells_everything_and_ends_with_the_job(world: World) -
     worker.join()
     assert answer.headers["content-type"].startswith("text/event-stream")
     events = events_of(answer.text)
-    assert [event["data"]["status"] for event in events if event["event"] == "status"] == [
-        "accepted",
-        "running",
-        "successful",
-    ]
-
-
-def test_a_stream_resumes_after_the_last_event_and_then_has_no_more(world: World) -> None:
-    job_id = world.submit()
-    world.succeed(job_id)
-    events = events_of(world.client.get(f"/jobs/{job_id}/events").text)
+    states = [event["data"]["status"] for event in events if event["event"] == "status"]
+    assert states == ["accepted", "running", "successful"]
     rest = world.client.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": events[0]["id"]})
     assert events_of(rest.text) == events[1:]
     done = world.client.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": events[-1]["id"]})
@@ -127,27 +91,21 @@ def test_the_stream_of_a_failed_job_carries_the_problem(world: World) -> None:
     assert (last["data"]["status"], last["data"]["error"]["reason"]) == ("failed", "NO_INITIAL_TRANSFORM")
 
 
-def test_cancelling_a_waiting_job_dismisses_it_once(world: World) -> None:
-    job_id = world.submit()
-    first = world.client.post(f"/jobs/{job_id}/cancel")
-    assert (first.status_code, first.json()["status"]) == (202, "dismissed")
-    assert world.queue.stopped == [(job_id, 1)]
-    second = world.client.post(f"/jobs/{job_id}/cancel")
-    assert (second.status_code, second.json()["status"]) == (200, "dismissed")
+def test_cancelling_dismisses_a_waiting_job_once_asks_a_running_ones_worker_and_refuses_a_finished_one(
+    world: World,
+) -> None:
+    def cancelled(job_id: str) -> tuple[int, str, bool]:
+        answer = world.client.post(f"/jobs/{job_id}/cancel")
+        return answer.status_code, answer.json()["status"], answer.json()["cancel_requested"]
 
-
-def test_cancelling_a_running_job_asks_its_worker(world: World) -> None:
-    job_id = world.submit()
-    world.run(job_id)
-    answer = world.client.post(f"/jobs/{job_id}/cancel")
-    assert (answer.status_code, answer.json()["status"], answer.json()["cancel_requested"]) == (202, "running", True)
-    assert world.queue.stopped == [(job_id, 1)]
-
-
-def test_a_finished_job_is_not_cancelled(world: World) -> None:
-    job_id = world.submit()
-    world.succeed(job_id)
-    assert_refused(world.client.post(f"/jobs/{job_id}/cancel"), 409, "JOB_FINISHED")
+    waiting, running, finished = (world.submit(seed=seed) for seed in range(3))
+    assert cancelled(waiting)[:2] == (202, "dismissed")
+    assert cancelled(waiting)[:2] == (200, "dismissed")
+    world.run(running)
+    assert cancelled(running) == (202, "running", True)
+    assert world.queue.stopped == [(waiting, 1), (running, 1)]
+    world.succeed(finished)
+    assert_refused(world.client.post(f"/jobs/{finished}/cancel"), 409, "JOB_FINISHED")
 
 
 def test_deleting_takes_the_artifacts_along(world: World) -> None:
@@ -175,3 +133,193 @@ def test_nobody_is_found_under_no_id(world: World) -> None:
         answer = world.client.get(f"/jobs/{odd}")
         assert answer.status_code == 404
         assert answer.json()["reason"] in ("JOB_NOT_FOUND", "NOT_FOUND")
+
+
+# results and artifacts over HTTP
+
+
+DATA = bytes(range(256)) * 4
+
+
+@pytest.fixture
+def job_id(world: World) -> str:
+    made = world.submit()
+    world.succeed(made, {"scene_points.ply": DATA, "trace.json": b"[]", "private.key": b"not an artifact"})
+    return made
+
+
+def test_the_result_lists_its_artifacts(world: World, job_id: str) -> None:
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    assert {name: document[name] for name in RESULT} == RESULT
+    listed = {entry["name"]: entry for entry in document["artifacts"]}
+    assert set(listed) == {"result.json", "scene_points.ply", "trace.json"}
+    assert world.client.get(listed["scene_points.ply"]["url"]).content == DATA
+    assert listed["scene_points.ply"]["bytes"] == len(DATA)
+
+
+def test_a_result_larger_than_any_can_be_is_not_read_whole(world: World, job_id: str) -> None:
+    world.blobs.put(f"jobs/{job_id}/1/result.json", b'{"a": "' + b"x" * (4 << 20) + b'"}')
+    assert_refused(world.client.get(f"/jobs/{job_id}/result"), 503, "RECORD_UNREADABLE")
+
+
+def test_pictures_follow_the_result(world: World) -> None:
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, pending=["preview.png"])
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    listed = {entry["name"]: entry for entry in document["artifacts"]}
+    picture = listed["preview.png"]
+    assert (picture["state"], picture["bytes"], picture["sha256"]) == ("pending", None, None)
+    assert listed["result.json"]["state"] == "ready"
+    refused = world.client.get(picture["url"], params={"wait": 0})
+    assert_refused(refused, 409, "ARTIFACT_NOT_READY")
+    assert refused.headers["retry-after"] == "1"
+    assert world.client.head(picture["url"], params={"wait": 0}).status_code == 409
+    world.finish(job_id, {"preview.png": b"a picture"})
+    assert world.client.get(picture["url"]).content == b"a picture"
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    assert [entry["state"] for entry in document["artifacts"]] == ["ready", "ready"]
+    assert "missing_artifacts" not in document
+
+
+def test_pictures_whose_worker_has_died_are_missing_in_time(world: World) -> None:
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, pending=["preview.png"])
+    world.records.ahead_s = world.settings.lost_after_s + 1
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    assert document["missing_artifacts"] == ["preview.png"]
+    assert [entry["name"] for entry in document["artifacts"]] == ["result.json"]
+    assert_refused(world.client.get(f"/jobs/{job_id}/artifacts/preview.png"), 404, "ARTIFACT_NOT_FOUND")
+
+
+def test_there_is_no_result_before_the_end_nor_of_a_dismissed_job(world: World) -> None:
+    job_id = world.submit(seed=1)
+    for path in ("result", "artifacts/trace.json"):
+        answer = world.client.get(f"/jobs/{job_id}/{path}")
+        assert_refused(answer, 409, "JOB_NOT_READY")
+        assert answer.headers["retry-after"] == "1"
+    world.client.post(f"/jobs/{job_id}/cancel")
+    assert_refused(world.client.get(f"/jobs/{job_id}/result"), 409, "JOB_DISMISSED")
+
+
+def test_a_failed_job_answers_with_its_own_problem(world: World) -> None:
+    """Whatever its reason, known or not: polling it is no error of the server."""
+    detail = "12 surface points were found; 500 are needed."
+    reasons = ("NO_SURFACE_IN_DETECTION", "SOMETHING_NEW", "WORKER_LOST", "JOB_TIMEOUT", "STORAGE_FULL", "INTERNAL")
+    for seed, reason in enumerate(reasons):
+        job_id = world.submit(seed=seed)
+        status = REASONS[reason].status if reason in REASONS else 422
+        world.fail(job_id, reason=reason, title="Failed", status=status, detail=detail, found=12)
+        for path in ("result", "artifacts/trace.json"):
+            problem = assert_refused(world.client.get(f"/jobs/{job_id}/{path}"), 409, "JOB_FAILED")
+            assert problem["detail"] == f"{reason}: {detail}"
+        own = problem["error"]
+        assert (own["reason"], own["status"], own["detail"], own["found"]) == (reason, status, detail, 12)
+        assert world.client.get(f"/jobs/{job_id}").json()["error"] == own
+    counted = generate_latest(world.app.state.metrics.registry).decode()
+    assert 'status="409"' in counted
+    assert not re.search(r'regnf_http_requests_total\{[^}]*status="5', counted)
+
+
+def test_ranges(world: World, job_id: str) -> None:
+    def ranged(asked: str) -> httpx.Response:
+        return world.client.get(f"/jobs/{job_id}/artifacts/scene_points.ply", headers={"Range": asked})
+
+    one = {
+        "bytes=0-9": (0, 10), "bytes=0-0": (0, 1), "bytes=1000-": (1000, 1024), "bytes=1020-9999": (1020, 1024),
+        "bytes=-24": (1000, 1024), "bytes=-3000": (0, 1024),
+    }  # fmt: skip
+    for asked, (start, stop) in one.items():
+        answer = ranged(asked)
+        assert (answer.status_code, answer.content) == (206, DATA[start:stop])
+        assert answer.headers["content-range"] == f"bytes {start}-{stop - 1}/1024"
+        assert answer.headers["content-length"] == str(stop - start)
+    many, digits = "bytes=" + ",".join(f"{i}-{i}" for i in range(10_000)), "bytes=" + "9" * 40 + "-"
+    for asked in (many, digits, "bytes=0-1,2-3", "bytes=5-1", "bytes=", "bytes=-", "items=0-1", "x"):
+        assert (ranged(asked).status_code, ranged(asked).content) == (200, DATA), asked
+    for asked in ("bytes=1024-", "bytes=99999999999-", "bytes=-0"):
+        refused = ranged(asked)
+        assert_refused(refused, 416, "RANGE_NOT_SATISFIABLE")
+        assert refused.headers["content-range"] == "bytes */1024"
+
+
+def test_etags_guard_ranges(world: World, job_id: str) -> None:
+    path = f"/jobs/{job_id}/artifacts/scene_points.ply"
+    head = world.client.head(path)
+    assert (head.status_code, head.content, head.headers["content-length"]) == (200, b"", "1024")
+    etag = head.headers["etag"]
+    assert world.client.get(path, headers={"Range": "bytes=0-9", "If-Range": etag}).status_code == 206
+    assert world.client.get(path, headers={"Range": "bytes=0-9", "If-Range": '"other"'}).status_code == 200
+
+
+ODD_NAMES = (
+    "private.key", "preview.png", "manifest.json", "..%2fmanifest.json", "%2e%2e%2f%2e%2e%2fx", "trace.json%00",
+    "trace.json%0d%0aX-Bad:1", "%E2%80%AEnosj.ecart", "x" * 4000, "/etc/passwd", "../manifest.json",
+)  # fmt: skip
+
+
+def test_only_the_fixed_names_are_artifacts(world: World, job_id: str) -> None:
+    for name in ODD_NAMES:
+        answer = world.client.get(f"/jobs/{job_id}/artifacts/{name}")
+        assert answer.status_code == 404, name
+        assert answer.json()["reason"] in ("ARTIFACT_NOT_FOUND", "NOT_FOUND")
+        assert "X-Bad" not in answer.headers
+    assert world.client.get(f"/jobs/{job_id}/artifacts/trace.json").content == b"[]"
+
+
+def addresses(world: World) -> list[str]:
+    job, known, asked = world.submit(), world.ready_field("a"), "a" * 64
+    world.succeed(job, {"trace.json": b"[]"})
+    now = world.records.now()
+    error = {"reason": "LAYOUT_AMBIGUOUS", "candidates": [{"picture": True}]}
+    world.records.create_field(FieldRecord(asked, "rejected", 1, now, now, error=error, original_until=now + 60.0))
+    places = [f"/fields/{known}/preview.png", f"/fields/{asked}/candidates/1.png"]
+    for place in places:
+        world.blobs.put(place[1:], b"a picture")
+    return [*places, f"/jobs/{job}", f"/fields/{known}", f"/jobs/{job}/artifacts/trace.json"]
+
+
+def test_every_etag_is_honored(world: World) -> None:
+    """As RFC 9110 defines it: weak comparison, lists, `*`. A malformed header sets no condition."""
+    for path, method in product(addresses(world), ("GET", "HEAD")):
+        whole = world.client.request(method, path)
+        if whole.status_code == 405:  # a job's document
+            continue
+        etag = whole.headers["etag"]
+        held = (etag, f"W/{etag}", f'"x", {etag}', f'W/"x" ,,W/{etag} ', "*", " * ", f'"a,b", {etag}')
+        others = ('"x"', f'W/"x", "{etag[1:-2]}"', f'"x,{etag[1:]}', '""')
+        malformed = ("", etag[1:-1], f"{etag} {etag}", f"w/{etag}", f"{etag}, *", etag[:-1], f'{etag[:-1]} "')
+        for header in held + others + malformed:
+            answer = world.client.request(method, path, headers={"If-None-Match": header})
+            assert answer.status_code == (304 if header in held else 200), (path, header)
+            assert (answer.content == b"") == (header in held or method == "HEAD")
+            assert [answer.headers[one] == whole.headers[one] for one in ("etag", "cache-control")] == [True, True]
+
+
+def test_an_etag_holds_until_something_changes_and_a_heartbeat_is_no_change(world: World) -> None:
+    job_id = world.submit()
+    path = f"/jobs/{job_id}"
+    etag = world.client.get(path).headers["etag"]
+    assert world.client.get(path, headers={"If-None-Match": etag}).status_code == 304
+    world.run(job_id)
+    changed = world.client.get(path, headers={"If-None-Match": etag})
+    assert changed.status_code == 200
+    world.records.heartbeat(job_id, 1)
+    assert world.client.get(path, headers={"If-None-Match": changed.headers["etag"]}).status_code == 304
+
+
+@pytest.mark.parametrize("weak", ["", "W/"])
+def test_waiting_with_an_etag_ends_at_the_first_change(world: World, weak: str) -> None:
+    job_id, data = world.submit(), field_bytes("new")
+    sent = world.client.post("/fields", content=data)
+    etag = world.client.get(f"/jobs/{job_id}").headers["etag"]
+    changes = [
+        (f"/jobs/{job_id}", etag, threading.Timer(0.1, world.run, (job_id,)), "status", "running"),
+        (sent.headers["location"], sent.headers["etag"],
+         threading.Timer(0.1, world.records.update_field, (sent.json()["sha256"],), {"label": "a room"}), "label",
+         "a room"),
+    ]  # fmt: skip
+    for path, held, change, member, value in changes:
+        change.start()
+        answer = world.client.get(path, params={"wait": 20}, headers={"If-None-Match": weak + held})
+        change.join()
+        assert (answer.status_code, answer.json()[member]) == (200, value)

@@ -11,8 +11,8 @@ import httpx
 import pytest
 
 from tests.contract.live import Live, eventually, live_service
-from tests.contract.test_slow_clients import ended, submit
-from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, sha256
+from tests.contract.test_live_transport import submit
+from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused
 
 MOST = 8
 REQUEST = b"GET /openapi.yaml HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -20,7 +20,6 @@ REQUEST = b"GET /openapi.yaml HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 @pytest.fixture
 def limited(worlds: Callable[..., World]) -> Callable[..., World]:
-    """Makes a service where a caller has one request in progress."""
     return partial(worlds, max_requests_per_caller=1)
 
 
@@ -28,11 +27,7 @@ def limited(worlds: Callable[..., World]) -> Callable[..., World]:
 def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """A real API where an address has few requests in progress."""
     folder = tmp_path_factory.mktemp("narrow")
-    limits = {
-        "max_requests_per_caller": MOST, "max_connections": 3 * MOST, "max_connections_per_address": 2 * MOST,
-        "max_uploads_per_caller": 3,
-    }  # fmt: skip
-    with live_service(folder, with_worker=False, **limits) as started:
+    with live_service(folder, with_worker=False, max_requests_per_caller=MOST) as started:
         yield started
 
 
@@ -42,7 +37,7 @@ def test_requests_at_once(limited: Callable[..., World]) -> None:
     with requests.held("alice"):
         refused = world.client.get("/fields", headers=ALICE)
         assert_refused(refused, 429, "TOO_MANY_REQUESTS_AT_ONCE")
-        assert (int(refused.headers["retry-after"]) > 0, refused.headers["connection"]) == (True, "close")
+        assert int(refused.headers["retry-after"]) > 0
         assert world.client.get("/healthz", headers=ALICE).status_code == 200
         assert world.client.get("/static/favicon.svg", headers=ALICE).status_code == 200
         assert_refused(world.client.get("/fields"), 401, "UNAUTHENTICATED")
@@ -99,16 +94,8 @@ def test_requests_sent_ahead_are_answered_one_after_the_other(narrow: Live) -> N
     last = REQUEST.replace(b"localhost\r\n", b"localhost\r\nConnection: close\r\n")
     with narrow.connect() as connection:
         connection.sendall(REQUEST * 30 + last)
-        assert ended(connection).count(b"HTTP/1.1 200 ") == 31
-
-
-def test_connections_that_ask_ahead_make_room(narrow: Live) -> None:
-    """As many as an address may have, each with something to answer all the time, and a client that does not read."""
-    with ExitStack() as stack:
-        for _ in range(2 * MOST):
-            stack.enter_context(narrow.connect()).sendall(REQUEST * 200)
-        with narrow.client() as honest:
-            assert eventually(lambda: answered(honest, "/version"), "an answer", 10)
+        text = b"".join(iter(lambda: connection.recv(65536), b""))
+    assert text.count(b"HTTP/1.1 200 ") == 31
 
 
 def test_a_client_does_not_choose_the_address_it_counts_for(narrow: Live) -> None:
@@ -131,17 +118,3 @@ def test_a_client_does_not_choose_the_address_it_counts_for(narrow: Live) -> Non
 
         assert eventually(all_refused, "the refusals", 10)
         client.post(f"/jobs/{job}/cancel")
-
-
-def test_slow_uploads_make_room_for_another_of_the_same_address(narrow: Live) -> None:
-    """Each would have half a minute for its next byte, if nobody else asked."""
-    data = field_bytes("honest beside slow uploads", 1 << 20)
-    with ExitStack() as stack, narrow.client() as honest:
-        slow = [stack.enter_context(narrow.connect()) for _ in range(3)]
-        for one in slow:
-            one.sendall(b"POST /fields HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4000000\r\n\r\n" + data[:600])
-        assert honest.put(f"/fields/{sha256(data)}", content=data).status_code == 201
-        assert honest.delete(f"/fields/{sha256(data)}").status_code == 204
-        told = [text for text in map(at_hand, slow) if text]
-    assert len(told) == 1
-    assert b"REQUEST_STALLED" in told[0]

@@ -20,7 +20,6 @@ _ROOM = 3 * 512 * 1024
 
 @pytest.fixture
 def redis() -> Iterator[Redis]:
-    """A server of its own: its memory is limited."""
     with private_redis() as url, connect(url) as made:
         yield made
 
@@ -28,11 +27,10 @@ def redis() -> Iterator[Redis]:
 def served(folder: Path, redis: Redis, **settings: Any) -> World:
     """No rate of writes protects Redis here: its own bounds have to."""
     callers = frozenset({"greedy:greedy-token", "honest:honest-token"})
-    return make_world(folder, redis, api_tokens=callers, write_limit_per_s=0, **settings)
+    return make_world(folder, redis, api_tokens=callers, **settings)
 
 
 def ready(world: World, caller: str) -> dict[str, Any]:
-    """A request of a caller who has both fields."""
     names = {}
     for role in ("scene", "object"):
         data = field_bytes(role)
@@ -89,7 +87,7 @@ def test_a_reserve_is_kept_for_what_goes_on(tmp_path: Path, redis: Redis) -> Non
         refused = [answer for answer in answers if answer.status_code != 202]
         assert refused
         for answer in refused:
-            assert_refused(answer, 507, "RECORDS_FULL")
+            assert_refused(answer, 507, "STORAGE_FULL")
             assert "retry-after" in answer.headers
         answer = register(world, "honest", requests["honest"], 1)
         assert answer.status_code == 202, answer.text
@@ -100,8 +98,8 @@ def test_a_reserve_is_kept_for_what_goes_on(tmp_path: Path, redis: Redis) -> Non
         assert world.client.delete(f"/jobs/{waiting}", headers=TOKENS["greedy"]).status_code == 204
         redis.config_set("maxmemory", 1)
         problem = assert_refused(world.client.get("/readyz", headers=TOKENS["honest"]), 503, "NOT_READY")
-        assert problem["reasons"] == {"records": "RECORDS_FULL"}
-        assert_refused(register(world, "honest", requests["honest"], 2), 507, "RECORDS_FULL")
+        assert problem["reasons"] == {"records": "STORAGE_FULL"}
+        assert_refused(register(world, "honest", requests["honest"], 2), 507, "STORAGE_FULL")
 
 
 def test_a_caller_s_oldest_finished_jobs_go_beyond_its_quota(tmp_path: Path, redis: Redis) -> None:
@@ -125,14 +123,12 @@ def test_a_caller_s_oldest_finished_jobs_go_beyond_its_quota(tmp_path: Path, red
 
 
 def test_rounds_bring_all_callers_within_their_bounds(tmp_path: Path, redis: Redis) -> None:
-    """Those whom the release before has not noted, too."""
     world = served(tmp_path, redis, max_upload_bytes=4096)
     with world.client:
         requests = {caller: ready(world, caller) for caller in TOKENS}
         for caller, count in (("greedy", 6), ("honest", 2)):
             for seed in range(count):
                 register_and_cancel(world, caller, requests[caller], seed)
-        redis.delete("regnf:owners")
         room = Room(world.records, world.blobs, redis, world.settings.model_copy(update={"max_finished_jobs": 5}))
         assert room.tidy(lambda: None) == 3
         held = [len(world.client.get("/jobs", headers=TOKENS[caller]).json()["jobs"]) for caller in TOKENS]

@@ -12,7 +12,6 @@ from typing import Any
 import httpx
 from fastapi import FastAPI
 from redis import Redis
-from starlette.routing import BaseRoute
 
 from regnf_service.server import create_app
 from regnf_state.queue import Work
@@ -21,7 +20,7 @@ from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 from tests.stores import HeldBlobs, ShiftedJournaledRecords, WatchedQueue, stores_over
 
-_ROUTES: list[BaseRoute] = []
+_APPS: list[FastAPI] = []
 BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
 BOUNDS = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 NOBODY = "0" * 32
@@ -31,7 +30,6 @@ BOB = {"Authorization": "Bearer the-secret-of-bob"}
 
 
 def field_bytes(name: str, size: int = 600) -> bytes:
-    """Bytes that begin as a safetensors file does; different for each name."""
     header = json.dumps({"__metadata__": {"name": name}}).encode()
     return (len(header).to_bytes(8, "little") + header).ljust(size, b"\0")
 
@@ -40,29 +38,24 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+def put(client: httpx.Client, data: bytes, **headers: str) -> httpx.Response:
+    return client.put(f"/fields/{sha256(data)}", content=data, headers=headers)
+
+
 def transform(scale: float = 1.0) -> dict[str, Any]:
     matrix = [[scale, 0, 0, 0], [0, scale, 0, 0], [0, 0, scale, 0], [0, 0, 0, 1]]
     return {"matrix": matrix, "scale": scale, "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]}
 
 
 RESULT = {
-    "verdict": "registered",
-    "verdict_reason": "SURFACES_AGREE",
-    "probability": 0.95,
-    "T_scene_object": transform(0.5),
-    "T_object_scene": transform(2.0),
-    "center_scene": [0.0, 0.0, 0.0],
-    "center_object": [0.0, 0.0, 0.0],
-    "alternatives": [],
-    "metrics": {"residual_rms": 0.001},
-    "seed": 0,
-}
+    "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.95,
+    "T_scene_object": transform(0.5), "T_object_scene": transform(2.0), "center_scene": [0.0, 0.0, 0.0],
+    "center_object": [0.0, 0.0, 0.0], "alternatives": [], "metrics": {"residual_rms": 0.001}, "seed": 0,
+}  # fmt: skip
 
 
 @dataclass
 class World:
-    """The service, its stores, and a client."""
-
     settings: Settings
     redis: Redis
     records: ShiftedJournaledRecords
@@ -77,7 +70,7 @@ class World:
         answer = self.client.put(f"/fields/{sha256(data)}", content=data)
         assert answer.status_code == 201, answer.text
         self.blobs.delete(f"fields/{sha256(data)}/original")
-        self.queue.fair.remove(Work("import", sha256(data), 1).name)
+        self.queue.remove(Work("import", sha256(data), 1).name)
         self.records.update_field(sha256(data), attempt=1, state="ready", report={"bounds": bounds or BOUNDS})
         return sha256(data)
 
@@ -90,7 +83,6 @@ class World:
         return sha256(data)
 
     def submit(self, **changes: Any) -> str:
-        """Post a registration; the job's id."""
         answer = self.client.post("/register", json=self.valid_request() | changes)
         assert answer.status_code == 202, answer.text
         return str(answer.json()["id"])
@@ -103,10 +95,15 @@ class World:
                 self.ready_field(name)
         return {"scene": scene, "object": object_, "detection": BOX}
 
-    def run(self, job_id: str) -> JobRecord:
-        """What a worker does first."""
+    def job(self, job_id: str) -> JobRecord:
         record = self.records.get_job(job_id)
         assert record is not None
+        return record
+
+    def run(self, job_id: str) -> JobRecord:
+        record = self.job(job_id)
+        if record.status == "running":
+            return record
         return self.records.update_job(job_id, record.attempt, status="running", phase="loading")
 
     def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None, pending: Sequence[str] = ()) -> None:
@@ -116,9 +113,8 @@ class World:
         listed = self._put(job_id, attempt, files)
         document = {"attempt": attempt, "artifacts": listed} | ({"pending": list(pending)} if pending else {})
         self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
-        self.records.update_job(
-            job_id, attempt, status="successful", verdict=json.loads(files["result.json"]).get("verdict")
-        )
+        verdict = json.loads(files["result.json"]).get("verdict")
+        self.records.update_job(job_id, attempt, status="successful", verdict=verdict)
 
     def finish(self, job_id: str, artifacts: dict[str, bytes]) -> None:
         """What it leaves behind of what was still to come."""
@@ -138,17 +134,22 @@ class World:
         self.records.update_job(job_id, attempt, status="failed", error=error)
 
 
+def pointers(problem: dict[str, Any]) -> list[str]:
+    return [one["pointer"] for one in problem["errors"]]
+
+
 def share_routes(app: FastAPI) -> None:
-    """Give every application the routes of the first one: no setting changes them, and the framework takes longer to
-    work them out, at an application's first request, than most tests take for theirs."""
-    if not _ROUTES:
-        _ROUTES.extend(app.router.routes)
-    app.router.routes[:] = _ROUTES
+    """Give every application the routes and the contract of the first one: no setting changes them, and the framework
+    takes longer to work them out, at an application's first request, than most tests take for theirs."""
+    _APPS.append(app)
+    del _APPS[1:]
+    app.router.routes[:] = _APPS[0].router.routes
+    app.openapi = _APPS[0].openapi  # type: ignore[method-assign]
 
 
 def make_world(folder: Path, redis: Redis, **settings: Any) -> World:
     """A fresh service; ``settings`` override what suits tests. Redis is emptied."""
-    usual = {"state_dir": folder, "redis_url": None, "upload_stall_s": 2.0, "max_upload_bytes": 4096}
+    usual = {"state_dir": folder, "redis_url": None, "max_upload_bytes": 4096}
     chosen = Settings(**(usual | settings))
     stores = stores_over(redis, chosen.blob_dir, chosen.job_retention_s)
     app = create_app(chosen, stores)

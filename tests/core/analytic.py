@@ -48,8 +48,6 @@ def _unit_bounds() -> list[list[float]]:
 def sphere(
     radius: float, center: Sequence[float] = (0.0, 0.0, 0.0), bounds: Sequence[Sequence[float]] | None = None
 ) -> AnalyticField:
-    """A ball."""
-
     def formula(points: Tensor) -> Tensor:
         return (points - torch.tensor(list(center), dtype=points.dtype)).norm(dim=-1) - radius
 

@@ -196,19 +196,15 @@ def test_workers_are_scaled_by_what_is_unfinished() -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ([], "auth.existingSecret"),
-        ([*OPEN, "storage.kind=nfs"], "storage"),
-        ([*OPEN, "redis.password=a b"], "password"),
-        ([*OPEN, "queue.key=short"], "queue"),
+        ([], "auth.existingSecret"), ([*OPEN, "storage.kind=nfs"], "storage"),
+        ([*OPEN, "redis.password=a b"], "password"), ([*OPEN, "queue.key=short"], "queue"),
         ([*OPEN, "settings.REGNF_QUEUE_KEY=abcdefghijklmnop"], "settings"),
-        ([*OPEN, "storage.kind=s3"], "storage.s3.url"),
-        ([*OPEN, "worker.device=tpu"], "device"),
+        ([*OPEN, "storage.kind=s3"], "storage.s3.url"), ([*OPEN, "worker.device=tpu"], "device"),
         ([*OPEN, "api.replicas=0"], "replicas"),
         ([*OPEN, "webhooks.hosts={a.example.org}"], "webhooks.existingSecret"),
-        ([*OPEN, "settings.REGNF_API_TOKENS=x"], "settings"),
-        ([*OPEN, "wroker.replicas=2"], "wroker"),
+        ([*OPEN, "settings.REGNF_API_TOKENS=x"], "settings"), ([*OPEN, "wroker.replicas=2"], "wroker"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_work_is_refused(settings: list[str], said: str) -> None:
     sets = [word for one in settings for word in ("--set", one)]
     done = helm("template", "demo", str(CHART), *sets)

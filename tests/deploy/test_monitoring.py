@@ -11,7 +11,6 @@ import pytest
 import yaml
 from prometheus_client import generate_latest
 
-from regnf_service.http.connections import Connections
 from regnf_service.metrics import Metrics
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
@@ -45,18 +44,15 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         store.update_field("a" * 64, state="ready")
         for number in range(2):
             services.queue.enqueue_registration(f"j{number}", 1)
-        count(redis, "worker_seconds", "anonymous", "import")
         count(redis, "queue_payloads_refused", "regnf")
         count(redis, "jobs_evicted")
         count(redis, "records_unreadable", "job")
         RedisOutbox(redis).settle(Message("ended", 1, 0, "anonymous hooks.example"), Delivery("delivered"))
-        connections = Connections(most=1, most_of_site=1, most_unread=1)
-        connections.ended["all"] += 1
-        metrics = Metrics(services, connections)
+        metrics = Metrics(services)
         metrics.requests.labels("GET", "/", "200").inc()
         metrics.seconds.labels("/").observe(1)
         metrics.received.labels("/").inc()
-        metrics.quota_refusals.labels("QUOTA_IMPORTS").inc()
+        metrics.quota_refusals.labels("QUOTA_ACTIVE_JOBS").inc()
         text = generate_latest(metrics.registry).decode()
     found: dict[str, set[str]] = {}
     for line in text.splitlines():
@@ -68,7 +64,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
 
 @pytest.mark.parametrize("query", QUERIES)
 def test_every_metric_named_exists_with_its_labels(query: str, shown: dict[str, set[str]]) -> None:
-    names = set(re.findall(r"\bregnf_\w+", query))
+    names = set(re.findall(r"\b(?:regnf|process)_\w+", query))
     assert names <= shown.keys()
     held = set().union(*(shown[name] for name in names)) | {"instance", "job"}
     grouped = re.findall(r"\b(?:by|on) ?\(([^)]*)\)", query)

@@ -103,14 +103,26 @@ def ended(connection: socket.socket) -> bool:
     return True
 
 
+def test_a_refusal_reaches_a_client_that_goes_on_sending(proxy: int) -> None:
+    """The API stops reading, and the proxy passes its answer on."""
+    headers = {"Authorization": "Bearer key"}
+    with httpx.Client(base_url=f"http://localhost:{proxy}", headers=headers) as client:
+        answers = [client.put(f"/fields/{'0' * 64}", content=b"\x89PNG" + bytes(8 << 20)) for _ in range(5)]
+    assert [one.json()["reason"] for one in answers] == ["FIELD_NOT_RECOGNIZED"] * 5
+
+
 def test_one_address_has_so_many_connections(proxy: int) -> None:
     head = b"PUT /fields/0 HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
-    with ExitStack() as stack:
-        for _ in range(OF_ONE_ADDRESS):
-            one = stack.enter_context(socket.create_connection(("127.0.0.1", proxy), timeout=30))
-            one.sendall(head)
-        statuses = {httpx.get(f"http://localhost:{proxy}/healthz").status_code for _ in range(3)}
-    assert statuses == {429}
+
+    def beside_as_many() -> set[int]:
+        with ExitStack() as stack:
+            for _ in range(OF_ONE_ADDRESS):
+                one = stack.enter_context(socket.create_connection(("127.0.0.1", proxy), timeout=30))
+                one.sendall(head)
+            return {httpx.get(f"http://localhost:{proxy}/healthz").status_code for _ in range(3)}
+
+    # on a busy machine those that send nothing may be cut off before the others ask
+    assert eventually(lambda: beside_as_many() == {429}, "the refusals", 20)
 
 
 def test_tls_where_there_is_a_certificate(live: Live, tmp_path: Path) -> None:

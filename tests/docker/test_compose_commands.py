@@ -17,10 +17,6 @@ COMMANDS = documented_commands(ROOT)
 every_command = pytest.mark.parametrize("command", COMMANDS, ids=lambda command: f"{command.source}: {command.text}")
 
 
-def rendered(command: ComposeCommand) -> dict[str, Service]:
-    return render(ROOT / command.file, command.variables, command.profiles)
-
-
 def settings_of(service: Service, monkeypatch: pytest.MonkeyPatch) -> Settings:
     """What the program in the container reads: its environment, and nothing of this process'."""
     for name in [name for name in os.environ if name.startswith("REGNF_")]:
@@ -30,52 +26,39 @@ def settings_of(service: Service, monkeypatch: pytest.MonkeyPatch) -> Settings:
     return Settings()
 
 
-def test_the_documentation_prints_commands() -> None:
+def test_the_documentation_prints_commands_and_the_front_end_knows_its_port() -> None:
     sources = {command.source for command in COMMANDS}
     assert sources == {"README.md", "docs/deployment.md", "docker/compose.yaml"}
     assert {profile for command in COMMANDS for profile in command.profiles} == {"cpu", "gpu", "observability"}
+    for variables in ({}, {"REGNF_PUBLISH": "127.0.0.1:9000"}):
+        services = render(COMPOSE, variables)
+        assert services["proxy"]["ports"] == [f"{services['api']['environment']['REGNF_PUBLISH']}:8000"]
 
 
 @every_command
-def test_the_front_end_starts(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = settings_of(rendered(command)["api"], monkeypatch)
-    check_access(settings)
-    assert settings.redis_url == "redis://redis:6379/0"
-
-
-@every_command
-def test_a_worker_starts(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
-    services = rendered(command)
+def test_what_a_command_starts_has_what_it_needs(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    services = render(ROOT / command.file, command.variables, command.profiles)
     workers = [name for name in services if name.startswith("worker")]
     assert workers
     assert set(command.scale) <= set(services)
-    for name in workers:
+    for name in ("api", *workers):
         settings = settings_of(services[name], monkeypatch)
         assert settings.redis_url == "redis://redis:6379/0"
-        assert not settings.api_tokens
-
-
-@every_command
-def test_grafana_is_given_a_password(command: ComposeCommand) -> None:
-    services = rendered(command)
+        if name == "api":
+            check_access(settings)
+        else:
+            assert not settings.api_tokens
     assert ("grafana" in services) == ("observability" in command.profiles)
     if "grafana" in services:
         assert services["grafana"]["environment"]["GF_SECURITY_ADMIN_PASSWORD"]
 
 
-@pytest.mark.parametrize("publish", ["0.0.0.0:8080", "8080", "192.0.2.1:8080"])
-def test_published_to_others_it_does_not_start_without_tokens(publish: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    services = render(COMPOSE, {"REGNF_PUBLISH": publish}, ["cpu"])
-    assert services["proxy"]["ports"] == [f"{publish}:8000"]
+def test_published_to_others_it_does_not_start_without_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
+    services = render(COMPOSE, {"REGNF_PUBLISH": "0.0.0.0:8080"}, ["cpu"])
+    assert services["proxy"]["ports"] == ["0.0.0.0:8080:8000"]
     with pytest.raises(StartError) as caught:
         check_access(settings_of(services["api"], monkeypatch))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
-
-
-def test_the_front_end_knows_where_its_port_is_published() -> None:
-    for variables in ({}, {"REGNF_PUBLISH": "127.0.0.1:9000"}):
-        services = render(COMPOSE, variables)
-        assert services["proxy"]["ports"] == [f"{services['api']['environment']['REGNF_PUBLISH']}:8000"]
 
 
 @pytest.mark.parametrize(("password", "status"), [("", 1), ("a-password", 0)])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
+import runpy
 import subprocess
 import sys
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,59 +19,38 @@ SCRIPT = ROOT / "docker" / "worker_health.py"
 
 
 @pytest.fixture(scope="module")
-def health() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("worker_health", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def health() -> SimpleNamespace:
+    return SimpleNamespace(**runpy.run_path(str(SCRIPT)))
 
 
-def worker_of(redis: Redis, hostname: str) -> Any:
-    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{hostname}-1")
-    worker.hostname = hostname
-    worker.register_birth()
-    return worker
+def test_a_worker_of_this_host_that_reports_is_alive(health: SimpleNamespace, redis: Redis) -> None:
+    """Another host's does not count, nor one that said goodbye, or whose registration has run out."""
+    workers = {}
+    for host in ("here", "gone", "silent"):
+        workers[host] = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{host}-1")
+        workers[host].hostname = host
+        workers[host].register_birth()
+    assert [health.is_alive(redis, host) for host in ("here", "gone", "silent", "elsewhere")] == [True] * 3 + [False]
+    workers["gone"].register_death()
+    assert redis.ttl(workers["silent"].key) > 0
+    redis.delete(workers["silent"].key)
+    assert [health.is_alive(redis, host) for host in ("here", "gone", "silent")] == [True, False, False]
 
 
-def test_a_registered_worker_is_alive(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "here")
-    assert health.is_alive(redis, "here")
-
-
-def test_another_hosts_worker_does_not_count(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "elsewhere")
-    assert not health.is_alive(redis, "here")
-
-
-def test_a_worker_that_said_goodbye_is_not_alive(health: ModuleType, redis: Redis) -> None:
-    worker_of(redis, "here").register_death()
-    assert not health.is_alive(redis, "here")
-
-
-def test_a_worker_that_stopped_reporting_is_not_alive(health: ModuleType, redis: Redis) -> None:
-    worker = worker_of(redis, "here")
-    assert redis.ttl(worker.key) > 0  # the registration runs out by itself ...
-    redis.delete(worker.key)  # ... as it has now
-    assert not health.is_alive(redis, "here")
-
-
-@pytest.mark.parametrize(
-    ("url", "said"), [(None, "set REGNF_REDIS_URL"), ("unix:///nowhere/socket", "Redis does not answer")]
-)
-def test_says_what_is_wrong(url: str | None, said: str) -> None:
-    environment = {"PYTHONPATH": str(ROOT)} | ({"REGNF_REDIS_URL": url} if url else {})
+def checked(**variables: str) -> tuple[int, str]:
+    environment = {"PYTHONPATH": str(ROOT)} | variables
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 1
-    assert said in run.stderr
+    return run.returncode, run.stderr
+
+
+def test_says_what_is_wrong() -> None:
+    for variables, said in (({}, "set REGNF_REDIS_URL"), ({"REGNF_REDIS_URL": "unix:///no"}, "Redis does not answer")):
+        status, printed = checked(**variables)
+        assert (status, said in printed) == (1, True)
 
 
 def test_exit_status_follows_the_worker(redis_url: str, redis: Redis) -> None:
-    environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": redis_url}
-    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
-    assert (run.returncode, run.stderr) == (1, "no worker of this host has reported lately\n")
+    assert checked(REGNF_REDIS_URL=redis_url) == (1, "no worker of this host has reported lately\n")
     worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis)
     worker.register_birth()
-    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
-    assert (run.returncode, run.stderr) == (0, "")
+    assert checked(REGNF_REDIS_URL=redis_url) == (0, "")

@@ -14,9 +14,11 @@ from pathlib import Path
 import httpx
 import pytest
 
+from tests.cli.conftest import Run, demo, run
 from tests.contract.live import eventually
 from tests.docs.pages import DOCS, ROOT, Block, blocks, reader_pages
 
+__all__ = ["demo", "run"]
 ADDRESS = "127.0.0.1:8080"
 SERVE = "regnf serve\n"
 RUN = [page for page in reader_pages() if any(block.language in ("bash", "python") for block in blocks(page))]
@@ -37,12 +39,11 @@ def environment(folder: Path) -> dict[str, str]:
     return plain | own | {"REGNF_STATE_DIR": str(folder / "state"), "XDG_CACHE_HOME": str(folder / "cache")}
 
 
-def faults(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> str:
-    """What was run and what it said, where it failed; else nothing."""
+def runs(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> None:
     done = subprocess.run(
         command, input=text, cwd=folder, env=variables, capture_output=True, text=True, timeout=280, check=False
     )
-    return "" if done.returncode == 0 else f"{text}\n{done.stdout}\n{done.stderr}"
+    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
 
 
 @contextmanager
@@ -83,11 +84,11 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
         for block in found:
             code = block.code.replace(ADDRESS, address)
             if block.language == "bash" and block.code != SERVE:
-                assert faults(["bash", "-euo", "pipefail"], code, tmp_path, variables) == ""
+                runs(["bash", "-euo", "pipefail"], code, tmp_path, variables)
             elif block.language == "python":
                 program += code
         if program:
-            assert faults([sys.executable, "-W", "error", "-"], program, tmp_path, variables) == ""
+            runs([sys.executable, "-W", "error", "-"], program, tmp_path, variables)
 
 
 def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
@@ -96,23 +97,14 @@ def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
             assert block.language in ("bash", "python", "json", "console", "text"), page
             if block.language == "console":
                 assert ELSEWHERE.match(block.code), f"{page}: {block.code}"
-
-
-def test_there_are_blocks() -> None:
     assert {"tutorial.md", "batch.md", "verdicts.md", "units.md", "page.md"} <= {page.name for page in RUN}
 
 
-def test_the_tutorial_prints_what_is_printed(tmp_path: Path) -> None:
+def test_the_tutorial_prints_what_is_printed(run: Run, demo: list[object]) -> None:
     """The words as they are, the numbers rounded: they differ between machines in the last digits."""
     page = (DOCS / "start" / "tutorial.md").read_text(encoding="utf-8")
     (told,) = re.findall(r"```text\n(verdict .*?)```", page, flags=re.S)
-    data = ROOT / "examples" / "data"
-    fields = [str(data / name) for name in ("mix-room.safetensors", "armchair.safetensors")]
-    command = [sys.executable, "-m", "regnf_cli.main", "register", *fields, "--detection", str(data / "detection.json")]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, timeout=280, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = run(*demo, code=0)
     number = re.compile(r"-?\d+\.\d+")
     printed = "\n".join(done.stdout.splitlines()[: len(told.splitlines())])
     words_told, words_printed = (re.sub(r"\s+", " ", number.sub("#", text)).strip() for text in (told, printed))

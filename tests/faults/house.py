@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 from redis import Redis
 
+from regnf_state.redis.queue import JobQueue
 from tests.contract.world import BOX, field_bytes, sha256
 from tests.faults.pace import Pace
 from tests.faults.stores import Bucket, Store
@@ -85,7 +86,7 @@ class House:
         return process
 
     def live_workers(self) -> int:
-        return sum(not self.redis.hexists(key, "death") for key in self.redis.scan_iter("rq:worker:*"))
+        return JobQueue(self.redis).live_workers()
 
     def _answers(self) -> bool:
         try:

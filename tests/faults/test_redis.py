@@ -109,7 +109,7 @@ def test_redis_out_of_memory(house: House) -> None:
     with fault() as one:
         house.redis.config_set("maxmemory", 1)
         refused = house.client.post("/register", json=request)
-        assert (refused.status_code, refused.json()["reason"]) == (507, "RECORDS_FULL")
+        assert (refused.status_code, refused.json()["reason"]) == (507, "STORAGE_FULL")
         assert "Retry-After" in refused.headers
         house.let_go()
         time.sleep(house.pace.lasting(2.6, 120.0))
@@ -138,7 +138,7 @@ def test_redis_frozen(house: House) -> None:
             assert house.client.get("/static/favicon.svg", timeout=20).status_code == 200
             assert house.client.get("/healthz", timeout=20).status_code == 200
             answers = [each.result() for each in asked]
-        assert {(each.status_code, each.json()["reason"]) for each in answers} == {(503, "STORE_UNAVAILABLE")}
+        assert {(each.status_code, each.json()["reason"]) for each in answers} == {(503, "STORAGE_UNAVAILABLE")}
         assert all("Retry-After" in each.headers for each in answers)
         list(lines)  # the stream ends, and whole: a broken one raises
         house.server.process.send_signal(signal.SIGCONT)

@@ -21,8 +21,8 @@ from regnf_state.manifest import Manifest
 from regnf_state.queue import Kind
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
+from regnf_worker import artifacts
 from regnf_worker import attempt as attempts
-from regnf_worker import settle
 from regnf_worker.attempt import run_attempt
 from regnf_worker.engine import Made
 from regnf_worker.imports import run_import_attempt
@@ -68,7 +68,7 @@ class HeldEngine(TinyEngine):
 
 
 def publish(blobs: BlobStore, manifest: Manifest) -> bool:
-    published = settle.publish(blobs, manifest)
+    published = artifacts.publish(blobs, manifest)
     wait_while("hold-end")
     return published
 

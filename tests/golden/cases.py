@@ -9,11 +9,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from regnf_core import OrientedBox, RegistrationOptions, RegistrationResult, Sim3, WarmStart, open_field, register
+from regnf_core import OrientedBox, RegistrationOptions, RegistrationResult, Sim3, open_field, register
 from regnf_core.library import LibraryObject, model_object, search_library
 from tests.core.analytic import chair, chair_box, chair_pose, room, sphere, table
-from tests.core.robust.seen_in_part import UNDER_THE_SEAT, observed, over_closed
-from tests.core.robust.shapes import random_pose, reframed, slab_table, table_room
+from tests.core.robust.shapes import (
+    UNDER_THE_SEAT,
+    observed,
+    over_closed,
+    random_pose,
+    reframed,
+    slab_table,
+    table_room,
+)
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "data"
 PAPER = {
@@ -50,7 +57,7 @@ def cases() -> list[Case]:
         plain("robust-several-poses", table_room(chair_pose(1.4)), slab_table(), SLAB_BOX),
         plain("robust-wrong-object", chair_room, table(), box),
         plain("robust-seen-in-part", observed(over_closed(UNDER_THE_SEAT), UNDER_THE_SEAT), chair(), box),
-        plain("robust-start-and-up-axis", chair_room, chair(), box, {"up_axis": "z"}, WarmStart(near)),
+        plain("robust-start-and-up-axis", chair_room, chair(), box, {"up_axis": "z"}, near),
         plain("paper-right-object", chair_room, chair(), box, PAPER),
         plain("paper-wrong-object", chair_room, table(), box, PAPER),
         Case("library-search", box, partial(search, chair_room, box)),
@@ -61,16 +68,11 @@ SLAB_BOX = OrientedBox.from_corners([-0.55, -0.5, -0.02], [0.15, 0.2, 0.36])
 
 
 def plain(
-    name: str,
-    scene: Any,
-    obj: Any,
-    box: OrientedBox,
-    options: dict[str, Any] | None = None,
-    start: WarmStart | None = None,
+    name: str, scene: Any, obj: Any, box: OrientedBox, options: dict[str, Any] | None = None, start: Sim3 | None = None
 ) -> Case:
     """A registration of two fields, with seed 1."""
     wanted = RegistrationOptions.from_dict(options or {})
-    return Case(name, box, partial(register, scene, obj, box, wanted, seed=1, warm_start=start, clouds=False))
+    return Case(name, box, partial(register, scene, obj, box, wanted, seed=1, initial_transform=start, clouds=False))
 
 
 def demo(name: str) -> Case:

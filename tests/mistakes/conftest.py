@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.cli.conftest import DATA, demo, run, serve
-from tests.contract.conftest import world
+from tests.contract.conftest import world, worlds
 
-__all__ = ["demo", "folder", "run", "serve", "world"]
+__all__ = ["demo", "folder", "run", "serve", "world", "worlds"]
 BOX = {"center": [-0.56, -0.28, -0.24], "size": [0.55, 0.6, 0.51]}
 
 

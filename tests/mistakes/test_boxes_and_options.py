@@ -17,6 +17,7 @@ BOXES = [
     Case("trailing comma", "MALFORMED_JSON", 2, "b.json.*line 1, column", "not JSON", "Remove the comma", '{"center": [0, 0, 0],}'),
     Case("single quotes", "MALFORMED_JSON", 2, "b.json.*line 1, column 2", "not JSON", "double quotes", "{'center': [0, 0, 0]}"),
     Case("Python's None", "MALFORMED_JSON", 2, "b.json", "not JSON", "Write null", '{"label": None}'),
+    Case("quotes of a program for letters", "MALFORMED_JSON", 2, "b.json", "not JSON", "straight quotes", '{\u201ccenter\u201d: [0, 0, 0]}'),
     Case("comment", "MALFORMED_JSON", 2, "b.json", "not JSON", "no comments", '// box\n{"center": [0, 0, 0]}'),
     Case("YAML", "MALFORMED_JSON", 2, "b.json", "not JSON", "Write it as JSON", "center: [0, 0, 0]"),
     Case("empty detection", "MALFORMED_JSON", 2, "b.json", "value is expected", "It is empty", ""),
@@ -33,6 +34,7 @@ BOXES = [
     Case("reflection", "INVALID_DETECTION", 2, "detection.R", "expected a rotation", "Negate", '{"center": [0, 0, 0], "size": [1, 1, 1], "R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}'),
     Case("swapped corners", "INVALID_DETECTION", 2, r"max\[0\] is -0.8", "expected more than min", "look swapped", '{"min": [0.1, 0.2, 0.3], "max": [-0.8, -0.5, -0.4]}'),
     Case("negative size", "INVALID_DETECTION", 2, r"size\[2\] is -0.5", "above 0", "full edge lengths", '{"center": [0, 0, 0], "size": [1, 1, -0.5]}'),
+    Case("brackets without an end", "MALFORMED_JSON", 2, "b.json", "nested|deep", "", "[" * 100_000),
     Case("flat box", "INVALID_DETECTION", 2, r"size\[2\] is 0", "above 0", "thick", '{"center": [0, 0, 0], "size": [1, 1, 0]}'),
     Case("list of detections", "INVALID_DETECTION", 2, "b.json: detection is a list of 1", "expected one box", "--detection-index", '[{"center": [0, 0, 0], "size": [1, 1, 1]}]'),
     Case("document of detections", "INVALID_DETECTION", 2, "detection.detections is a list of 2", "expected one box", "--detection-index", '{"detections": [{"label": "chair"}, {"label": "table"}]}'),
@@ -57,8 +59,7 @@ def test_a_wrong_box(case: Case, run: Run, folder: Path, monkeypatch: pytest.Mon
     """It is refused before any field is opened: there is nothing left that could open one."""
     monkeypatch.delattr("regnf_core.loading.load_field")
     (folder / "b.json").write_text(case.how)
-    outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "b.json")
-    assert outcome.code == case.code, outcome.stderr
+    outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "b.json", code=case.code)
     assert outcome.stderr.startswith(case.reason)
     assert outcome.stdout == ""
     case.check(outcome.stderr)
@@ -67,25 +68,32 @@ def test_a_wrong_box(case: Case, run: Run, folder: Path, monkeypatch: pytest.Mon
 @parametrized(OPTIONS)
 def test_wrong_options(case: Case, run: Run, folder: Path) -> None:
     (folder / "o.json").write_text(case.how)
-    outcome = run("register", "room.safetensors", "chair.safetensors", "--detection", "box.json", "--options", "o.json")
-    assert outcome.code == case.code, outcome.stderr
+    outcome = run(
+        "register",
+        "room.safetensors",
+        "chair.safetensors",
+        "--detection",
+        "box.json",
+        "--options",
+        "o.json",
+        code=case.code,
+    )
     assert outcome.stderr.startswith(case.reason)
+    assert outcome.stderr.count("\n") == 2  # the message and the hint, however narrow the terminal
     case.check(outcome.stderr)
 
 
 def test_swapped_scene_and_object(run: Run, folder: Path) -> None:
     (folder / "far.json").write_text(json.dumps({"center": [1.1, 1.1, 0.0], "size": [0.3, 0.3, 0.3]}))
-    outcome = run("register", "chair.safetensors", "room.safetensors", "--detection", "far.json")
-    assert outcome.code == 2
+    outcome = run("register", "chair.safetensors", "room.safetensors", "--detection", "far.json", code=2)
     assert outcome.stderr.startswith("DETECTION_OUTSIDE_SCENE chair.safetensors: the box is")
     assert "are scene and object swapped?" in outcome.stderr
 
 
 def test_the_same_file_twice(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("regnf_cli.register._register_here", lambda *_: {"verdict": "rejected"})
+    monkeypatch.setattr("regnf_cli.registration.register_here", lambda *_: {"verdict": "rejected"})
     monkeypatch.setattr("regnf_cli.report.show_result", lambda _: None)
-    outcome = run("register", "room.safetensors", "room.safetensors", "--detection", "box.json")
-    assert outcome.code == 1
+    outcome = run("register", "room.safetensors", "room.safetensors", "--detection", "box.json", code=1)
     assert "warning: scene and object are the same file, room.safetensors" in outcome.stderr
 
 

@@ -99,19 +99,17 @@ def test_what_no_client_is_made_of(case: Case) -> None:
     assert_refused(case, lambda: Client(**case.how))
 
 
-def test_a_service_that_does_not_run() -> None:
+def test_a_service_that_does_not_run_or_is_another() -> None:
     case = Case("", "SERVICE_UNAVAILABLE", 0, "http://127.0.0.1:1", "does not answer", "regnf serve")
     with Client("http://127.0.0.1:1", retries=0) as client:
         assert_refused(case, client.jobs)
-
-
-def test_a_service_that_is_another() -> None:
     case = Case("", "SERVICE_ERROR", 0, "the answer is no Job", "id", "another service's")
     assert_refused(case, lambda: pretended(lambda _: httpx.Response(200, json={"status": "fine"})).job("j"))
     case = Case(
         "", "SERVICE_ERROR", 0, "HTTP status 200 from http://service/jobs/j", "no regnf service", "Check address"
     )
-    assert_refused(case, lambda: pretended(lambda _: httpx.Response(200, text="<html>")).job("j"))
+    for text in ("<html>", "[]"):
+        assert_refused(case, lambda text=text: pretended(lambda _: httpx.Response(200, text=text)).job("j"))  # type: ignore[misc]
 
 
 @pytest.mark.parametrize("token", [None, "the-secret-of-eve"])

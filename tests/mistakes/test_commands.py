@@ -29,6 +29,10 @@ CASES = [
     Case("detection a folder", "FILE_IS_FOLDER", 2, "nothing", "expected a file", "Give a file", [*REGISTER[:4], "nothing"]),
     Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON is expected", [*REGISTER[:4], "chair.safetensors"]),
     Case("output a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json"]),
+    Case("recording of another format", "INVALID_OPTIONS", 2, "chair.bin", ".rrd", "", [*REGISTER, "--recording", "chair.bin"]),
+    Case("recording a folder", "FILE_IS_FOLDER", 2, "folder.rrd", "", "", [*REGISTER, "--recording", "folder.rrd"], lambda folder: (folder / "folder.rrd").mkdir()),
+    Case("recording below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "", "", [*REGISTER, "--recording", "box.json/chair.rrd"]),
+    Case("recording of a service's job", "INVALID_OPTIONS", 2, "--recording", "", "", [*REGISTER, "--recording", "chair.rrd", "--server", "http://127.0.0.1:1"]),
     Case("output below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json/out"]),
     Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--ground-truth", "box.json"]),
     Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected safe fields", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
@@ -55,8 +59,8 @@ def test_a_wrong_command(case: Case, run: Run, folder: Path, monkeypatch: pytest
     if case.reason in ("ADDRESS_UNAVAILABLE", "PROXY_MISSING"):
         monkeypatch.setenv("REGNF_API_TOKENS", '["robot:0123456789abcdef0123456789abcdef"]')
         monkeypatch.setenv("REGNF_BEHIND_PROXY", str(case.reason == "ADDRESS_UNAVAILABLE"))
-    outcome = run(*case.how)
-    assert outcome.code == case.code, outcome.stderr
+    case.prepare(folder)
+    outcome = run(*case.how, code=case.code)
     assert case.reason in outcome.stderr
     assert outcome.stdout == ""
     case.check(outcome.stderr)
@@ -77,14 +81,8 @@ def test_two_services_on_one_state_folder(run: Run, folder: Path) -> None:
         held.note(address="http://127.0.0.1:1")
         outcome = run("serve", "--state-dir", "state", "--port", 0)
     assert outcome.code == 3
-    Case(
-        "",
-        "",
-        3,
-        "STATE_DIR_IN_USE .*/state",
-        rf"another `regnf serve` \(process {os.getpid()}, http://127.0.0.1:1\) uses",
-        "--state-dir",
-    ).check(outcome.stderr)
+    other = rf"another `regnf serve` \(process {os.getpid()}, http://127.0.0.1:1\) uses"
+    Case("", "", 3, "STATE_DIR_IN_USE .*/state", other, "--state-dir").check(outcome.stderr)
 
 
 @pytest.mark.parametrize(
@@ -107,8 +105,7 @@ def test_wrong_settings(
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_an_output_that_cannot_be_written(run: Run, folder: Path) -> None:
     (folder / "closed").mkdir(mode=0o500)
-    outcome = run(*REGISTER, "--output", "closed/out")
-    assert outcome.code == 2
+    outcome = run(*REGISTER, "--output", "closed/out", code=2)
     Case("", "", 2, "closed/out", "Permission denied", "Check who may write").check(outcome.stderr)
 
 
@@ -130,6 +127,7 @@ SERVERS = [
     Case("another JSON service", "SERVICE_ERROR", 2, "HTTP status 200|HTTP status 404", "no regnf service", "Check address", lambda method, path: (404, '{"message": "no"}')),
     Case("no token", "UNAUTHENTICATED", 2, "UNAUTHENTICATED", "token", "REGNF_API_TOKEN", refusing(401, {"reason": "UNAUTHENTICATED", "detail": "Send a token."})),
     Case("no worker", "NO_WORKER", 3, "no live worker", "for 0 s", "regnf worker", without_worker("jobs")),
+    Case("no worker for the fields", "NO_WORKER", 3, "no live worker", "for 0 s", "regnf worker", without_worker("fields")),
     Case("queue full", "QUEUE_FULL", 3, "QUEUE_FULL", "as many", "again later", refusing(503, {"reason": "QUEUE_FULL", "detail": "as many jobs as it takes"})),
     Case("a field that was rejected", "FIELD_SHAPES", 2, "chair.safetensors: wrong shapes", "wrong shapes", "another", lambda method, path: (200, field(path, state="rejected", error={"reason": "FIELD_SHAPES", "detail": "wrong shapes", "hint": "Try another."}))),
 ]  # fmt: skip
@@ -137,8 +135,7 @@ SERVERS = [
 
 @parametrized(SERVERS)
 def test_a_wrong_server(case: Case, run: Run, folder: Path, serve: Serve) -> None:
-    outcome = run(*REGISTER, "--server", serve(case.how), "--worker-timeout", 0)
-    assert outcome.code == case.code, outcome.stderr
+    outcome = run(*REGISTER, "--server", serve(case.how), "--worker-timeout", 0, code=case.code)
     assert case.reason in outcome.stderr
     case.check(outcome.stderr)
 
@@ -153,41 +150,28 @@ def interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_job_and_page_are_told_at_the_start(run: Run, folder: Path, serve: Serve) -> None:
     address = serve(service())
-    outcome = run(*REGISTER, "--server", f"{address}/", "--json")
-    assert outcome.code == 0, outcome.stderr
+    outcome = run(*REGISTER, "--server", f"{address}/", "--json", code=0)
     assert f"page         {address}/jobs/j/view" in outcome.stderr
     assert json.loads(outcome.stdout)["verdict"] == "registered"  # nothing else is printed there
 
 
 @pytest.mark.usefixtures("interrupted")
-def test_an_interrupted_job_goes_on(run: Run, folder: Path, serve: Serve) -> None:
-    calls: list[str] = []
-
-    def answers(method: str, path: str) -> tuple[int, str]:
-        calls.append(path)
-        return service()(method, path)
-
-    address = serve(answers)
-    outcome = run(*REGISTER, "--server", address)
-    assert outcome.code == 130
-    Case("", "", 130, "the job j goes on", f"{address}/jobs/j/view", f"curl -X POST {address}/jobs/j/cancel").check(
-        outcome.stderr
-    )
-    assert "/jobs/j/cancel" not in calls
-
-
-@pytest.mark.usefixtures("interrupted")
-def test_an_interrupted_job_is_cancelled_on_request(run: Run, folder: Path, serve: Serve) -> None:
+@pytest.mark.parametrize("cancel", [False, True])
+def test_an_interrupted_job_goes_on_or_is_cancelled_on_request(
+    cancel: bool, run: Run, folder: Path, serve: Serve
+) -> None:
     calls: list[tuple[str, str]] = []
 
     def answers(method: str, path: str) -> tuple[int, str]:
         calls.append((method, path))
         return service()(method, path)
 
-    outcome = run(*REGISTER, "--server", serve(answers), "--cancel-on-interrupt")
-    assert outcome.code == 130
-    assert "canceled the job j" in outcome.stderr
-    assert calls[-1] == ("POST", "/jobs/j/cancel")
+    address = serve(answers)
+    outcome = run(*REGISTER, "--server", address, *(["--cancel-on-interrupt"] if cancel else []))
+    assert (outcome.code, ("POST", "/jobs/j/cancel") in calls) == (130, cancel)
+    told = (f"{address}/jobs/j/view", f"curl -X POST {address}/jobs/j/cancel")
+    said = ("canceled the job j", "", "") if cancel else ("the job j goes on", *told)
+    Case("", "", 130, *said).check(outcome.stderr)
 
 
 def test_an_interrupted_local_registration_ends_with_130(
@@ -196,7 +180,6 @@ def test_an_interrupted_local_registration_ends_with_130(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("regnf_cli.register._register_here", interrupt)
-    outcome = run(*REGISTER)
-    assert outcome.code == 130
+    monkeypatch.setattr("regnf_cli.registration.register_here", interrupt)
+    outcome = run(*REGISTER, code=130)
     assert "Traceback" not in outcome.stderr

@@ -56,8 +56,7 @@ CASES = [
 @parametrized(CASES)
 def test_a_wrong_scene(case: Case, run: Run, folder: Path) -> None:
     case.prepare(folder)
-    outcome = run("register", case.how, "chair.safetensors", "--detection", "box.json")
-    assert outcome.code == case.code, outcome.stderr
+    outcome = run("register", case.how, "chair.safetensors", "--detection", "box.json", code=case.code)
     assert case.reason in outcome.stderr
     assert outcome.stdout == ""
     case.check(outcome.stderr)
@@ -66,7 +65,6 @@ def test_a_wrong_scene(case: Case, run: Run, folder: Path) -> None:
 def test_inspect_and_convert_name_the_file_too(run: Run, folder: Path) -> None:
     (folder / "page.ckpt").write_bytes(b"<html>")
     for arguments in (["inspect", "page.ckpt"], ["convert", "page.ckpt", "out.ply"], ["inspect", "run"]):
-        outcome = run(*arguments)
-        assert outcome.code == 2
+        outcome = run(*arguments, code=2)
         assert arguments[1] in outcome.stderr
         assert "hint: " in outcome.stderr

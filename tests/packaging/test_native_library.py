@@ -42,7 +42,7 @@ def test_the_checkouts_own_library_is_of_these_sources() -> None:
     assert found.sources == sources_digest(SOURCES), "run scripts/setup.sh"
 
 
-def test_what_is_built_loads_and_is_not_built_twice(built: Path) -> None:
+def test_what_is_built_loads_and_is_not_built_twice(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = library.load(built)
     assert found.variants[-1].name == "plain"
     assert found.sources == sources_digest(SOURCES)
@@ -50,6 +50,9 @@ def test_what_is_built_loads_and_is_not_built_twice(built: Path) -> None:
     build(SOURCES, built)
     assert built.stat().st_ino == before
     assert [path.name for path in built.parent.iterdir()] == [NAME]
+    other = built.rename(built.with_name("other.so"))
+    monkeypatch.setattr(library, "_LAYOUT", 0)
+    assert library.load(other).fastest is None, "it is of another layout"
 
 
 def test_a_library_of_older_sources_goes(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,21 +79,12 @@ def test_without_a_compiler_there_is_a_reason(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_such_library_is_not_used(tmp_path: Path) -> None:
+def test_what_is_no_library_is_not_used_nor_any_by_the_switch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert library.load(tmp_path / "none.so").fault == library.NOT_BUILT
     (tmp_path / "text.so").write_text("not code")
     found = library.load(tmp_path / "text.so")
     assert (found.variants, found.fastest) == ((), None)
     assert "does not load" in str(found.fault)
-
-
-def test_a_library_of_another_layout_is_not_used(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    other = built.rename(built.with_name("other.so"))
-    monkeypatch.setattr(library, "_LAYOUT", 0)
-    assert library.load(other).fastest is None
-
-
-def test_the_switch_turns_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(library.SWITCH, "0")
     assert library.variant() is None
     monkeypatch.delenv(library.SWITCH)

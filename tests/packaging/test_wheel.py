@@ -36,10 +36,15 @@ def names(wheel: Path) -> set[str]:
         return set(archive.namelist())
 
 
-def test_it_holds_our_packages_and_nothing_else(names: set[str]) -> None:
+def test_it_holds_our_packages_the_demo_the_manual_and_nothing_else(names: set[str]) -> None:
     tops = {name.split("/")[0] for name in names}
     assert tops == PACKAGES | {f"regnf-{__version__}.dist-info"}
     assert not [name for name in names if "__pycache__" in name or "/tests/" in name]
+    assert wheel_hook.FILES == FILES
+    assert {f"regnf_cli/demo_files/{name}" for name in FILES} <= names
+    # Those that a checkout shows: the wheel's list and the command's are made in different ways.
+    assert {f"regnf_cli/manual_pages/{name}.md" for name in pages_of(ROOT / "docs")} <= names
+    assert {"families.md", "how-to/batch.md"} <= set(wheel_hook.pages(ROOT))
 
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
@@ -49,17 +54,6 @@ def test_every_file_of_a_package_is_in_it(names: set[str], package: str) -> None
     wanted = {f"{package}/{line}" for line in files.stdout.splitlines()}
     assert f"{package}/py.typed" in wanted
     assert wanted - names == set()
-
-
-def test_the_demo_has_its_files(names: set[str]) -> None:
-    assert wheel_hook.FILES == FILES
-    assert {f"regnf_cli/demo_files/{name}" for name in FILES} <= names
-
-
-def test_the_manual_has_its_pages(names: set[str]) -> None:
-    """Those that a checkout shows: the wheel's list and the command's are made in different ways."""
-    assert {f"regnf_cli/manual_pages/{name}.md" for name in pages_of(ROOT / "docs")} <= names
-    assert {"families.md", "how-to/batch.md"} <= set(wheel_hook.pages(ROOT))
 
 
 def test_the_metadata_is_complete_and_names_no_address(wheel: Path) -> None:

@@ -73,13 +73,9 @@ def _default(kind: str) -> Any:
         return [0.0] * 36
     if name.endswith("[]"):
         return []
-    return (
-        _KINDS[name](given or 0)
-        if name in ("int32", "uint32", "float64")
-        else ""
-        if name == "string"
-        else TYPES[name]()
-    )
+    if name == "string":
+        return ""
+    return _KINDS[name](given or 0) if name in _KINDS else TYPES[name]()
 
 
 TYPES: dict[str, type[Message]] = {

@@ -65,12 +65,18 @@ def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request]
     monkeypatch.setenv("REGNF_API_TOKEN", "open-sesame")
     usual = {"server": "http://127.0.0.1:1", "scene": SCENE, "objects": f"chair={CHAIR}"}
     monkeypatch.setattr(Node, "given", usual | given)
-    node_part = part("node")
-    service = part("service").Service
-    transport = httpx.MockTransport(answers)
-    monkeypatch.setattr(node_part, "Service", lambda address, token: service(address, token, transport))
-    monkeypatch.setattr(node_part.RegisterObjects, "work", lambda self: None)
-    return node_part.RegisterObjects()
+    service, transport = part("service").Service, httpx.MockTransport(answers)
+    monkeypatch.setattr(part("node"), "Service", lambda address, token: service(address, token, transport))
+    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self: None)
+    return part("node").RegisterObjects()
+
+
+def answered(monkeypatch: pytest.MonkeyPatch, document: Any = None, **given: Any) -> tuple[Any, dict[str, Any]]:
+    """A node that has answered the usual detections, and what it asked the service for."""
+    answers = Answers(document or result())
+    node = make_node(monkeypatch, answers, **given)
+    node.answer(detections())
+    return node, answers.requests[0]
 
 
 def detections(class_id: str = "chair", frame: str = "map") -> Any:
@@ -95,9 +101,7 @@ def matrix(pose: Any, scale: float) -> np.ndarray[Any, Any]:
 
 
 def test_a_pose_is_published_in_the_map_with_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = Answers(result())
-    node = make_node(monkeypatch, answers)
-    node.answer(detections())
+    node, _ = answered(monkeypatch)
     (array,), (pose,), (frame,) = node.found_out.sent, node.pose_out.sent, node.broadcaster.sent
     wanted = T_OBJECT_FIELD.inverse().matrix().numpy()
     scale = float(array.detections[0].id.rpartition("=")[2])
@@ -112,43 +116,35 @@ def test_a_pose_is_published_in_the_map_with_its_frame(monkeypatch: pytest.Monke
 
 
 def test_the_request_is_one_that_the_contract_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = Answers(result())
-    make_node(monkeypatch, answers, up_axis="z").answer(detections())
+    _, request = answered(monkeypatch, up_axis="z")
     contract = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
     schema = {"$ref": "#/components/schemas/RegisterRequest", "components": contract["components"]}
-    (request,) = answers.requests
     Draft202012Validator(schema).validate(request)
     assert (request["scene"], request["object"], request["options"]) == (SCENE, CHAIR, {"up_axis": "z"})
-    assert request["detection"]["center"] == [1.0, 0.0, 0.0]
-    assert request["detection"]["size"] == [0.5, 0.6, 0.7]
+    assert (request["detection"]["center"], request["detection"]["size"]) == ([1.0, 0.0, 0.0], [0.5, 0.6, 0.7])
 
 
 def test_objects_in_meters_bound_the_scale(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     file = tmp_path / "dataparser_transforms.json"
     file.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.25}))
-    answers = Answers(result())
-    make_node(monkeypatch, answers, dataparser_transforms=str(file), scale_tolerance="0.03").answer(detections())
-    make_node(monkeypatch, answers, scale_tolerance="0").answer(detections())
-    quarter, metric = (request["options"]["robust"] for request in answers.requests)
-    assert quarter == pytest.approx({"min_scale": 3.88, "max_scale": 4.12}), (
-        "an object's meters for each of the field's units"
-    )
-    assert metric == {"min_scale": 1.0, "max_scale": 1.0}
+    _, quarter = answered(monkeypatch, dataparser_transforms=str(file), scale_tolerance="0.03")
+    _, metric = answered(monkeypatch, scale_tolerance="0")
+    bounds = pytest.approx({"min_scale": 3.88, "max_scale": 4.12})  # an object's meters for each of the field's units
+    assert quarter["options"]["robust"] == bounds
+    assert metric["options"]["robust"] == {"min_scale": 1.0, "max_scale": 1.0}
     for wrong in ("-0.1", "1", "nan", "little"):
         with pytest.raises(ValueError, match=r"scale_tolerance|could not convert"):
-            make_node(monkeypatch, answers, scale_tolerance=wrong)
+            make_node(monkeypatch, Answers(result()), scale_tolerance=wrong)
 
 
 def test_a_field_in_its_trainers_frame_gives_poses_in_meters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     parser = {"transform": [[0.0, -1.0, 0.0, 0.3], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, 1.0, -0.2]], "scale": 0.25}
     file = tmp_path / "dataparser_transforms.json"
     file.write_text(json.dumps(parser))
-    answers = Answers(result())
-    node = make_node(monkeypatch, answers, dataparser_transforms=str(file))
-    node.answer(detections())
+    node, request = answered(monkeypatch, dataparser_transforms=str(file))
     # nerfstudio: a point of the dataset is trained at scale * (transform @ point)
-    np.testing.assert_allclose(answers.requests[0]["detection"]["center"], [0.25 * 0.3, 0.25 * 1.1, 0.25 * -0.2])
-    np.testing.assert_allclose(answers.requests[0]["detection"]["size"], [0.125, 0.15, 0.175])
+    np.testing.assert_allclose(request["detection"]["center"], [0.25 * 0.3, 0.25 * 1.1, 0.25 * -0.2])
+    np.testing.assert_allclose(request["detection"]["size"], [0.125, 0.15, 0.175])
     T_field_map = np.eye(4)
     T_field_map[:3] = 0.25 * np.array(parser["transform"])
     wanted = np.linalg.inv(T_OBJECT_FIELD.matrix().numpy() @ T_field_map)
@@ -171,8 +167,7 @@ def test_a_box_of_another_frame_is_carried_to_the_map(monkeypatch: pytest.Monkey
 
 
 def test_all_poses_of_an_ambiguous_result_are_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
-    node = make_node(monkeypatch, Answers(result("ambiguous", (Sim3.identity(),))))
-    node.answer(detections())
+    node, _ = answered(monkeypatch, result("ambiguous", (Sim3.identity(),)))
     assert len(node.found_out.sent[0].detections[0].results) == 2
 
 
@@ -235,14 +230,12 @@ def test_quaternions_go_there_and_back() -> None:
         poses.rotation_matrix((0.0, 0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(
-    "text", ["[]", "{}", '{"transform": [[1]], "scale": 1}', '{"transform": [], "scale": "x"}', "x"]
-)
-def test_a_bad_dataparser_file_is_named(tmp_path: Path, text: str) -> None:
+def test_a_bad_dataparser_file_is_named(tmp_path: Path) -> None:
     file = tmp_path / "dataparser_transforms.json"
-    file.write_text(text)
-    with pytest.raises(ValueError, match="dataparser_transforms"):
-        part("poses").field_from_map(str(file))
+    for text in ("[]", "{}", '{"transform": [[1]], "scale": 1}', '{"transform": [], "scale": "x"}', "x"):
+        file.write_text(text)
+        with pytest.raises(ValueError, match="dataparser_transforms"):
+            part("poses").field_from_map(str(file))
 
 
 BOOLEANS = {
@@ -280,37 +273,26 @@ PASSED = [launched, of_rcl]
 
 
 @pytest.mark.parametrize("passed", PASSED)
-@pytest.mark.parametrize("said", ["x", "y", "z", "X", "Y", "Z", "+y", "axis_y", "y-axis"])
-def test_an_axis_arrives_whatever_yaml_makes_of_it(passed: Callable[[str], Any], said: str) -> None:
-    assert part("parameters").axis_of("up_axis", passed(said)) == re.sub("axis|[-+_]", "", said).lower()
+def test_axes_and_shares_arrive_whatever_yaml_makes_of_them(passed: Callable[[str], Any]) -> None:
+    axis_of, share_of = part("parameters").axis_of, part("parameters").share_of
+    for said in ("x", "y", "z", "X", "Y", "Z", "+y", "axis_y", "y-axis"):
+        assert axis_of("up_axis", passed(said)) == re.sub("axis|[-+_]", "", said).lower()
+    for said in ("n", "no", "off", "null", "~", "1", "-y", "up", "nan"):
+        with pytest.raises(ValueError, match=r"up_axis: .* is none of x, y and z"):
+            axis_of("up_axis", passed(said))
+    for said, share in {"0.03": 0.03, "1e-3": 0.001, "0": 0.0, "3e-2": 0.03, ".5": 0.5}.items():
+        assert share_of("scale_tolerance", passed(said)) == share
+    said = ("1", "-0.1", "3%", "true", "y", "no", "nan", ".nan", ".inf", "inf", "0,03")
+    for value in ([0.1], *map(passed, said)):
+        with pytest.raises(ValueError, match=r"scale_tolerance: .* is no number"):
+            share_of("scale_tolerance", value)
 
 
-@pytest.mark.parametrize("passed", PASSED)
-@pytest.mark.parametrize("said", ["n", "no", "off", "null", "~", "1", "-y", "up", "nan"])
-def test_what_is_no_axis_is_refused(passed: Callable[[str], Any], said: str) -> None:
-    with pytest.raises(ValueError, match=r"up_axis: .* is none of x, y and z"):
-        part("parameters").axis_of("up_axis", passed(said))
-
-
-@pytest.mark.parametrize("passed", PASSED)
-@pytest.mark.parametrize(("said", "share"), [("0.03", 0.03), ("1e-3", 0.001), ("0", 0.0), ("3e-2", 0.03), (".5", 0.5)])
-def test_a_share_is_a_number_of_any_kind(passed: Callable[[str], Any], said: str, share: float) -> None:
-    assert part("parameters").share_of("scale_tolerance", passed(said)) == share
-
-
-@pytest.mark.parametrize("passed", PASSED)
-@pytest.mark.parametrize("said", ["1", "-0.1", "3%", "true", "y", "no", "nan", ".nan", ".inf", "inf", "0,03", "[0.1]"])
-def test_what_is_no_share_is_refused(passed: Callable[[str], Any], said: str) -> None:
-    value = [0.1] if said == "[0.1]" else passed(said)
-    with pytest.raises(ValueError, match=r"scale_tolerance: .* is no number"):
-        part("parameters").share_of("scale_tolerance", value)
-
-
-@pytest.mark.parametrize("said", ["on", "no", "y", "12", "0x1f", "1e5", "0.5", "nan"])
-def test_a_text_that_yaml_has_changed_is_refused_and_quotes_keep_it(said: str) -> None:
-    with pytest.raises(ValueError, match=f"map_frame: .*{of_rcl(said)!r}.*quotes"):
-        part("parameters").text_of("map_frame", of_rcl(said))
-    assert part("parameters").text_of("map_frame", of_rcl(f"'{said}'")) == said
+def test_a_text_that_yaml_has_changed_is_refused_and_quotes_keep_it() -> None:
+    for said in ("on", "no", "y", "12", "0x1f", "1e5", "0.5", "nan"):
+        with pytest.raises(ValueError, match=f"map_frame: .*{of_rcl(said)!r}.*quotes"):
+            part("parameters").text_of("map_frame", of_rcl(said))
+        assert part("parameters").text_of("map_frame", of_rcl(f"'{said}'")) == said
 
 
 NAMES = ["chair", "dining table", "a=b", "a, b", "rack: left", "Stühle", "y", "12", "{x}", "a;b", 'the "big" one']

@@ -20,38 +20,21 @@ from tests.processes import alive, command_of, descendants_of
 from tests.worker.bench import eventually
 
 
-@pytest.mark.parametrize(
-    ("host", "expected"),
-    [
-        ("127.0.0.1", True),
-        ("127.9.9.9", True),
-        ("::1", True),
-        ("localhost", True),
-        ("0.0.0.0", False),
-        ("::", False),
-        ("10.0.0.1", False),
-        ("localhost.example.org", False),
-        ("", False),
-    ],
-)
-def test_what_is_loopback(host: str, expected: bool) -> None:
-    assert is_loopback(host) is expected
+def test_what_is_loopback() -> None:
+    hosts = ("127.0.0.1", "127.9.9.9", "::1", "localhost", "0.0.0.0", "::", "10.0.0.1", "localhost.example.org", "")
+    assert [host for host in hosts if is_loopback(host)] == ["127.0.0.1", "127.9.9.9", "::1", "localhost"]
 
 
 @pytest.mark.parametrize(
     ("publish", "private"),
     [
-        ("127.0.0.1:8080", True),
-        ("127.0.0.1:9000-9010", True),
-        ("[::1]:8080", True),
-        ("0.0.0.0:8080", False),
-        ("[::]:8080", False),
-        ("192.0.2.1:8080", False),
-        ("8080", False),
-        ("127.0.0.1:8080:8080", False),
+        ("127.0.0.1:8080", True), ("127.0.0.1:9000-9010", True), ("[::1]:8080", True), ("0.0.0.0:8080", False),
+        ("[::]:8080", False), ("192.0.2.1:8080", False), ("8080", False), ("127.0.0.1:8080:8080", False),
     ],
-)
+)  # fmt: skip
 def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: str, private: bool) -> None:
+    """Whatever the container's own address is."""
+    assert Settings(host="127.0.0.1", publish=publish).is_private is private
     settings = Settings(host="0.0.0.0", publish=publish, behind_proxy=True)
     assert settings.is_private is private
     assert settings.calls_per_s == (0 if private else 20)
@@ -67,19 +50,13 @@ def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: s
 def test_beyond_loopback_a_proxy_stands_before_it() -> None:
     """And behind one the service is open to others, whatever its own address is."""
     tokens = frozenset({"lab:a-long-random-string"})
-    with pytest.raises(StartError, match=r"^0\.0\.0\.0 can be reached by others") as caught:
+    with pytest.raises(StartError, match=r"^0\.0\.0\.0 can be reached by others"):
         check_access(Settings(host="0.0.0.0", api_tokens=tokens))
-    assert caught.value.reason == "PROXY_MISSING"
-    assert "REGNF_BEHIND_PROXY" in str(caught.value.hint)
     with pytest.raises(StartError) as caught:
         check_access(Settings(behind_proxy=True))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
-    check_access(Settings(behind_proxy=True, api_tokens=tokens))
-
-
-def test_a_published_loopback_is_not_private() -> None:
-    """Whoever publishes the port elsewhere says so, whatever the container's own address is."""
-    assert not Settings(host="127.0.0.1", publish="0.0.0.0:8080").is_private
+    for open_to_all in ({"api_tokens": tokens}, {"allow_unauthenticated": True}):
+        check_access(Settings(host="0.0.0.0", behind_proxy=True, **open_to_all))
 
 
 def test_addresses_to_open() -> None:
@@ -87,12 +64,6 @@ def test_addresses_to_open() -> None:
         assert address_of(listener) == f"http://127.0.0.1:{listener.getsockname()[1]}"
     with open_socket(Settings(port=0, host="0.0.0.0", allow_unauthenticated=True, behind_proxy=True)) as listener:
         assert address_of(listener).startswith("http://127.0.0.1:")
-
-
-def test_a_host_that_is_not_ours() -> None:
-    with pytest.raises(StartError) as caught:
-        open_socket(Settings(port=0, host="192.0.2.1", allow_unauthenticated=True, behind_proxy=True))
-    assert caught.value.reason == "ADDRESS_UNAVAILABLE"
 
 
 def test_a_missing_redis_server_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:

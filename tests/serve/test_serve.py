@@ -20,8 +20,9 @@ from tests.worker.bench import eventually
 
 @contextmanager
 def started(state_dir: Path, *arguments: str, **settings: object) -> Iterator[Service]:
-    """A service that has ended with all its processes once the context is left. A worker takes most of the start."""
-    service = start(state_dir, *arguments, **settings)
+    """A service that has ended with all its processes once the context is left. A worker that loads the engine takes
+    most of the start: none does, tests/serve/test_secrets.py aside."""
+    service = start(state_dir, *arguments, preload="false", **settings)
     try:
         yield service
     finally:
@@ -62,21 +63,20 @@ def listening_sockets(pid: int) -> set[str]:
     return {entry[9] for entry in tables if entry[3] == "0A" and f"socket:[{entry[9]}]" in inodes}
 
 
-@pytest.mark.parametrize(
-    ("number", "workers"), [(signal.SIGTERM, ()), (signal.SIGINT, NO_WORKER), (signal.SIGHUP, NO_WORKER)]
-)
-def test_a_signal_ends_everything_in_order(tmp_path: Path, number: signal.Signals, workers: tuple[str, ...]) -> None:
-    with started(tmp_path / "state", *workers) as service:
-        if not workers:
-            service.await_ready()
-        folder = service.socket_dir()
-        service.look()
-        service.process.send_signal(number)
-        assert service.process.wait(DEADLINE_S) == 0
-        assert service.all_gone(), "nothing outlives the one who waited for it"
-        assert not folder.exists()
-        assert "killed" not in service.log()
-        assert "Traceback" not in service.log()
+def ends_in_order(service: Service, number: signal.Signals = signal.SIGTERM) -> None:
+    folder = service.socket_dir()
+    service.look()
+    service.process.send_signal(number)
+    assert service.process.wait(DEADLINE_S) == 0
+    assert service.all_gone(), "nothing outlives the one who waited for it"
+    assert not folder.exists()
+    assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in service.log()] == []
+
+
+def test_a_signal_ends_everything_in_order(tmp_path: Path) -> None:
+    with started(tmp_path / "state") as service:
+        service.await_ready()
+        ends_in_order(service)
 
 
 def test_ctrl_c_reaches_the_supervisor_alone(shared: Service) -> None:
@@ -94,12 +94,13 @@ def test_a_killed_supervisor_takes_everything_along(tmp_path: Path) -> None:
         service.process.wait()
         eventually(service.all_gone, "the end of every process", DEADLINE_S)
         assert folder.exists(), "nobody was left to remove it"
-        with started(service.state_dir, *NO_WORKER):
+        with started(service.state_dir, *NO_WORKER) as following:
             assert not folder.exists(), "the next one does"
+            ends_in_order(following, signal.SIGHUP)
 
 
 def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> None:
-    process = subprocess.Popen(command(tmp_path / "state"), env=environment(), stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command(tmp_path / "state"), env=environment(preload="false"), stderr=subprocess.DEVNULL)
     started = Service(process, tmp_path / "state", "")
     eventually(started.look, "a first child", DEADLINE_S)
     process.kill()
@@ -120,22 +121,13 @@ def test_a_part_that_dies_is_started_anew(shared: Service, part: str) -> None:
     assert shared.process.poll() is None
 
 
-def test_state_survives_a_restart(tmp_path: Path) -> None:
-    with started(tmp_path / "state", *NO_WORKER) as first:
-        sha256 = upload(first.address, b"no field, but bytes")
-        first.process.terminate()
-        assert first.process.wait(DEADLINE_S) == 0
-    with started(tmp_path / "state", *NO_WORKER) as second:
-        assert httpx.get(f"{second.address}/fields/{sha256}").json()["state"] == "validating"
-
-
 def upload(address: str, content: bytes) -> str:
     answer = httpx.post(f"{address}/fields", content=b"PK\x03\x04" + content)
     assert answer.status_code == 201, answer.text
     return str(answer.json()["sha256"])
 
 
-def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
+def test_whoever_waits_is_answered_before_the_end_and_the_next_service_has_their_fields(tmp_path: Path) -> None:
     """Without a worker there is no news: the stop alone ends what is waited for, in order."""
     with started(tmp_path / "state", *NO_WORKER) as service:
         scene, object_ = (upload(service.address, name) for name in (b"scene", b"object"))
@@ -154,6 +146,9 @@ def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
         assert service.process.wait(DEADLINE_S) == 0
         log = service.log()
         assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
+    with started(tmp_path / "state", *NO_WORKER) as following:
+        assert httpx.get(f"{following.address}/fields/{scene}").json()["state"] == "validating"
+        ends_in_order(following, signal.SIGINT)
 
 
 @contextmanager
@@ -166,38 +161,13 @@ def sent(address: str, asked: str) -> Iterator[BinaryIO]:
             yield answer
 
 
-def refused(*arguments: str, state_dir: Path, **settings: object) -> str:
-    done = subprocess.run(
-        command(state_dir, *arguments), env=environment(**settings), capture_output=True, text=True, timeout=DEADLINE_S
-    )
-    assert done.returncode == 3, done
-    assert done.stdout == ""
-    assert "Traceback" not in done.stderr
-    return done.stderr
-
-
 def test_one_service_to_a_state_folder(shared: Service) -> None:
     shared.await_ready()
-    assert "STATE_DIR_IN_USE" in refused(state_dir=shared.state_dir)
+    another = command(shared.state_dir)
+    done = subprocess.run(another, env=environment(), capture_output=True, text=True, timeout=DEADLINE_S)
+    assert (done.returncode, done.stdout, "STATE_DIR_IN_USE" in done.stderr) == (3, "", True), done.stderr
+    assert "Traceback" not in done.stderr
     assert shared.is_ready()
-
-
-def test_an_unusable_state_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    assert "STATE_DIR_UNUSABLE" in refused(state_dir=tmp_path / "file" / "state")
-
-
-def test_a_port_that_is_taken(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert "ADDRESS_UNAVAILABLE" in refused("--port", port, state_dir=tmp_path / "state")
-
-
-def test_beyond_loopback_only_behind_a_proxy_and_with_tokens_or_on_request(tmp_path: Path) -> None:
-    assert "UNAUTHENTICATED_PUBLIC_BIND" in refused("--host", "0.0.0.0", state_dir=tmp_path / "state")
-    for settings in ({"allow_unauthenticated": "true"}, {"api_tokens": '["0123456789abcdef0123456789abcdef"]'}):
-        with started(tmp_path / "state", "--host", "0.0.0.0", *NO_WORKER, behind_proxy="true", **settings):
-            pass
 
 
 def test_without_an_embedded_redis_there_is_one_child_less(tmp_path: Path) -> None:

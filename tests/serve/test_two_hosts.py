@@ -10,12 +10,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 
 from benchmarks.service_load.small_fields import write_small_pair
+from tests.live_stack import finished, imported
 from tests.object_store import ObjectServer
 from tests.redis_server import private_redis
 from tests.worker.bench import eventually
@@ -68,40 +68,23 @@ def logs(folder: Path) -> str:
     return "\n".join(path.read_text() for path in folder.glob("*.log"))
 
 
-def upload(client: httpx.Client, path: Path) -> str:
-    content = path.read_bytes()
-    sha256 = hashlib.sha256(content).hexdigest()
-    client.put(f"/fields/{sha256}", content=content).raise_for_status()
-    return sha256
-
-
-def finished(client: httpx.Client, job_id: str) -> dict[str, Any]:
-    def look() -> dict[str, Any] | None:
-        job: dict[str, Any] = client.get(f"/jobs/{job_id}", params={"wait": 10}).json()
-        return job if job["status"] in ("successful", "failed", "dismissed") else None
-
-    return eventually(look, f"the end of job {job_id}", 120.0)
-
-
 @pytest.mark.long
 def test_a_registration_between_two_machines(client: httpx.Client, tmp_path: Path) -> None:
     pair = write_small_pair(tmp_path)
-    scene, object_ = upload(client, pair.scene), upload(client, pair.object)
+    scene, object_ = (imported(client, path.read_bytes())["sha256"] for path in (pair.scene, pair.object))
     answer = client.post("/register", json={"scene": scene, "object": object_, "detection": pair.detection})
     assert answer.status_code == 202, answer.text
     job_id = answer.json()["id"]
     assert finished(client, job_id)["status"] == "successful", logs(tmp_path)
     result = client.get(f"/jobs/{job_id}/result").json()
     assert result["verdict"] == "registered"
-    for artifact in result["artifacts"]:  # the answer waits a while for those that follow the result
-        address = f"/jobs/{job_id}/artifacts/{artifact['name']}"
-        eventually(lambda of=address: client.get(of).status_code == 200, lambda: logs(tmp_path), PATIENCE_S)
+    for one in result["artifacts"]:  # the answer waits a while for those that follow the result
+        eventually(lambda of=one["url"]: client.get(of).status_code == 200, lambda: logs(tmp_path), PATIENCE_S)
     for artifact in client.get(f"/jobs/{job_id}/result").json()["artifacts"]:
-        address = f"/jobs/{job_id}/artifacts/{artifact['name']}"
-        content = client.get(address).content
+        content = client.get(artifact["url"]).content
         assert hashlib.sha256(content).hexdigest() == artifact["sha256"]
         middle = len(content) // 2
-        part = client.get(address, headers={"Range": f"bytes={middle}-{middle + 9}"})
+        part = client.get(artifact["url"], headers={"Range": f"bytes={middle}-{middle + 9}"})
         assert (part.status_code, part.content) == (206, content[middle : middle + 10])
     picture = f"/fields/{scene}/preview.png"
     eventually(lambda: client.get(picture).content.startswith(b"\x89PNG"), lambda: logs(tmp_path), PATIENCE_S)

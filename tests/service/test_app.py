@@ -7,21 +7,28 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from redis import Redis
+from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import RedisError
 
 from regnf_service import server
 from regnf_service.concurrency import Waiters
 from regnf_service.http.body import pause, wait_for
+from regnf_service.http.sse import event_stream
 from regnf_service.server import create_app, stopping_on_signals
+from regnf_service.services import JobWatch, Position
+from regnf_state.records import JobNews
 from regnf_state.redis.client import NoRedisError
+from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from tests.contract.world import make_world
+from tests.round_trips import counted_round_trips
+from tests.state.record_makers import finished, started
 from tests.stores import services_over
 
 
@@ -68,7 +75,8 @@ def test_waiting_ends_when_the_service_stops(tmp_path: Path, any_redis: Redis) -
 
 def test_where_many_answers_are_held_no_more_are(tmp_path: Path, any_redis: Redis) -> None:
     """A held answer keeps its connection: enough of them would leave none for anybody else."""
-    services = replace(make_world(tmp_path, any_redis).app.state.services, waiters=Waiters(most=1))
+    services = make_world(tmp_path, any_redis).app.state.services
+    services.waiters = Waiters(most=1)
     looks: list[int] = []
 
     async def ask() -> int:
@@ -130,3 +138,75 @@ def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(
     asyncio.run(run())
     assert not faults
     assert [record.levelname for record in caplog.records] == ["ERROR", "WARNING", "WARNING"]
+
+
+# all event streams of a process share their looks at the store
+
+
+@pytest.mark.parametrize("streams", [1, 40])
+def test_any_number_of_streams_is_one_round_trip_a_round(
+    redis: Redis, tmp_path: Path, streams: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    services = services_over(redis, Settings(state_dir=tmp_path))
+    store = services.records
+    jobs = [finished(store, "failed", f"j{number}").id for number in range(4)]
+    round_trips = counted_round_trips(monkeypatch)
+
+    async def read(job_id: str) -> str:
+        return "".join([text async for text in event_stream(services, job_id, None)])
+
+    async def read_all() -> list[str]:
+        return await asyncio.gather(*(read(jobs[number % 4]) for number in range(streams)))
+
+    texts = asyncio.run(read_all())
+    assert round_trips == ["pipeline"]
+    assert all(text.count('"status": "failed"') == 1 for text in texts)
+
+
+def test_a_stream_that_comes_during_a_look_is_answered_by_the_next(redis: Redis) -> None:
+    store = RecordStore(redis)
+    started(store)
+    looks: list[list[Position]] = []
+
+    async def run() -> list[JobNews]:
+        loop = asyncio.get_running_loop()
+        late: list[asyncio.Task[JobNews]] = []
+
+        def look(positions: Sequence[Position]) -> list[JobNews]:
+            looks.append(list(positions))
+            if len(looks) == 1:
+                asked = asyncio.run_coroutine_threadsafe(_begin(watch, late), loop)
+                asked.result(30)
+            return store.news(positions)
+
+        watch = JobWatch(look, asyncio.Event())
+        first = await watch.news("j1", None)
+        return [first, *await asyncio.gather(*late)]
+
+    first, second = asyncio.run(run())
+    assert first == second
+    assert looks == [[("j1", None)], [("j1", None)]]
+
+
+async def _begin(watch: JobWatch, late: list[asyncio.Task[JobNews]]) -> None:
+    late.append(asyncio.create_task(watch.news("j1", None)))
+    await asyncio.sleep(0)
+
+
+def test_a_store_that_is_away_ends_the_streams_not_the_watch() -> None:
+    answers: list[object] = [RedisConnectionError("away"), [JobNews(None, [])]]
+
+    def look(positions: Sequence[Position]) -> list[JobNews]:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        assert isinstance(answer, list)
+        return answer
+
+    async def run() -> None:
+        watch = JobWatch(look, asyncio.Event())
+        outcomes = await asyncio.gather(watch.news("j", None), watch.news("j", None), return_exceptions=True)
+        assert [type(outcome) for outcome in outcomes] == [RedisConnectionError] * 2
+        assert (await watch.news("j", None)).record is None
+
+    asyncio.run(run())

@@ -1,5 +1,7 @@
 """What goes from the store because nobody needs it, and what stays because somebody does."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -8,7 +10,7 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from regnf_service.upkeep.housekeeping import Housekeeper, Lease, LeaseLostError, Removed
+from regnf_service.upkeep.housekeeping import Housekeeper, Lease, LeaseLostError
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from tests.stores import stores_over
@@ -44,7 +46,7 @@ class World:
             self.blobs.put(f"jobs/{job_id}/1/result.json", bytes(size))
             self.records.update_job(job_id, 1, status="successful")
 
-    def tidy(self, later_s: float = 0.0, **settings: object) -> Removed:
+    def tidy(self, later_s: float = 0.0, **settings: object) -> dict[str, list[str]]:
         self.records.ahead_s += later_s
         keeper = Housekeeper(self.records, self.blobs, self.redis, self.settings.model_copy(update=settings))
         with self.lease.held() as term:
@@ -63,20 +65,20 @@ def world(redis: Redis, tmp_path: Path) -> World:
 
 def test_by_default_fields_stay(world: World) -> None:
     world.add_field("a")
-    assert world.tidy(1000 * DAY_S) == Removed()
+    assert world.tidy(1000 * DAY_S) == {}
     assert world.fields() == {"a"}
 
 
 def test_a_field_goes_once_nobody_has_used_it_for_long(world: World) -> None:
     keep = {"field_retention_s": 10 * DAY_S}
     a, b, c = (world.add_field(letter) for letter in "abc")
-    assert world.tidy(**keep) == Removed(), "from now on they count as unused"
+    assert world.tidy(**keep) == {}, "from now on they count as unused"
     world.records.ahead_s += 8 * DAY_S
     world.add_job("j", a, b)
-    assert world.tidy(3 * DAY_S, **keep) == Removed(fields=(c,))
+    assert world.tidy(3 * DAY_S, **keep) == {"fields": [c]}
     assert world.records.get_field(c) is None
     assert world.fields() == {"a", "b"}
-    assert sorted(world.tidy(8 * DAY_S, **keep).fields) == [a, b]
+    assert sorted(world.tidy(8 * DAY_S, **keep)["fields"]) == [a, b]
     assert list(world.records.journal.fields()) == []
 
 
@@ -84,7 +86,7 @@ def test_what_a_live_job_needs_stays(world: World) -> None:
     a, b = world.add_field("a"), world.add_field("b")
     world.tidy()
     world.add_job("j", a, b, ended=False)
-    assert world.tidy(100 * DAY_S, field_retention_s=60, max_stored_bytes=1) == Removed()
+    assert world.tidy(100 * DAY_S, field_retention_s=60, max_stored_bytes=1) == {}
     assert world.fields() == {"a", "b"}
 
 
@@ -99,7 +101,7 @@ def test_a_field_that_is_asked_for_while_it_goes_comes_back(world: World, monkey
         return delete(sha256)
 
     monkeypatch.setattr(world.records, "delete_field", and_somebody_asks)
-    assert world.tidy(100 * DAY_S, field_retention_s=60) == Removed()
+    assert world.tidy(100 * DAY_S, field_retention_s=60) == {}
     assert world.records.get_field(a) == known
     assert world.records.journal.recall_field(a) == replace(known, version=1) if known else None
     assert world.fields() == {"a"}
@@ -107,8 +109,8 @@ def test_a_field_that_is_asked_for_while_it_goes_comes_back(world: World, monkey
 
 def test_rejected_fields_are_forgotten_after_a_while(world: World) -> None:
     a = world.add_field("a", state="rejected")
-    assert world.tidy(6 * DAY_S) == Removed()
-    assert world.tidy(2 * DAY_S) == Removed(fields=(a,))
+    assert world.tidy(6 * DAY_S) == {}
+    assert world.tidy(2 * DAY_S) == {"fields": [a]}
 
 
 def test_beyond_the_cap_the_oldest_go_and_the_youngest_stay(world: World) -> None:
@@ -119,11 +121,11 @@ def test_beyond_the_cap_the_oldest_go_and_the_youngest_stay(world: World) -> Non
     world.add_job("new", b, b, size=300_000)
     world.records.ahead_s += DAY_S / 2
     removed = world.tidy(max_stored_bytes=450_000)
-    assert (removed.jobs, removed.fields) == (("old",), (a,))
+    assert removed == {"jobs": ["old"], "fields": [a]}
     assert world.records.get_job("old") is None
     assert sum(map(len, (data for key, data in world.blobs.blobs.items() if not key.startswith("journal/")))) == 400_000
     world.add_job("fresh", b, b, size=300_000)
-    assert world.tidy(60.0, max_stored_bytes=1).jobs == ("new",), "what is an hour old at most is not taken"
+    assert world.tidy(60.0, max_stored_bytes=1)["jobs"] == ["new"], "what is an hour old at most is not taken"
 
 
 def test_folders_that_no_record_knows_go_after_a_day(world: World) -> None:
@@ -132,7 +134,7 @@ def test_folders_that_no_record_knows_go_after_a_day(world: World) -> None:
     world.blobs.put("jobs/unknown/1/result.json", b".")
     world.blobs.put(f"fields/{'c' * 64}/original", b".")
     world.blobs.age()
-    assert set(world.tidy().orphans) == {"jobs/unknown", f"fields/{'c' * 64}"}
+    assert set(world.tidy()["orphans"]) == {"jobs/unknown", f"fields/{'c' * 64}"}
     assert world.fields() == {"a"}
     assert list(world.blobs.list("jobs")) == ["jobs/j/1/result.json"]
 
@@ -154,7 +156,7 @@ def test_nothing_goes_while_redis_has_lost_the_records(world: World) -> None:
     world.add_job("j", world.add_field("a"), world.add_field("b"), size=10)
     before = dict(world.blobs.blobs)
     world.redis.flushall()
-    assert world.tidy(100 * DAY_S, field_retention_s=60, max_stored_bytes=1) == Removed()
+    assert world.tidy(100 * DAY_S, field_retention_s=60, max_stored_bytes=1) == {}
     assert world.blobs.blobs == before
 
 
@@ -179,10 +181,10 @@ def test_once_an_hour_is_enough(world: World) -> None:
     keeper = Housekeeper(world.records, world.blobs, world.redis, world.settings)
     with world.lease.held() as term:
         assert term is not None
-        assert keeper.run_if_due(term).orphans == ("jobs/unknown",)
+        assert keeper.run_if_due(term)["orphans"] == ["jobs/unknown"]
         world.blobs.put("jobs/unknown/1/result.json", b".")
         world.blobs.age()
-        assert keeper.run_if_due(term) == Removed()
+        assert keeper.run_if_due(term) == {}
 
 
 def test_a_batch_goes_when_its_time_is_over(world: World) -> None:
@@ -205,7 +207,7 @@ def test_pieces_and_journals_count_in_the_cap(world: World) -> None:
         os.utime(world.blobs.path_of(key), (moment, moment))
     journal = sum(entry.bytes for entry in world.blobs.entries("journal"))
     kept = {"keep_pieces_s": 100 * int(DAY_S)}
-    assert world.tidy(max_stored_bytes=40_000 + journal, **kept) == Removed()
+    assert world.tidy(max_stored_bytes=40_000 + journal, **kept) == {}
     assert list(world.blobs.list("uploads")) == pieces
     world.tidy(max_stored_bytes=40_000 + journal - 1, **kept)
     assert list(world.blobs.list("uploads")) == pieces[1:]
@@ -221,3 +223,50 @@ def test_batches_count_in_the_cap_and_go_before_their_time(world: World) -> None
         os.utime(world.blobs.path_of(f"batches/anyone/{number}"), (moment, moment))
     world.tidy(max_stored_bytes=1000)
     assert list(world.blobs.list("batches")) == ["batches/anyone/2"]
+
+
+# one leader at a time, and a leader that was slow hears that it no longer leads
+
+
+@pytest.fixture
+def lease(redis: Redis) -> Lease:
+    redis.flushall()
+    return Lease(redis, "lease", 30.0)
+
+
+def test_one_leader_at_a_time(lease: Lease) -> None:
+    with lease.held() as first, lease.held() as second:
+        assert first is not None
+        assert second is None
+        first.confirm()
+    with lease.held() as third:
+        assert third is not None
+        assert third.number > first.number
+
+
+def test_a_leader_whose_term_has_lapsed_is_told(lease: Lease, redis: Redis) -> None:
+    with lease.held() as slow:
+        assert slow is not None
+        redis.delete("lease")
+        with lease.held() as next_:
+            assert next_ is not None
+            with pytest.raises(LeaseLostError):
+                slow.confirm()
+            next_.confirm()
+    assert not redis.exists("lease")
+
+
+def test_the_end_of_an_old_term_does_not_end_the_new_one(lease: Lease, redis: Redis) -> None:
+    with lease.held():
+        redis.set("lease", "999")
+    assert redis.get("lease") == b"999"
+
+
+def test_a_confirmed_term_goes_on(lease: Lease, redis: Redis) -> None:
+    with lease.held() as term:
+        assert term is not None
+        redis.pexpire("lease", 1000)
+        term.confirm()
+        left = redis.pttl("lease")
+        assert isinstance(left, int)
+        assert left > 20_000

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import socket
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
-from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -15,8 +11,6 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from redis import Redis
 
-from regnf_service import metrics as metrics_port
-from regnf_service.http.hosts import AllowedHosts
 from regnf_service.metrics import Metrics, served
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
@@ -38,7 +32,6 @@ def redis(redis_url: str) -> Iterator[Redis]:
 
 
 def values(text: str) -> dict[tuple[str, ...], float]:
-    """Every sample by its name and its labels' values in the order of their names."""
     samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
     return {(one.name, *(value for _, value in sorted(one.labels.items()))): one.value for one in samples}
 
@@ -153,68 +146,14 @@ def test_a_scrape_without_redis_says_so(tmp_path: Path) -> None:
 
 
 def test_they_have_a_port_of_their_own(tmp_path: Path, any_redis: Redis) -> None:
-    from prometheus_client import start_http_server
-
     metrics = make_world(tmp_path, any_redis).app.state.metrics
-    probe, thread = start_http_server(0, "127.0.0.1", metrics.registry)
-    port = probe.server_port
-    probe.shutdown()
-    probe.server_close()
-    thread.join()
-    hosts = AllowedHosts({"api"})
-    with served(metrics.registry, hosts, f"127.0.0.1:{port}"):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with served(metrics.registry, f"127.0.0.1:{port}"):
         answer = httpx.get(f"http://127.0.0.1:{port}/metrics")
         assert answer.headers["content-type"].startswith("text/plain")
-        assert ("regnf_uploads_active",) in values(answer.text)
-        assert answer.headers["cross-origin-resource-policy"] == "same-origin"
-        for headers, status in (
-            ({"Host": "evil.example"}, 421),
-            ({"Host": "localhost", "Origin": "http://evil.example"}, 403),
-            ({"Sec-Fetch-Site": "cross-site"}, 403),
-            ({"Host": "api:9464"}, 200),
-        ):
-            assert httpx.get(f"http://127.0.0.1:{port}/metrics", headers=headers).status_code == status
+        assert {("regnf_uploads_active",), ("process_open_fds",)} <= values(answer.text).keys()
     with pytest.raises(httpx.ConnectError):
         httpx.get(f"http://127.0.0.1:{port}/metrics")
-    with served(metrics.registry, hosts, None):
+    with served(metrics.registry, None):
         pass
-
-
-def test_silent_connections_do_not_fill_the_metrics_port(tmp_path: Path, any_redis: Redis) -> None:
-    metrics = make_world(tmp_path, any_redis).app.state.metrics
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    with served(metrics.registry, AllowedHosts(()), f"127.0.0.1:{port}"), ExitStack() as stack:
-        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(17)]
-        assert silent[-1].recv(1) == b""
-        assert threading.active_count() < 40
-
-
-def test_trickling_connections_do_not_keep_the_metrics_port(
-    tmp_path: Path, any_redis: Redis, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(metrics_port, "_LONGEST_S", 0.5)
-    metrics = make_world(tmp_path, any_redis).app.state.metrics
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    end = time.monotonic() + 20
-    with (
-        served(metrics.registry, AllowedHosts(()), f"127.0.0.1:{port}"),
-        socket.create_connection(("127.0.0.1", port)) as trickling,
-    ):
-        trickling.settimeout(0.1)
-        with suppress(ConnectionError):
-            while time.monotonic() < end:
-                trickling.sendall(b"x")
-                with suppress(TimeoutError):
-                    if trickling.recv(1) == b"":
-                        break
-    assert time.monotonic() < end, "a byte now and then kept the connection"
-
-
-def test_the_verdict_is_kept_with_the_job(redis: Redis) -> None:
-    store = RecordStore(redis)
-    record = job(store, "j")
-    assert replace(record, verdict=None) == record
-    store.update_job("j", 1, status="running")
-    assert store.update_job("j", 1, status="successful", verdict="registered").verdict == "registered"

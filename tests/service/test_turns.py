@@ -11,37 +11,24 @@ from regnf_service.concurrency import Threads, whose
 from regnf_service.http.middleware import AT_ONCE, Turns, fair_key
 
 
-def order(arrivals: list[tuple[str, float]]) -> list[tuple[str, float]]:
-    """Of these callers and times, after one that nobody waits for."""
-    seen: list[tuple[str, float]] = []
+def test_callers_take_turns() -> None:
+    """The first of them comes at once: nobody waits when it asks."""
+    seen: list[str] = []
 
-    async def ask(turns: Turns, who: str, quiet_since: float) -> None:
-        await turns.come(who, quiet_since)
-        seen.append((who, quiet_since))
+    async def ask(turns: Turns, who: str) -> None:
+        await turns.come(who)
+        seen.append(who)
 
     async def all_at_once() -> None:
         turns = Turns()
-        await turns.come("somebody", 0.0)
+        await turns.come("somebody")
         async with asyncio.TaskGroup() as group:
-            for who, quiet_since in arrivals:
-                group.create_task(ask(turns, who, quiet_since))
+            for who in [*["greedy"] * 50, "honest", "honest"]:
+                group.create_task(ask(turns, who))
 
     asyncio.run(all_at_once())
-    return seen
-
-
-def test_callers_take_turns() -> None:
-    """The first of them comes at once: nobody waits when it asks."""
-    greedy = [("greedy", float(number)) for number in range(50)]
-    names = [who for who, _ in order([*greedy, ("honest", 99.0), ("honest", 98.0)])]
-    assert len(names) == 52
-    assert names[:6].count("honest") == 2
-
-
-def test_who_was_answered_longest_ago_comes_first() -> None:
-    times = [since for _, since in order([("one", since) for since in (5.0, 9.0, 1.0, 7.0, 3.0, 8.0)])]
-    assert times[1:] == sorted(times[1:])
-    assert times[-1] == 9.0
+    assert len(seen) == 52
+    assert seen[:6].count("honest") == 2
 
 
 def test_a_few_begin_in_each_turn_of_the_loop() -> None:
@@ -50,7 +37,7 @@ def test_a_few_begin_in_each_turn_of_the_loop() -> None:
 
         async def ask() -> None:
             nonlocal begun
-            await turns.come("caller", 0.0)
+            await turns.come("caller")
             begun += 1
 
         asking = [asyncio.create_task(ask()) for _ in range(100)]
@@ -67,11 +54,11 @@ def test_a_few_begin_in_each_turn_of_the_loop() -> None:
 def test_who_leaves_keeps_nobody_waiting() -> None:
     async def leave() -> list[bool]:
         turns = Turns()
-        asking = [asyncio.create_task(turns.come("caller", 0.0)) for _ in range(5)]
+        asking = [asyncio.create_task(turns.come("caller")) for _ in range(5)]
         await asyncio.sleep(0)
         asking[1].cancel()
         await asyncio.gather(*asking, return_exceptions=True)
-        await turns.come("caller", 0.0)
+        await turns.come("caller")
         return [one.cancelled() for one in asking]
 
     assert asyncio.run(leave()) == [False, True, False, False, False]

@@ -18,7 +18,7 @@ from regnf_service.webhooks.service import HttpSender, SendError, deliver_until_
 from regnf_service.webhooks.targets import AllowList, Webhooks, read_secrets
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Message, RedisOutbox, line_of
-from tests.service.webhook_receiver import SECRET, Receiver, delivery, finish
+from tests.service.conftest import SECRET, Receiver, delivery, finish
 
 LONG_S = 60.0
 Behavior = Callable[[socket.socket], object]
@@ -30,8 +30,6 @@ def nothing(connection: socket.socket) -> None:
 
 
 def repeated(data: bytes, pause_s: float, first: bytes = b"") -> Behavior:
-    """Says ``first``, and then ``data`` for ever."""
-
     def behave(connection: socket.socket) -> None:
         connection.sendall(first)
         while True:
@@ -55,8 +53,6 @@ BEHAVIORS: dict[str, Behavior] = {
 
 
 class Slow:
-    """Behaves as told on each connection."""
-
     def __init__(self, behave: Behavior) -> None:
         self._behave = behave
         self._listening = socket.create_server(("127.0.0.1", 0))
@@ -113,7 +109,6 @@ def test_of_an_endless_body_nothing_is_read(length: bytes) -> None:
 
 
 def test_many_interim_answers_are_too_much_without_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They would keep the front end busy until the time is over."""
     slow = Slow(BEHAVIORS["interim answers without end"])
     with pytest.raises(SendError, match="ANSWER_TOO_LARGE"):
         send(f"http://127.0.0.1:{slow.port}/x", LONG_S)
@@ -162,7 +157,7 @@ def test_a_receiver_that_does_not_answer_keeps_no_other_waiting(
 
     async def serve() -> None:
         stopping = asyncio.Event()
-        serving = asyncio.create_task(deliver_until_stopped(webhooks, RecordStore(redis), redis, stopping))
+        serving = asyncio.create_task(deliver_until_stopped(webhooks, RecordStore(redis), stopping))
         await asyncio.to_thread(until, lambda: slow.opened == 4 and len(receiver.received) == 2)
         assert not slow.closed.acquire(timeout=0)
         stopping.set()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
 import pytest
 from redis import Redis
@@ -11,7 +10,7 @@ from redis.exceptions import ResponseError
 
 from regnf_state.queue import Work
 from regnf_state.redis.counters import COUNTERS_KEY, Counters, count
-from regnf_state.redis.fair_queue import FairQueue
+from regnf_state.redis.fair_queue import FairQueue, Waiting
 
 PREFIX = "regnf:queue:"
 WAITING, OTHER, PARKED = (Work("registration", f"{letter * 32}", 1) for letter in "abc")
@@ -22,11 +21,10 @@ def used(redis: Redis) -> FairQueue:
     """A queue with something in every key: work that waits, lies ready, has been run and is parked."""
     fair = FairQueue(redis)
     for number in range(3):
-        fair.enqueue(Work("registration", f"{number:032x}", 1), "one", {"owner": "one"})
-    fair.enqueue(WAITING, "two", {"owner": "two"})
-    first: Any = redis.lpop("rq:queue:regnf")
+        fair.enqueue(Waiting(Work("registration", f"{number:032x}", 1), "one", {"owner": "one"}))
+    fair.enqueue(Waiting(WAITING, "two", {"owner": "two"}))
+    redis.lpop("rq:queue:regnf")
     fair.turn()
-    fair.finish(first.decode(), 2.0)
     fair.park(PARKED, "one", "e" * 64)
     return fair
 
@@ -37,19 +35,16 @@ def go_through(fair: FairQueue, redis: Redis) -> None:
     fair.holds(WAITING.name)
     fair.position(WAITING)
     fair.lines()
-    fair.spent("one")
     fair.release("e" * 64)
     fair.awaited()
     Counters(redis)
-    name: Any = redis.lpop("rq:queue:regnf")
-    if name is not None:
-        fair.turn()
-        fair.finish(name.decode(errors="replace"), 1.0)
+    redis.lpop("rq:queue:regnf")
+    fair.turn()
 
 
 def comes_out(fair: FairQueue, redis: Redis, work: Work) -> bool:
     """Whether work that is queued now is handed out in the end."""
-    fair.enqueue(work, "three", {"owner": "three"})
+    fair.enqueue(Waiting(work, "three", {"owner": "three"}))
     for _ in range(20):
         fair.turn()
         if redis.lpop("rq:queue:regnf") == work.name.encode():
@@ -127,20 +122,3 @@ def test_damaged_counters_begin_anew(redis: Redis, value: str | None) -> None:
         redis.hset(COUNTERS_KEY, "refused|a", value)
     count(redis, "refused", "a")
     assert list(Counters(redis).counts("refused")) == [(("a",), 1.0)]
-
-
-@pytest.mark.parametrize("kind", ["another type", "no number"])
-def test_damaged_counters_do_not_empty_the_queue(redis: Redis, kind: str) -> None:
-    fair = used(redis)
-    name: Any = redis.lpop("rq:queue:regnf")
-    fair.turn()
-    held = {line.owner: line.waiting for line in fair.lines()}
-    redis.delete(COUNTERS_KEY)
-    if kind == "no number":
-        redis.hset(COUNTERS_KEY, "worker_seconds|two|registration", "x")
-        redis.hset(COUNTERS_KEY, "worker_seconds|one|registration", "x")
-    else:
-        redis.set(COUNTERS_KEY, "x")
-    fair.finish(name.decode(), 2.0)
-    assert {line.owner: line.waiting for line in fair.lines()} == held
-    assert [value for _, value in Counters(redis).counts("worker_seconds") if value] == [2.0]

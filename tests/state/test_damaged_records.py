@@ -208,7 +208,7 @@ def test_a_damaged_message_does_not_keep_the_others(store: RecordStore, redis: R
     assert redis.zscore(due_key(line), "nonsense") is None
     record = job(store)
     record.request["webhook"] = {"url": "https://hooks.example"}
-    redis.hset("regnf:webhook:j1:0", mapping={"state": "?", "sends": "many"})
+    redis.hset("regnf:webhook:j1:0", mapping={"message": "j1-1-0", "delivery": "{"})
     assert outbox.deliveries(record)[0].last_error == "RECORD_UNREADABLE"
 
 

@@ -12,26 +12,20 @@ from typing import Any
 import httpx
 import pytest
 import trimesh
-from playwright.sync_api import Browser, ConsoleMessage, Error, Page, Request, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
 
 from regnf_state.settings import Settings
 from tests.ui import room
-from tests.ui.fixture_server import FixtureServer
 from tests.ui.home import home, register, upload
+from tests.ui.stories import FixtureServer
 
 # SwiftShader draws WebGL without a GPU, and nothing else, being slow. The others keep the browser from calling home.
 ARGUMENTS = [
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-gpu-compositing",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+Files = tuple[Path, Path, Path]
 
 DRIVER = "GL Driver Message"
 """Begins what the drawing library says of its own speed; the page has no part in it."""
@@ -39,8 +33,6 @@ DRIVER = "GL Driver Message"
 
 @dataclass
 class Visit:
-    """One open page, with everything it asked for and complained about."""
-
     page: Page
     server: FixtureServer
     requests: list[str] = field(default_factory=list)
@@ -53,15 +45,19 @@ class Visit:
         return self.page
 
 
+def chromium() -> str:
+    """The installed browser; without one the test is skipped, or fails where REGNF_REQUIRE_BROWSER=1 asks for it."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None and os.environ.get("REGNF_REQUIRE_BROWSER") == "1":
+        pytest.fail("no chromium on this machine, and REGNF_REQUIRE_BROWSER=1 asks for it")
+    return found or pytest.skip("no chromium on this machine: the page is not tested")
+
+
 @pytest.fixture(scope="package")  # its loop of events must not outlive these tests
 def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        if os.environ.get("REGNF_REQUIRE_BROWSER") == "1":
-            pytest.fail("no chromium on this machine, and REGNF_REQUIRE_BROWSER=1 asks for it")
-        pytest.skip("no chromium on this machine: the page is not tested")
+    program = chromium()
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)
         yield browser
         browser.close()
 
@@ -74,14 +70,14 @@ def running_server() -> Iterator[FixtureServer]:
 
 @pytest.fixture
 def server(running_server: FixtureServer) -> FixtureServer:
-    running_server.stage.reset()
+    running_server.stage.set(step=0, cancelled=False)
     return running_server
 
 
 @pytest.fixture
 def context_options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """What a test overrides to look through another kind of screen; a module's VIEWPORT says how large it is."""
-    width, height = getattr(request.module, "VIEWPORT", (1100, 700))
+    width, height = getattr(request.module, "VIEWPORT", (1000, 600))
     return {"viewport": {"width": width, "height": height}, "reduced_motion": "reduce"}
 
 
@@ -107,7 +103,6 @@ def kept_window() -> dict[str, Page]:
 
 
 def forget(page: Page) -> None:
-    """Leave the window as it was opened."""
     page.unroute_all()
     page.context.set_offline(False)
     page.context.clear_permissions()
@@ -143,17 +138,15 @@ def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Vis
     page: Page = request.getfixturevalue(name)
     visit = Visit(page, server)
 
-    def asked(message: Request) -> None:
-        visit.requests.append(message.url)
-
-    def failed(error: Error) -> None:
-        visit.complaints.append(str(error))
-
     def said(message: ConsoleMessage) -> None:
         if message.type != "info" and DRIVER not in message.text:
             visit.complaints.append(message.text)
 
-    listeners = {"request": asked, "pageerror": failed, "console": said}
+    listeners: dict[Any, Callable[[Any], None]] = {
+        "request": lambda message: visit.requests.append(message.url),
+        "pageerror": lambda error: visit.complaints.append(str(error)),
+        "console": said,
+    }
     for event, listener in listeners.items():
         page.on(event, listener)
     yield visit
@@ -162,8 +155,7 @@ def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Vis
 
 
 @pytest.fixture(scope="session")
-def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """A room, the chair that stands in it, and a stool that does not."""
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     folder = tmp_path_factory.mktemp("own")
     stool = folder / "stool.glb"
     trimesh.creation.box((0.4, 0.3, 0.5)).export(stool)
@@ -178,7 +170,6 @@ def running_home() -> Iterator[str]:
 
 @pytest.fixture
 def service(running_home: str, visit: Visit) -> Iterator[str]:
-    """The address of a service that has nothing yet."""
     yield running_home
     if visit.page.url.startswith(running_home):
         visit.page.evaluate("() => { sessionStorage.clear(); localStorage.clear(); }")
@@ -190,7 +181,6 @@ def service(running_home: str, visit: Visit) -> Iterator[str]:
 
 
 @pytest.fixture
-def filled(service: str, files: tuple[Path, Path, Path]) -> str:
-    """The address of a service that has a room, a chair, and a job with both."""
+def filled(service: str, files: Files) -> str:
     register(service, upload(service, files[:2]))
     return service

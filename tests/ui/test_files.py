@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ui.fixture_server import WEB
+from tests.ui.stories import WEB
 
 
 def test_files_hold_no_inline_code_and_no_foreign_address() -> None:

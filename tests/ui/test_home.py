@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, Route, expect
 
-from regnf_state.settings import Settings
 from tests.ui import room
-from tests.ui.conftest import Visit
-from tests.ui.home import CHAIR, NETWORK, choose_scene, click_at, give_files, home, open_page, register, upload
+from tests.ui.conftest import Files, Visit
+from tests.ui.home import CHAIR, NETWORK, box_of, choose_scene, click_at, give_files, open_page, register, upload
 
-Files = tuple[Path, Path, Path]
 pytestmark = pytest.mark.browser
 VIEWPORT = (1280, 800)
+TURN = "Turn about the up axis, degrees"
 
 
 def numbers_of(page: Page) -> dict[str, float]:
@@ -25,9 +24,12 @@ def numbers_of(page: Page) -> dict[str, float]:
     return {name: float(inputs.nth(i).input_value()) for i, name in enumerate(names)}
 
 
-def test_from_files_to_a_registered_chair(visit: Visit, service: str, files: Files) -> None:
+def test_from_files_to_a_registered_chair(visit: Visit, service: str, files: Files, tmp_path: Path) -> None:
     page = visit.page
+    (tmp_path / "empty.ply").write_bytes(b"hello, this is no field")
     open_page(page, service)
+    page.set_input_files("#scene-file", tmp_path / "empty.ply")
+    expect(page.locator("#scene-state .bad")).to_contain_text("empty.ply: ")  # refused, and why
     give_files(page, files)
     click_at(page, CHAIR)
     expect(page.locator("#boxes li")).to_have_count(1)
@@ -37,8 +39,7 @@ def test_from_files_to_a_registered_chair(visit: Visit, service: str, files: Fil
     assert found["Center y"] == pytest.approx(room.CHAIR_AT[1], abs=0.06)
     assert found["Size z"] == pytest.approx(1.0, abs=0.12)
     assert max(found["Size x"], found["Size y"]) < 0.72
-    turn = found["Turn about the up axis, degrees"]
-    assert (turn - np.degrees(room.CHAIR_TURN) + 45) % 90 == pytest.approx(45, abs=5)
+    assert (found[TURN] - np.degrees(room.CHAIR_TURN) + 45) % 90 == pytest.approx(45, abs=5)
     page.click("#register")
     expect(page.locator(".run strong")).to_have_text("Box 1, registered: chair.glb")
     page.click(".run a")
@@ -70,11 +71,8 @@ def test_boxes_are_edited_by_mouse_keys_and_numbers(visit: Visit, service: str, 
     before = numbers_of(page)
     page.locator(".handle.turn").focus()
     page.keyboard.press("ArrowRight")
-    assert numbers_of(page)["Turn about the up axis, degrees"] == pytest.approx(
-        before["Turn about the up axis, degrees"] + 5, abs=0.2
-    )
-    top = page.locator(".handle[aria-label='Top']").bounding_box()
-    assert top is not None
+    assert numbers_of(page)[TURN] == pytest.approx(before[TURN] + 5, abs=0.2)
+    top = box_of(page, ".handle[aria-label='Top']")
     page.mouse.move(top["x"] + top["width"] / 2, top["y"] + top["height"] / 2)
     page.mouse.down()
     page.mouse.move(top["x"] + top["width"] / 2, top["y"] - 30, steps=3)
@@ -94,45 +92,15 @@ def test_boxes_are_edited_by_mouse_keys_and_numbers(visit: Visit, service: str, 
     expect(page.locator("#boxes li")).to_have_count(1)
 
 
-def test_guarded_service_asks_for_the_token_once(visit: Visit, files: Files) -> None:
-    page = visit.page
-    with home(Settings(api_tokens=frozenset({"robot:open-sesame"})), "robot") as service:
-        page.goto(service)
-        page.locator("#token").fill("open-sesame")
-        page.keyboard.press("Enter")
-        page.wait_for_selector("html[data-page=ready]")
-        give_files(page, files)
-        page.goto(f"{service}/fields")
-        expect(page.locator(".tile")).to_have_count(2)
-
-
-def test_refused_file_says_why(visit: Visit, service: str, tmp_path: Path) -> None:
-    page = visit.page
-    (tmp_path / "empty.ply").write_bytes(b"hello, this is no field")
-    open_page(page, service)
-    page.set_input_files("#scene-file", tmp_path / "empty.ply")
-    expect(page.locator("#scene-state .bad")).to_contain_text("empty.ply: ")
-
-
-def test_run_again_keeps_what_the_form_does_not_show(visit: Visit, service: str, files: Files) -> None:
-    page = visit.page
-    turned = [[0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    options = {"preset": "paper", "optimization": {"iterations": 7}}
-    register(service, upload(service, files[:2]), options=options, ground_truth={"T_object_scene": turned})
-    page.goto(f"{service}/jobs")
-    page.get_by_role("button", name="Run again").click()
-    page.get_by_label("Seed").fill("9")
-    page.click("#again-start")
-    page.wait_for_url("**/view")
-    again = page.request.get(page.url.removesuffix("/view") + "/request").json()
-    assert (again["options"]["optimization"]["iterations"], again["seed"]) == (7, 9)
-    assert again["ground_truth"] == {"T_object_scene": turned}
-
-
-def test_run_again_and_compare(visit: Visit, filled: str) -> None:
+def test_run_again_keeps_what_the_form_does_not_show_and_two_runs_are_compared(
+    visit: Visit, service: str, files: Files
+) -> None:
     """The comparison opens at its top, in the words of a job's page, however small the window."""
     page = visit.page
-    page.goto(f"{filled}/jobs")
+    turned = [[0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    options = {"robust": {"rotations": 77}}
+    register(service, upload(service, files[:2]), options=options, ground_truth={"T_object_scene": turned})
+    page.goto(f"{service}/jobs")
     page.get_by_role("button", name="Run again").click()
     page.get_by_label("Seed").fill("7")
     page.locator("dialog[open] summary").click()
@@ -140,9 +108,12 @@ def test_run_again_and_compare(visit: Visit, filled: str) -> None:
     page.click("#again-start")
     page.wait_for_url("**/view")
     expect(page.locator("#verdict-word")).to_have_text("Registered")
+    again = page.request.get(page.url.removesuffix("/view") + "/request").json()
+    robust = again["options"]["robust"]
+    assert (robust["rotations"], robust["min_inlier_share"], again["seed"]) == (77, 0.5, 7)
+    assert again["ground_truth"] == {"T_object_scene": turned}
     page.set_viewport_size({"width": 600, "height": 320})
-    page.goto(f"{filled}/jobs")
-    expect(page.locator(".tile")).to_have_count(2)
+    page.goto(f"{service}/jobs")
     expect(page.locator(".tile .word")).to_have_text(["Registered", "Registered"])
     expect(page.locator(".tile").first).to_contain_text("seed 7")
     expect(page.locator("#compare")).to_be_disabled()
@@ -151,39 +122,32 @@ def test_run_again_and_compare(visit: Visit, filled: str) -> None:
     for mark in marks.all():
         mark.check()
     page.click("#compare")
-    expect(page.locator("#comparison")).to_contain_text("turned by 0.00°")
-    expect(page.locator("#comparison")).to_contain_text("Residual RMS")
+    for part in ("turned by 0.00°", "Residual RMS"):
+        expect(page.locator("#comparison")).to_contain_text(part)
     expect(page.locator("#compare-title")).to_be_focused()
     expect(page.locator("#compare-title")).to_be_in_viewport()
     page.set_viewport_size({"width": VIEWPORT[0], "height": VIEWPORT[1]})
     assert [one for one in visit.complaints if not one.startswith(NETWORK)] == []
 
 
-def refuse_lists(page: Page, answers: int) -> list[str]:
-    """Have the store of records busy at the first requests for the list of fields; the servicees asked for."""
+@pytest.mark.parametrize("busy_answers", [3, 1000])
+def test_the_page_asks_again_while_the_store_is_busy_and_says_that_it_stays_so(
+    visit: Visit, service: str, busy_answers: int
+) -> None:
+    page = visit.page
     asked: list[str] = []
+    problem = '{"reason": "STORAGE_UNAVAILABLE", "detail": "The record store does not answer. Retry later."}'
 
     def busy(route: Route) -> None:
         asked.append(route.request.url)
-        if len(asked) > answers:
+        if len(asked) > busy_answers:
             return route.continue_()
-        problem = '{"reason": "STORE_UNAVAILABLE", "detail": "The record store does not answer. Retry later."}'
         return route.fulfill(status=503, headers={"Retry-After": "0"}, body=problem)
 
     page.route("**/fields?*", busy)
-    return asked
-
-
-def test_the_page_asks_again_while_the_store_is_busy(visit: Visit, service: str) -> None:
-    page = visit.page
-    asked = refuse_lists(page, 3)
     open_page(page, service)
-    assert len(asked) > 3
-    expect(page.locator("#tip")).to_be_hidden()
-
-
-def test_the_page_says_that_the_store_stays_busy(visit: Visit, service: str) -> None:
-    page = visit.page
-    refuse_lists(page, 1000)
-    open_page(page, service)
-    expect(page.locator("#tip")).to_contain_text("The record store does not answer.")
+    if busy_answers == 3:
+        assert len(asked) > 3
+        expect(page.locator("#tip")).to_be_hidden()
+    else:
+        expect(page.locator("#tip")).to_contain_text("The record store does not answer.")

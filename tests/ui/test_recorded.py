@@ -24,11 +24,11 @@ pytestmark = [pytest.mark.browser, pytest.mark.long, pytest.mark.timeout(900)]
 CHAIR = (0.614, 0.598)
 """Where the chair is seen at first, as shares of the view."""
 PATIENCE_MS = 400_000
+VIEWPORT = (1280, 800)
 
 
 @pytest.fixture
 def serving(tmp_path: Path) -> Iterator[str]:
-    """The address of `regnf serve` with a state of its own."""
     command = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(tmp_path / "state")]
     plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
     with (
@@ -45,27 +45,12 @@ def serving(tmp_path: Path) -> Iterator[str]:
             process.wait()
 
 
-@pytest.fixture
-def context_options() -> dict[str, object]:
-    return {"viewport": {"width": 1280, "height": 800}, "reduced_motion": "reduce"}
-
-
-class Recording:
-    """Frames of a page; nothing is written without REGNF_RECORD."""
-
-    def __init__(self, page: Page) -> None:
-        self._page = page
-        self._folder = os.environ.get("REGNF_RECORD")
-        self._began = time.monotonic()
-
-    def frame(self, name: str) -> None:
-        if self._folder is None:
-            return
-        folder = Path(self._folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        self._page.screenshot(path=folder / f"{name}.png")
-        with (folder / "seconds.txt").open("a") as file:
-            file.write(f"{name} {time.monotonic() - self._began:.1f}\n")
+def frame(page: Page, name: str, since: float) -> None:
+    """Keep what is shown, and when; nothing is written without REGNF_RECORD."""
+    if folder := os.environ.get("REGNF_RECORD"):
+        page.screenshot(path=Path(folder) / f"{name}.png")
+        with (Path(folder) / "seconds.txt").open("a") as file:
+            file.write(f"{name} {time.monotonic() - since:.1f}\n")
 
 
 def test_four_actions_to_a_registered_chair(visit: Visit, serving: str, tmp_path: Path) -> None:
@@ -73,8 +58,8 @@ def test_four_actions_to_a_registered_chair(visit: Visit, serving: str, tmp_path
     scene, chair = room.write_room_and_chair(tmp_path)
     page.goto(serving)
     page.wait_for_selector("html[data-page=ready]")
-    recording = Recording(page)
-    recording.frame("1-start")
+    began = time.monotonic()
+    frame(page, "1-start", began)
     with page.expect_file_chooser() as chooser:
         page.get_by_text("Choose a scene").click()  # 1
     chooser.value.set_files(scene)
@@ -82,17 +67,17 @@ def test_four_actions_to_a_registered_chair(visit: Visit, serving: str, tmp_path
         page.get_by_text("Add files").click()  # 2
     chooser.value.set_files(chair)
     page.wait_for_selector("html[data-scene]", timeout=PATIENCE_MS)
-    recording.frame("2-scene")
+    frame(page, "2-scene", began)
     click_at(page, CHAIR)  # 3
     page.wait_for_selector("#objects input:checked", timeout=PATIENCE_MS)
-    recording.frame("3-box")
+    frame(page, "3-box", began)
     page.click("#register")  # 4
     page.wait_for_selector("#runs progress")
-    recording.frame("4-running")
+    frame(page, "4-running", began)
     page.wait_for_selector(".run[data-verdict], .run .bad", timeout=PATIENCE_MS)
     expect(page.locator(".run strong")).to_have_text("Box 1, registered: chair.glb")
     page.wait_for_function("() => document.querySelectorAll('#handles button:not([hidden])').length === 0")
-    recording.frame("5-registered")
+    frame(page, "5-registered", began)
     expect(page.locator(".run")).to_contain_text(f"scale {room.CHAIR_SCALE:.2f}"[:-1])
     assert [url for url in visit.requests if not url.startswith((serving, "blob:"))] == []
     page.goto("about:blank")

@@ -1,4 +1,4 @@
-"""What the pages say: names, finds, sizes, every error, questions before a deletion; and room for all of it."""
+"""What the pages of the service say: names, finds, sizes, errors, questions before a deletion, the library."""
 
 from __future__ import annotations
 
@@ -11,47 +11,51 @@ import pytest
 from playwright.sync_api import Route, expect
 
 from regnf_core.options import RobustOptions
-from tests.ui.conftest import Visit
-from tests.ui.home import CHAIR, choose_scene, click_at, give_files, open_page, register, upload
-from tests.ui.test_accessibility import NONE, in_both_themes
+from tests.ui.conftest import Files, Visit
+from tests.ui.home import CHAIR, NETWORK, box_of, choose_scene, click_at, give_files, open_page, register, upload
+from tests.ui.test_access import NONE, in_both_themes
 
 pytestmark = pytest.mark.browser
 VIEWPORT = (1280, 800)
-Files = tuple[Path, Path, Path]
-JSON = {"Accept": "application/json"}
 FAULTS = {
-    "reason": "INVALID_OPTIONS",
-    "detail": "An option is wrong.",
-    "hint": "See the table.",
+    "reason": "INVALID_OPTIONS", "detail": "An option is wrong.", "hint": "See the table.",
     "errors": [
         {"pointer": "/options/robust", "detail": "min_scale 2 is larger than max_scale 1"},
         {"pointer": "/seed", "detail": "must not be negative"},
     ],
-}
+}  # fmt: skip
 
 
-def test_the_card_of_a_search_says_what_was_found_where_and_in_which_box(
+def test_the_card_of_a_search_says_what_was_found_where_and_its_page_leads_on(
     visit: Visit, service: str, files: Files
 ) -> None:
     page = visit.page
     fields = upload(service, files)
     job = register(service, fields)
     named = dict(zip(fields, ("room.ply", "chair.glb", "stool.glb"), strict=True))
+    title = f"{named[job['object_found']]} in room.ply"
     page.goto(f"{service}/jobs")
-    expect(page.locator(".tile h2")).to_have_text(f"{named[job['object_found']]} in room.ply")
+    expect(page.locator(".tile h2")).to_have_text(title)
     expect(page.locator(".tile .word")).to_have_text("Registered")
     expect(page.locator(".tile")).to_contain_text("the likeliest of 2 objects")
-    expect(page.locator(".tile")).to_contain_text(
-        re.compile(r"box [\d.]+ × [\d.]+ × [\d.]+ at [−\d.]+, [−\d.]+, [−\d.]+")
-    )
+    box = re.compile(r"box [\d.]+ × [\d.]+ × [\d.]+ at [−\d.]+, [−\d.]+, [−\d.]+")
+    expect(page.locator(".tile")).to_contain_text(box)
     page.get_by_role("link", name="Open").click()
-    expect(page.locator("#job-title")).to_have_text(f"{named[job['object_found']]} in room.ply")
+    expect(page.locator("#job-title")).to_have_text(title)
+    expect(page.locator("#verdict-word")).to_have_text("Registered")
+    expect(page.locator("header nav a")).to_have_text(["Register", "Library", "Jobs", "Fields", "API"])
+    page.get_by_role("button", name="Run again").click()
+    expect(page.locator("#again-start")).to_be_enabled()
+    page.get_by_role("button", name="Close").click()
+    page.get_by_role("button", name="Delete").click()
+    page.locator("dialog[open]").get_by_role("button", name="Delete").click()
+    page.wait_for_url("**/jobs")
+    expect(page.locator("#note")).to_contain_text("No jobs yet")
 
 
-def test_every_member_of_a_problem_is_shown(visit: Visit, service: str, files: Files) -> None:
+def test_every_member_of_a_problem_is_shown(visit: Visit, filled: str) -> None:
     page = visit.page
-    register(service, upload(service, files[:2]))
-    open_page(page, service)
+    open_page(page, filled)
     choose_scene(page)
     page.locator("#objects input").check()
     click_at(page, CHAIR)
@@ -60,7 +64,7 @@ def test_every_member_of_a_problem_is_shown(visit: Visit, service: str, files: F
     faults = "options.robust: min_scale 2 is larger than max_scale 1. seed: must not be negative."
     expect(page.locator(".run .bad")).to_have_text(f"An option is wrong. {faults} See the table.")
     page.unroute("**/register")
-    page.goto(f"{service}/jobs")
+    page.goto(f"{filled}/jobs")
     page.get_by_role("button", name="Run again").click()
     page.get_by_label(re.compile("^Min. scale")).fill("2")
     page.get_by_label("Max. scale").fill("1")
@@ -75,7 +79,6 @@ def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(visit: Visit, 
     page.get_by_role("button", name="Delete").click()
     expect(page.locator("dialog[open]")).to_contain_text("in room.ply”?")
     expect(page.get_by_role("button", name="Keep")).to_be_focused()
-    assert in_both_themes(page) == NONE
     page.keyboard.press("Escape")
     expect(page.locator("dialog")).to_have_count(2)  # those of the page itself
     expect(page.get_by_role("button", name="Delete")).to_be_focused()
@@ -89,34 +92,25 @@ def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(visit: Visit, 
     expect(page.locator(".tile h2").nth(1)).to_be_focused()
 
 
-def test_a_field_is_called_what_its_file_is_called_now(
+def test_a_field_is_called_what_its_file_is_called_now_and_has_the_size_of_its_surface(
     visit: Visit, service: str, files: Files, tmp_path: Path
 ) -> None:
     page = visit.page
-    upload = {"file": {"name": "x", "mimeType": "application/octet-stream", "buffer": files[1].read_bytes()}}
+    upload = {"file": {"name": "x", "mimeType": "application/octet-stream", "buffer": files[2].read_bytes()}}
     page.request.post(f"{service}/fields", multipart={"description": '{"as": "object"}', **upload})
-    mine = tmp_path / "my chair.glb"
-    mine.write_bytes(files[1].read_bytes())
+    mine = tmp_path / "my stool.glb"
+    mine.write_bytes(files[2].read_bytes())
     open_page(page, service)
     page.set_input_files("#object-file", mine)
-    expect(page.locator("#objects")).to_contain_text("my chair.glb")
+    expect(page.locator("#objects")).to_contain_text("my stool.glb")
+    expect(page.locator("#objects input:checked")).to_have_count(1)
     page.goto(f"{service}/fields")
-    expect(page.locator(".tile h2")).to_have_text("my chair.glb")
-
-
-def test_the_page_of_a_job_leads_on(visit: Visit, filled: str) -> None:
-    page = visit.page
-    page.goto(f"{filled}/jobs")
-    page.get_by_role("link", name="Open").click()
-    expect(page.locator("#verdict-word")).to_have_text("Registered")
-    expect(page.locator("header nav a")).to_have_text(["Register", "Library", "Jobs", "Fields", "API"])
-    page.get_by_role("button", name="Run again").click()
-    expect(page.locator("#again-start")).to_be_enabled()
-    page.get_by_role("button", name="Close").click()
-    page.get_by_role("button", name="Delete").click()
-    page.locator("dialog[open]").get_by_role("button", name="Delete").click()
-    page.wait_for_url("**/jobs")
-    expect(page.locator("#note")).to_contain_text("No jobs yet")
+    expect(page.locator(".tile h2")).to_have_text("my stool.glb")
+    expect(page.locator(".tile")).to_contain_text("0.4 × 0.3 × 0.5")
+    page.get_by_role("link", name="Add to library").click()
+    expect(page.locator("#entry-name")).to_have_value("my stool")
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator(".tile")).to_contain_text("0.4 × 0.3 × 0.5")
 
 
 def test_rooms_are_no_candidates_unless_a_person_says_so(visit: Visit, service: str, files: Files) -> None:
@@ -133,18 +127,6 @@ def test_rooms_are_no_candidates_unless_a_person_says_so(visit: Visit, service: 
     expect(page.locator("#objects .check")).to_have_text(["chair.glb"])
     groups = page.locator("#scene-known optgroup")
     assert [groups.nth(i).get_attribute("label") for i in range(groups.count())] == ["Scenes", "Objects"]
-
-
-def test_sizes_are_those_of_the_surface(visit: Visit, service: str, files: Files) -> None:
-    page = visit.page
-    open_page(page, service)
-    page.set_input_files("#object-file", files[2])
-    expect(page.locator("#objects input:checked")).to_have_count(1)
-    page.goto(f"{service}/fields")
-    expect(page.locator(".tile")).to_contain_text("0.4 × 0.3 × 0.5")
-    page.get_by_role("link", name="Add to library").click()
-    page.get_by_role("button", name="Save").click()
-    expect(page.locator(".tile")).to_contain_text("0.4 × 0.3 × 0.5")
 
 
 def test_several_files_become_entries_and_leaving_meanwhile_is_asked_about(
@@ -190,31 +172,22 @@ def test_the_result_lies_over_the_scene_and_nothing_scrolls_but_the_panel(
     page = visit.page
     open_page(page, service)
     page.locator("#options > summary").click()
-    expect(page.locator("#options-form input[placeholder]")).not_to_have_count(0)
+    page.locator("#options-form details summary").click()
+    rows = page.locator("#options-form input[placeholder]")
+    expect(rows).not_to_have_count(0)
+    shown = [str(one.get_attribute("placeholder")).replace(",", "") for one in rows.all()]
+    defaults = [one.default for one in fields_of(RobustOptions) if not isinstance(one.default, bool | str)]
+    assert sorted(shown) == sorted("not known" if usual is None else f"{usual:g}" for usual in defaults)
     give_files(page, files[:2])
     click_at(page, CHAIR)
     page.click("#register")
     page.wait_for_selector(".run[data-verdict]")
-    stage, results = page.locator("#stage").bounding_box(), page.locator("#results").bounding_box()
-    assert stage is not None
-    assert results is not None
+    stage, results = box_of(page, "#stage"), box_of(page, "#results")
     assert results["x"] >= stage["x"]
     assert results["x"] + results["width"] <= stage["x"] + stage["width"]
     assert results["y"] + results["height"] <= 800
     assert page.evaluate("document.scrollingElement.scrollHeight") <= 800
     assert in_both_themes(page) == NONE
-
-
-def test_options_are_those_of_the_contract(visit: Visit, service: str) -> None:
-    page = visit.page
-    open_page(page, service)
-    page.locator("#options > summary").click()
-    page.locator("#options-form details summary").click()
-    rows = page.locator("#options-form input[placeholder]")
-    expect(rows).not_to_have_count(0)
-    shown = [str(rows.nth(i).get_attribute("placeholder")).replace(",", "") for i in range(rows.count())]
-    defaults = [one.default for one in fields_of(RobustOptions) if not isinstance(one.default, bool | str)]
-    assert sorted(shown) == sorted("not known" if usual is None else f"{usual:g}" for usual in defaults)
 
 
 CROWDED = """() => {
@@ -235,8 +208,7 @@ CROWDED = """() => {
 }"""
 
 
-@pytest.mark.parametrize("width", [390, 1280])
-def test_buttons_have_gaps_and_no_choice_is_cut(visit: Visit, filled: str, width: int) -> None:
+def test_buttons_have_gaps_and_no_choice_is_cut(visit: Visit, filled: str) -> None:
     page = visit.page
     open_page(page, filled)
     choose_scene(page)
@@ -244,44 +216,45 @@ def test_buttons_have_gaps_and_no_choice_is_cut(visit: Visit, filled: str, width
     click_at(page, CHAIR)
     page.click("#register")
     page.wait_for_selector(".run[data-verdict]")
-    page.set_viewport_size({"width": width, "height": 800})
     page.locator("#options > summary").click()
-    clear = {"touching": [], "cut": []}
-    looks = {"home": page.evaluate(CROWDED)}
-    for place in ("jobs", "fields", "library", "docs"):
+
+    def look(place: str) -> None:
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 800})
+            seen = page.evaluate(CROWDED)
+            assert seen.pop("wide") <= 0, (place, width)
+            assert seen == {"touching": [], "cut": []}, (place, width)
+
+    look("home")
+    for place in ("fields", "library", "docs", "jobs"):
         open_page(page, f"{filled}/{place}")
-        looks[place] = page.evaluate(CROWDED)
         expect(page.locator("header nav a")).to_have_count(5)
-    page.goto(f"{filled}/jobs")
+        look(place)
     page.get_by_role("button", name="Run again").first.click()
     expect(page.locator("#again-start")).to_be_enabled()
-    looks["again"] = page.evaluate(CROWDED)
-    for place, look in looks.items():
-        assert look.pop("wide") <= 0, place
-        assert look == clear, place
+    look("again")
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
-@pytest.mark.parametrize(("on_paper", "alpha"), [(True, 0), (False, 255)])
-def test_the_paper_of_a_picture_is_left_out(visit: Visit, service: str, on_paper: bool, alpha: int) -> None:
+PAPER = """async (onPaper) => {
+  const { canvasOf } = await import('/static/js/pictures.js');
+  const drawn = new OffscreenCanvas(60, 20);
+  const pencil = drawn.getContext('2d');
+  pencil.fillStyle = 'rgb(248 248 247)';
+  pencil.fillRect(0, 0, 60, 20);
+  pencil.fillStyle = 'rgb(200 205 210)';
+  pencil.fillRect(5, 5, 5, 5);
+  const canvas = await canvasOf(await drawn.convertToBlob(), 'a thing', null, onPaper);
+  const at = (x, y) => [...canvas.getContext('2d').getImageData(x, y, 1, 1).data];
+  return [at(1, 1)[3], at(7, 7)];
+}"""
+
+
+def test_the_paper_of_a_picture_is_left_out(visit: Visit, service: str) -> None:
     """White paper would be a white box on a dark page; a rendered picture stays whole."""
     visit.page.goto(f"{service}/fields")
-    found = visit.page.evaluate(
-        """async (onPaper) => {
-          const { canvasOf } = await import('/static/js/pictures.js');
-          const drawn = new OffscreenCanvas(60, 20);
-          const pencil = drawn.getContext('2d');
-          pencil.fillStyle = 'rgb(248 248 247)';
-          pencil.fillRect(0, 0, 60, 20);
-          pencil.fillStyle = 'rgb(200 205 210)';
-          pencil.fillRect(5, 5, 5, 5);
-          const canvas = await canvasOf(await drawn.convertToBlob(), 'a thing', null, onPaper);
-          const at = (x, y) => [...canvas.getContext('2d').getImageData(x, y, 1, 1).data];
-          return [at(1, 1)[3], at(7, 7)];
-        }""",
-        on_paper,
-    )
-    assert found == [alpha, [200, 205, 210, 255]]
+    for on_paper, alpha in ((True, 0), (False, 255)):
+        assert visit.page.evaluate(PAPER, on_paper) == [alpha, [200, 205, 210, 255]]
 
 
 @pytest.fixture
@@ -296,8 +269,7 @@ def test_handles_leave_the_thing_in_sight_on_a_phone(visit: Visit, service: str,
     give_files(page, files[:2])
     click_at(page, CHAIR)
     expect(page.locator("#boxes li")).to_have_count(1)
-    view = page.locator("#canvas").bounding_box()
-    assert view is not None
+    view = box_of(page)
     at = [view["x"] + CHAIR[0] * view["width"], view["y"] + CHAIR[1] * view["height"]]
     assert page.evaluate("([x, y]) => document.elementFromPoint(x, y).id", at) == "canvas"
     boxes = [one.bounding_box() for one in page.locator(".handle:visible").all()]
@@ -305,3 +277,57 @@ def test_handles_leave_the_thing_in_sight_on_a_phone(visit: Visit, service: str,
     centers = [(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2) for box in boxes if box is not None]
     near = [(a, b) for i, a in enumerate(centers) for b in centers[:i] if abs(a[0] - b[0]) + abs(a[1] - b[1]) < 24]
     assert near == []
+
+
+# the library
+
+
+def test_an_object_from_its_file_to_the_library_and_out_again(visit: Visit, service: str, files: Files) -> None:
+    page = visit.page
+    open_page(page, f"{service}/library")
+    expect(page.locator("#note")).to_have_text(re.compile("Nothing in the library yet"))
+    page.get_by_role("button", name="Add objects").click()
+    page.set_input_files("#entry-file", files[1])
+    expect(page.locator("#entry-name")).to_have_value("chair")
+    page.fill("#entry-tags", "seat, oak")
+    page.select_option("#entry-unit", "m")
+    page.select_option("#entry-symmetry", "turns")
+    page.fill("#entry-order", "4")
+    assert in_both_themes(page) == NONE
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator(".tile h2")).to_have_text("chair")
+    expect(page.locator(".tile")).to_contain_text("4 turns about 0, 0, 1 (as said)")
+    page.get_by_role("button", name="Edit chair").click()
+    expect(page.locator("#entry-tags")).to_have_value("oak, seat")
+    page.fill("#entry-name", "a/b")
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator("#entry-state .bad")).to_contain_text("1 to 64 characters")
+    page.fill("#entry-name", "armchair")
+    page.select_option("#entry-symmetry", "detected")
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator(".tile h2")).to_have_text("armchair")
+    expect(page.locator(".tile")).not_to_contain_text("as said")
+    page.get_by_role("button", name="Show the tag seat").click()
+    expect(page.locator("#tag")).to_have_value("seat")
+    page.locator("#search").fill("table")
+    expect(page.locator(".tile")).to_have_count(0)
+    page.locator("#search").fill("")
+    page.get_by_role("link", name="Search for this").click()
+    page.wait_for_selector("html[data-page=ready]")
+    expect(page.locator("#objects label", has_text="armchair").locator("input")).to_be_checked()
+    page.goto(f"{service}/?tag=seat")
+    expect(page.locator("#objects input:checked")).to_have_count(1)
+    page.goto(f"{service}/fields")
+    page.get_by_role("button", name="Delete armchair").click()
+    page.locator("dialog[open]").get_by_role("button", name="Delete").click()
+    expect(page.locator("dialog[open]")).to_contain_text("library")  # and stays to say so
+    page.get_by_role("button", name="Close").click()
+    page.goto(f"{service}/library")
+    page.get_by_role("button", name="Remove armchair").click()
+    page.locator("dialog[open]").get_by_role("button", name="Remove").click()
+    expect(page.locator(".tile")).to_have_count(0)
+    page.goto(f"{service}/fields")
+    page.get_by_role("link", name="Add to library").click()
+    expect(page.locator("#entry-name")).to_have_value("chair")
+    assert [one for one in visit.complaints if not one.startswith(NETWORK)] == []
+    assert [url for url in visit.requests if not url.startswith((service + "/", "blob:"))] == []

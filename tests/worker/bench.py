@@ -79,7 +79,7 @@ class Bench:
             now = self.context.records.now()
             self.context.records.create_field(FieldRecord(sha256, "validating", 1, now, now))
             self.context.blobs.put(f"fields/{sha256}/field.safetensors", sha256[:1].encode())
-            self.context.records.update_field(sha256, state="ready")
+            self.context.records.update_field(sha256, state="ready", views="none")
 
     def submit(self, do: str, job_id: str = "j1", owner: str = ANONYMOUS, **changes: object) -> JobRecord:
         """Record and queue a job whose engine shall do this."""
@@ -121,11 +121,7 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
         values = Settings(**given)  # type: ignore[arg-type]
-        stores = (
-            RecordStore(redis),
-            LocalBlobStore(values.blob_dir),
-            JobQueue(redis, reserve_s=values.worker_reserve_s),
-        )
+        stores = (RecordStore(redis), LocalBlobStore(values.blob_dir), JobQueue(redis))
         made = Bench(Context(values, *stores), redis, folder, environment, given)
         try:
             yield made

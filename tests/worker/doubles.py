@@ -34,6 +34,11 @@ def job(context: Context) -> JobRecord:
     return record
 
 
+def ending(context: Context) -> tuple[str, str | None]:
+    """The job's status, and the reason of its error."""
+    return job(context).status, (job(context).error or {}).get("reason")
+
+
 def begin_import(context: Context, data: bytes = b"f") -> None:
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))

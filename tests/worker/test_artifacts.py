@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from regnf_state.manifest import Artifact, Manifest, read_manifest
-from regnf_worker.settle import discard_others, publish, store_artifacts, told_by_result
+from regnf_worker.artifacts import discard_others, publish, store_artifacts, told_by_result
 from tests.stores import HeldBlobs
 
 

@@ -5,11 +5,11 @@ import pytest
 from regnf_core.errors import CancelledError
 from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.records import FieldRecord
+from regnf_worker.artifacts import publish
 from regnf_worker.attempt import Heartbeat, run_attempt
 from regnf_worker.models import Context
-from regnf_worker.settle import publish
 from tests.stores import ShiftedRecords, WatchedQueue
-from tests.worker.doubles import SHA, accept, job
+from tests.worker.doubles import SHA, accept, ending, job
 from tests.worker.tiny_engine import TinyEngine
 
 
@@ -46,16 +46,13 @@ def test_a_deleted_field_is_told(context: Context) -> None:
     accept(context)
     context.records.delete_field(SHA)
     run_attempt(context, "j1", 1, "w", TinyEngine)
-    error = job(context).error
-    assert error is not None
-    assert error["reason"] == "FIELD_NOT_FOUND"
+    assert ending(context) == ("failed", "FIELD_NOT_FOUND")
 
 
-def test_fields_that_are_still_imported_send_the_job_back(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fields_that_are_still_imported_send_the_job_back(context: Context) -> None:
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
     accept(context)
-    monkeypatch.setattr("regnf_worker.attempt._WAIT_BEFORE_GIVING_BACK_S", 0.0)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
     assert isinstance(context.queue, WatchedQueue)
@@ -69,9 +66,7 @@ def test_a_field_that_is_never_imported_fails_the_job_at_last(context: Context) 
     assert isinstance(context.records, ShiftedRecords)
     context.records.ahead_s += 2 * (120 + 90) + 1
     run_attempt(context, "j1", 1, "w", TinyEngine)
-    error = job(context).error
-    assert error is not None
-    assert error["reason"] == "FIELD_IMPORT_TIMEOUT"
+    assert ending(context) == ("failed", "FIELD_IMPORT_TIMEOUT")
 
 
 def test_progress_is_written_a_few_times_a_second_but_every_phase(context: Context) -> None:

@@ -68,15 +68,22 @@ def test_a_drawing_that_kills_its_process_is_given_up(undrawn: Context) -> None:
     assert field(undrawn).views == "none"
 
 
-def test_a_field_deleted_while_it_is_drawn_leaves_nothing(undrawn: Context) -> None:
-    def deletes(_: Path) -> FieldViews:
+@pytest.mark.parametrize("opened", [True, False])
+def test_a_field_deleted_while_it_is_drawn_leaves_nothing(undrawn: Context, opened: bool) -> None:
+    def deletes(path: Path) -> FieldViews:
         undrawn.records.delete_field(SHA)
         undrawn.blobs.delete_prefix(f"fields/{SHA}")
-        return VIEWS
+        return VIEWS if opened else FieldViews(path.read_bytes())
 
     draw_field(undrawn, SHA, deletes)
     assert list(undrawn.blobs.list("")) == []
     assert undrawn.records.undrawn_fields() == []
+
+
+def test_a_field_whose_file_alone_is_lost_is_a_fault(undrawn: Context) -> None:
+    undrawn.blobs.delete(f"fields/{SHA}/field.safetensors")
+    with pytest.raises(FileNotFoundError):
+        draw_field(undrawn, SHA, lambda path: FieldViews(path.read_bytes()))
 
 
 def test_a_field_imported_anew_keeps_nothing_of_the_drawing_before(undrawn: Context) -> None:
@@ -106,7 +113,7 @@ def test_of_undrawn_fields_the_one_asked_for_last_is_first(undrawn: Context) -> 
 
 @pytest.fixture
 def table(tmp_path: Path) -> Iterator[Bench]:
-    with bench(tmp_path, shutdown_grace_s=0, job_niceness=0) as made:
+    with bench(tmp_path, shutdown_grace_s=0) as made:
         made.add_ready_fields()
         yield made
 
@@ -145,14 +152,13 @@ def test_jobs_run_while_a_field_is_drawn(table: Bench) -> None:
     eventually(lambda: not children_of(worker.pid), "no zombie")
 
 
-@pytest.mark.parametrize(("job_niceness", "more"), [(0, 0), (10, 3)])
-def test_a_drawing_gives_way_to_jobs(table: Bench, job_niceness: int, more: int) -> None:
-    worker = table.start_worker(job_niceness=job_niceness)
+def test_a_drawing_gives_way_to_jobs(table: Bench) -> None:
+    worker = table.start_worker()
     upload(table)
     eventually(lambda: begun(table), table.log)
     (drawing,) = children_of(worker.pid)
     own = os.getpriority(os.PRIO_PROCESS, worker.pid)
-    assert os.getpriority(os.PRIO_PROCESS, drawing) == own + more
+    assert os.getpriority(os.PRIO_PROCESS, drawing) == own + 3
 
 
 def test_a_drawing_ends_with_its_worker_and_another_one_draws(table: Bench) -> None:

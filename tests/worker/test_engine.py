@@ -11,7 +11,7 @@ import pytest
 
 from regnf_core.field_notes import FieldNotes
 from regnf_core.options import RegistrationOptions
-from regnf_worker.engine import Candidate, CoreEngine
+from regnf_worker.engine import Candidate, Engine
 from tests.requests import registration_request
 
 START = [[0.0, -2.0, 0.0, 0.5], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
@@ -23,7 +23,7 @@ def test_the_request_reaches_the_engine(
 ) -> None:
     calls: list[Any] = []
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
-    monkeypatch.setattr("regnf_core.library.register", lambda *given, clouds: calls.append((*given, clouds)))
+    monkeypatch.setattr("regnf_core.library.register", lambda *given: calls.append(given))
     written: list[Any] = []
 
     def write_result(result: Any, folder: Path, **said: Any) -> list[str]:
@@ -35,14 +35,14 @@ def test_the_request_reaches_the_engine(
     request = registration_request("a" * 64, "b" * 64, options=RegistrationOptions(), **asked)
     files = Path("scene"), Path("object")
     notes = {"scene": FieldNotes("neus", None, ("SIGN_UNCERTAIN: perhaps",))}
-    made = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
-    ((scene, obj, box, options, seed, _, warm, clouds),) = calls
-    assert (scene, obj, seed, warm.object_model, clouds) == ("scene", "object", 3, "the model", False)
+    made = Engine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
+    ((scene, obj, box, options, seed, _, initial, model, clouds),) = calls
+    assert (scene, obj, seed, model, clouds) == ("scene", "object", 3, "the model", False)
     assert (made.names, "preview.png" in made.to_come) == (["result.json"], pictures)
     assert written == [{"scene": notes["scene"], "object": FieldNotes()}]
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
-    assert (None if warm.T_object_scene is None else warm.T_object_scene.matrix().tolist()) == start
+    assert (None if initial is None else initial.matrix().tolist()) == start
 
 
 @pytest.mark.parametrize("pictures", [True, False])
@@ -60,7 +60,7 @@ def test_a_search_makes_clouds_for_its_pictures_alone(
     monkeypatch.setattr("regnf_core.viewing.artifacts.write_pictures", lambda result, _: list(result))
     request = registration_request("a" * 64, None, options=RegistrationOptions(), pictures=pictures)
     several = [Candidate(sha256 * 64, partial(Path, sha256), "a model") for sha256 in "bc"]
-    made = CoreEngine("cpu").search(Path("scene"), several, request, lambda phase, share: None, tmp_path, {})
+    made = Engine("cpu").search(Path("scene"), several, request, lambda phase, share: None, tmp_path, {})
     assert calls == [{"clouds": False}]
     assert (made.names, bool(made.to_come)) == (["result.json"], pictures)
     if pictures:
@@ -71,7 +71,7 @@ def test_workers_share_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> N
     shares: list[float] = []
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.set_per_process_memory_fraction", shares.append)
-    assert CoreEngine.on("auto", 4) == CoreEngine("cuda")
-    assert CoreEngine.on("cuda", 1) == CoreEngine("cuda")
-    assert CoreEngine.on("cpu", 4) == CoreEngine("cpu")
+    assert Engine.on("auto", 4) == Engine("cuda")
+    assert Engine.on("cuda", 1) == Engine("cuda")
+    assert Engine.on("cpu", 4) == Engine("cpu")
     assert shares == [0.25]

@@ -28,9 +28,9 @@ def table(tmp_path: Path) -> Iterator[Bench]:
 @pytest.mark.parametrize(
     ("do", "reason", "limit"),
     [
-        ("fill_memory", "JOB_MEMORY_LIMIT", "job_memory_bytes"),
-        ("fill_shared_memory", "JOB_MEMORY_LIMIT", "job_memory_bytes"),
-        ("fill_memory_and_abort", "JOB_MEMORY_LIMIT", "job_memory_bytes"),
+        ("fill_memory", "OUT_OF_MEMORY", "job_memory_bytes"),
+        ("fill_shared_memory", "OUT_OF_MEMORY", "job_memory_bytes"),
+        ("fill_memory_and_abort", "OUT_OF_MEMORY", "job_memory_bytes"),
         ("fill_disk", "JOB_DISK_LIMIT", "job_scratch_bytes"),
         ("write_one_large_file", "JOB_DISK_LIMIT", "job_scratch_bytes"),
     ],

@@ -84,12 +84,9 @@ def test_settings_reach_the_import_under_their_own_name_and_go_with_the_upload(c
     uploaded_with_settings(context)
     seen: list[Any] = []
 
-    def importer(
-        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
-    ) -> dict[str, Any]:
-        assert settings is not None
-        seen.append((description, settings.name, settings.read_bytes()))
-        return tiny_importer(upload, folder, description, settings)
+    def importer(*given: Any) -> dict[str, Any]:
+        seen.append((given[2], given[3].name, given[3].read_bytes()))
+        return tiny_importer(*given)
 
     run_import_attempt(context, SHA, 1, "w", importer)
     assert seen == [({"sign": -1}, "config.yml", CONFIG)]

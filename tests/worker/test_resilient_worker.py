@@ -30,14 +30,9 @@ def offline_worker() -> ResilientWorker:
     return ResilientWorker(["q"], connection=Redis(), prepare_for_work=False)
 
 
-class Named:
-    id = "j1-1"
-
-
 TRIED: list[tuple[str, tuple[Any, ...]]] = [
     ("subscribe", ()),
     ("check_for_suspension", (False,)),
-    ("prepare_job_execution", (Named, False)),
 ]
 LEFT_UNDONE: list[tuple[str, tuple[Any, ...]]] = [
     ("set_state", ("idle", None)),
@@ -89,7 +84,7 @@ def test_what_need_not_be_is_left_undone(
 def test_sweeping_may_be_left_undone(monkeypatch: pytest.MonkeyPatch, waits: list[float], error: Exception) -> None:
     refusals = Refusals(1, error)
     worker = offline_worker()
-    monkeypatch.setattr(worker, "clean_registries", refusals)
+    monkeypatch.setattr(worker, "_sweep_entries", refusals)
     worker.run_maintenance_tasks()
     assert (len(refusals.calls), waits) == (1, [])
 
@@ -101,36 +96,9 @@ def test_a_sign_of_life_waits_unless_a_child_runs(
     worker = offline_worker()
     worker._horse_pid = horse
     refusals = Refusals(3)
-    monkeypatch.setattr(worker, "_report_now", refusals)
+    monkeypatch.setattr(worker, "_report", refusals)
     worker.heartbeat()
     assert len(refusals.calls) == tries
-
-
-def test_a_job_is_taken_up_before_its_child_starts(monkeypatch: pytest.MonkeyPatch, waits: list[float]) -> None:
-    refusals = Refusals(3)
-    fake(monkeypatch, "prepare_execution", refusals)
-    offline_worker().begin_job(Named)
-    assert [call[1:] for call in refusals.calls] == [(Named,)] * 4
-    assert len(waits) == 3
-
-
-@pytest.mark.parametrize("error", [FULL, LASTING], ids=["full", "wrong"])
-def test_no_refusal_keeps_the_worker_from_looking_after_its_child(
-    monkeypatch: pytest.MonkeyPatch, waits: list[float], error: Exception
-) -> None:
-    refusals = Refusals(1, error)
-    fake(monkeypatch, "maintain_heartbeats", refusals)
-    offline_worker().report_running(Named)
-    assert [call[1:] for call in refusals.calls] == [(Named,)]
-    assert waits == []
-
-
-def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch) -> None:
-    worker = offline_worker()
-    refusals = Refusals(1)
-    monkeypatch.setattr(worker.connection, "execute_command", refusals)
-    worker.set_shutdown_requested_date()
-    assert refusals.calls == []
 
 
 # the loop, over a real Redis of which every command in turn is refused
@@ -139,10 +107,9 @@ def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch)
 class ChildlessWorker(RegnfWorker):
     """Does what a worker does around a job, and notes the job instead of forking for it."""
 
-    def _run_child(self, job: Any, queue: Any, *_: Any) -> int | None:
-        self.prepare_job_execution(job)
+    def _run_child(self, job: Any, *_: Any) -> kernel.Exit | None:
         done.append(job.id)
-        self.report_running(job)
+        self._if_possible("a sign of life", lambda: self.maintain_heartbeats(job))
         return kernel.Exit(signal.SIGKILL)
 
     def _settle(self, *_: object) -> None:

@@ -11,10 +11,12 @@ from typing import Any
 import pytest
 
 from regnf_state.manifest import Manifest, Rest, read_manifest
+from regnf_worker.artifacts import publish
 from regnf_worker.attempt import run_attempt
 from regnf_worker.engine import Made
 from regnf_worker.models import Context
-from regnf_worker.settle import ChildExit, publish, publish_rest, settle_registration
+from regnf_worker.pictures import publish_rest
+from regnf_worker.settle import ChildExit, settle_registration
 from tests.processes import alive, children_of
 from tests.worker.bench import Bench, bench, eventually, kill
 from tests.worker.doubles import accept, job

@@ -7,9 +7,12 @@ from typing import Any
 import pytest
 from redis import Redis
 from redis.exceptions import RedisError
+from rq import Queue
 from rq.exceptions import StopRequested
 
-from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.queue import Work
+from regnf_state.records import FieldRecord
+from regnf_state.redis.queue import made
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.attempt import run_attempt
@@ -18,21 +21,9 @@ from regnf_worker.kernel import Scratch
 from regnf_worker.models import Context
 from regnf_worker.process import RegnfWorker
 from regnf_worker.resilient_worker import MAX_WAIT_S, passes, retry_until_available
-from tests.requests import request_record
-from tests.worker.doubles import context_over
+from tests.worker.doubles import SHA, accept, context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
-
-SHA = "a" * 64
-
-
-def accept(context: Context, do: str = "succeed") -> None:
-    now = context.records.now()
-    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
-    context.blobs.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = request_record(SHA, SHA, do)
-    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
-
 
 # waiting
 
@@ -88,14 +79,9 @@ def worker(tmp_path: Path, any_redis: Redis, redis: RefusingRedis, monkeypatch: 
     return RegnfWorker(context, Scratch(tmp_path / "scratch"))
 
 
-class TakenJob:
-    id = "j1-1"
-    args = ("j1",)
-    timeout = 1
-
-
-class JobsQueue:
-    name = "regnf"
+def execute(worker: RegnfWorker) -> None:
+    work = Work("registration", "j1", 1)
+    worker.execute_job(made(work, worker.connection), Queue(work.queue_name, connection=worker.connection))
 
 
 def test_a_job_taken_but_not_begun_is_left_to_the_reaper(worker: RegnfWorker, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +90,7 @@ def test_a_job_taken_but_not_begun_is_left_to_the_reaper(worker: RegnfWorker, mo
     monkeypatch.setattr("rq.worker.base.BaseWorker.prepare_execution", lambda *_: Refusals(9)())
     worker._stop_requested = True
     with pytest.raises(StopRequested):
-        worker.execute_job(TakenJob, JobsQueue)
+        execute(worker)
     assert worker._context.records.get_job("j1") == before
 
 
@@ -114,10 +100,9 @@ def test_a_job_is_settled_once_redis_takes_it(
     """The child died because Redis was full, and Redis is still full when its parent wants to say so."""
     accept(worker._context)
     refuse(monkeypatch, worker._context, "update_job", 3)
-    for name in ("begin_job", "finish_job"):
-        monkeypatch.setattr(worker, name, lambda *_: None)
+    worker.register_birth()
     monkeypatch.setattr(worker, "_run_child", lambda *_: kernel.Exit(status=None))
-    worker.execute_job(TakenJob, JobsQueue)
+    execute(worker)
     again = worker._context.records.get_job("j1")
     assert again is not None
     assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)
@@ -168,12 +153,10 @@ def test_an_import_waits_for_redis_and_rejects_nothing_for_it(
     context.blobs.put(f"fields/{SHA}/original", data)
     refuse(monkeypatch, context, name, 2)
 
-    def importer(
-        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
-    ) -> dict[str, Any]:
-        if upload.read_bytes() == b"raise":
+    def importer(*given: Any) -> dict[str, Any]:
+        if given[0].read_bytes() == b"raise":
             raise ValueError("no field")
-        return tiny_importer(upload, folder, description, settings)
+        return tiny_importer(*given)
 
     run_import_attempt(context, SHA, 1, "w", importer)
     field = context.records.get_field(SHA)

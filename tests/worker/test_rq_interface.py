@@ -22,25 +22,20 @@ OVERRIDDEN = {
     "dequeue_job_and_maintain_ttl": "(self, timeout: 'int | None', max_idle_time: 'int | None' = None)"
     " -> 'tuple[Job, Queue] | None'",
     "execute_job": "(self, job: 'Job', queue: 'Queue')",
-    "clean_registries": "(self)",
     "handle_payload": "(self, message)",
-    "main_work_horse": "(self, job: 'Job', queue: 'Queue')",
     "heartbeat": "(self, timeout: 'int | None' = None, pipeline: 'Pipeline | None' = None)",
-    "prepare_job_execution": "(self, job: 'Job', remove_from_intermediate_queue: 'bool' = False) -> 'None'",
     "register_birth": "(self)",
-    "request_force_stop": "(self, signum: 'int', frame: 'FrameType | None')",
     "request_stop": "(self, signum, frame)",
     "run_maintenance_tasks": "(self)",
-    "set_shutdown_requested_date": "(self)",
     "set_state": "(self, state: 'str', pipeline: 'Pipeline | None' = None)",
     "subscribe": "(self)",
     "teardown": "(self)",
 }
 CALLED = {
     "cleanup_execution": "(self, job: 'Job', pipeline: 'Pipeline')",
-    "kill_horse": "(self, sig: 'signal.Signals' = <Signals.SIGKILL: 9>)",
     "maintain_heartbeats": "(self, job: 'Job')",
     "prepare_execution": "(self, job: 'Job') -> 'Execution'",
+    "prepare_job_execution": "(self, job: 'Job', remove_from_intermediate_queue: 'bool' = False) -> 'None'",
     "serialize": "(self) -> 'dict'",
     "setup_work_horse_signals": "(self)",
 }

@@ -3,9 +3,10 @@
 import pytest
 
 from regnf_state.manifest import Manifest
+from regnf_worker.artifacts import publish
 from regnf_worker.models import Context
-from regnf_worker.settle import ChildExit, publish, settle_import, settle_registration
-from tests.worker.doubles import SHA, accept, begin_import, field, job
+from regnf_worker.settle import ChildExit, settle_import, settle_registration
+from tests.worker.doubles import SHA, accept, begin_import, ending, field, job
 
 
 @pytest.mark.parametrize(
@@ -27,9 +28,7 @@ def test_how_a_process_ended_is_how_its_job_failed(
         context.records.update_job("j1", 1, status="running", worker="w")
     context.blobs.put("jobs/j1/1/half", b".")
     settle_registration(context, "j1", 1, "w", end)
-    error = job(context).error
-    assert error is not None
-    assert (job(context).status, error["reason"]) == ("failed", reason)
+    assert ending(context) == ("failed", reason)
     assert list(context.blobs.list("jobs")) == []
 
 
@@ -46,10 +45,8 @@ def test_a_process_that_vanishes_is_given_a_second_chance_and_no_third(
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 1)
     assert context.queue.holds_registration("j1", 2)
     settle_registration(context, "j1", 2, "w", end)
-    error = job(context).error
-    assert error is not None
-    assert (job(context).status, error["reason"]) == ("failed", reason)
-    assert reason == "WORKER_LOST" or "request" not in error["detail"], "no request failed here"
+    assert ending(context) == ("failed", reason)
+    assert reason == "WORKER_LOST" or "request" not in (job(context).error or {})["detail"], "no request failed here"
     assert list(context.blobs.list("jobs")) == []
 
 
@@ -60,20 +57,16 @@ def test_somebody_elses_job_is_left_alone(context: Context) -> None:
     assert job(context) == running
 
 
-def test_a_killed_process_whose_result_stands_has_succeeded(context: Context) -> None:
+@pytest.mark.parametrize("status", ["successful", "dismissed"])
+def test_a_killed_process_whose_result_stands_or_whose_job_was_cancelled(context: Context, status: str) -> None:
     accept(context)
     context.records.update_job("j1", 1, status="running", worker="w")
-    publish(context.blobs, Manifest("j1", 1, ()))
+    if status == "successful":
+        publish(context.blobs, Manifest("j1", 1, ()))
+    else:
+        context.records.request_cancel("j1")
     settle_registration(context, "j1", 1, "w", ChildExit(signal=9))
-    assert job(context).status == "successful"
-
-
-def test_a_killed_process_whose_job_was_cancelled(context: Context) -> None:
-    accept(context)
-    context.records.update_job("j1", 1, status="running", worker="w")
-    context.records.request_cancel("j1")
-    settle_registration(context, "j1", 1, "w", ChildExit(signal=9))
-    assert job(context).status == "dismissed"
+    assert job(context).status == status
 
 
 @pytest.mark.parametrize(

@@ -30,11 +30,14 @@ from regnf_worker.models import Context
         (ValueError("secret"), "INTERNAL"),
     ],
 )
-def test_faults_have_reasons_and_tell_no_secrets(error: Exception, reason: str) -> None:
-    found = fault(error, "0123")
+def test_faults_have_reasons_and_tell_no_secrets(
+    error: Exception, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = fault(error, "job j1")
     assert found["reason"] == reason
     assert "secret" not in json.dumps(found)
-    assert found.get("incident") == ("0123" if reason == "INTERNAL" else None)
+    assert ("incident" in found) == (reason == "INTERNAL")
+    assert f"job j1 failed, incident {found.get('incident', '')}" in caplog.text
 
 
 def test_refusals_unknown_to_the_table_are_still_problems() -> None:

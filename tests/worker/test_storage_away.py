@@ -10,7 +10,6 @@ from redis import Redis
 
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.blobs.local import LocalBlobWriter
-from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.attempt import run_attempt
@@ -18,12 +17,9 @@ from regnf_worker.imports import run_import_attempt
 from regnf_worker.kernel import Scratch
 from regnf_worker.models import Context
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
-from tests.requests import request_record
 from tests.stores import HeldBlobs
-from tests.worker.doubles import context_over
+from tests.worker.doubles import SHA, accept, begin_import, context_over, ending, field, job
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
-
-SHA = "a" * 64
 
 
 class AwayStore(HeldBlobs):
@@ -49,37 +45,26 @@ def context(tmp_path: Path, any_redis: Redis, store: AwayStore) -> Context:
 
 
 def test_a_job_whose_result_cannot_be_stored_is_run_again(context: Context, store: AwayStore) -> None:
-    now = context.records.now()
-    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
-    store.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = request_record(SHA, SHA)
-    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
+    accept(context)
     store.away = True
     with pytest.raises(StorageUnavailableError):
         run_attempt(context, "j1", 1, "w", TinyEngine)
-    running = context.records.get_job("j1")
-    assert running is not None
-    assert (running.status, running.error) == ("running", None)
+    assert ending(context) == ("running", None)
     store.away = False
     settle_registration(context, "j1", 1, "w", ChildExit())
     run_attempt(context, "j1", 2, "w", TinyEngine)
-    done = context.records.get_job("j1")
-    assert done is not None
-    assert (done.status, done.attempt) == ("successful", 2)
+    assert (job(context).status, job(context).attempt) == ("successful", 2)
 
 
 def test_an_import_whose_field_cannot_be_stored_is_done_again_once(context: Context, store: AwayStore) -> None:
-    now = context.records.now()
-    context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
-    store.put(f"fields/{SHA}/original", b"f")
+    begin_import(context)
     store.away = True
     states = []
     for attempt in (1, 2):
         with pytest.raises(StorageUnavailableError):
             run_import_attempt(context, SHA, attempt, "w", tiny_importer)
         settle_import(context, SHA, attempt, "w", ChildExit())
-        record = context.records.get_field(SHA)
-        assert record is not None
+        record = field(context)
         states.append((record.state, record.attempt, (record.error or {}).get("reason")))
     assert states == [("validating", 2, None), ("rejected", 2, "INTERNAL")]
     assert context.queue.holds_import(SHA, 2)
@@ -104,16 +89,11 @@ class FileLosingEngine(TinyEngine):
 
 
 def test_a_job_whose_files_are_gone_is_run_again(context: Context, store: AwayStore) -> None:
-    now = context.records.now()
-    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
-    store.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = request_record(SHA, SHA)
-    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
+    accept(context)
     with pytest.raises(FileNotFoundError):
         run_attempt(context, "j1", 1, "w", FileLosingEngine)
     settle_registration(context, "j1", 1, "w", ChildExit())
-    again = context.records.get_job("j1")
-    assert again is not None
+    again = job(context)
     assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)
 
 

@@ -23,7 +23,7 @@ def taking(context: Context, any_redis: Redis) -> Taking:
     """A worker's, and a registration that waits."""
     accept(context)
     context.queue.enqueue_registration("j1", 1)
-    return Taking(any_redis, JobQueue(any_redis).fair, None)
+    return Taking(any_redis, JobQueue(any_redis))
 
 
 def import_again(context: Context) -> None:
@@ -63,13 +63,13 @@ def test_an_import_that_ends_meanwhile_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch, context: Context, taking: Taking
 ) -> None:
     import_again(context)
-    park = taking._fair.park
+    park = taking._queue.park
 
     def late(*arguments: object) -> None:
         context.records.update_field(SHA, state="ready")
         park(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(taking._fair, "park", late)
+    monkeypatch.setattr(taking._queue, "park", late)
     assert taking.accept(taken(taking)) is None
     assert taking.accept(taken(taking)) == JOB
 

@@ -71,7 +71,7 @@ def test_the_parent_of_a_worker_told_so_never_loads_torch(table: Bench) -> None:
 
 @pytest.mark.parametrize(
     ("do", "reason", "status"),
-    [("refuse", "NO_SURFACE_IN_DETECTION", 422), ("crash", "INTERNAL", 500), ("exhaust", "JOB_MEMORY_LIMIT", 500)],
+    [("refuse", "NO_SURFACE_IN_DETECTION", 422), ("crash", "INTERNAL", 500), ("exhaust", "OUT_OF_MEMORY", 500)],
 )
 def test_a_job_fails_with_its_reason(table: Bench, do: str, reason: str, status: int) -> None:
     table.start_worker()
@@ -297,9 +297,6 @@ def test_a_search_makes_pictures_where_they_are_wanted(table: Bench, pictures: b
 
 BEGINNINGS = [
     ("os:setpgrp", "OSError"),
-    ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
-    ("regnf_worker.kernel:give_way", "MemoryError"),
-    ("regnf_worker.resilient_worker:hold", "OSError"),
     ("regnf_worker.job_limits:JobLimits.hold_here", "ValueError"),
     ("regnf_worker.kernel:Scratch.use", "OSError"),
     ("random:seed", "KeyboardInterrupt"),

@@ -25,17 +25,18 @@ from regnf_state.manifest import EDITED_FIELD
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker.attempt import run_attempt
-from regnf_worker.engine import Candidate, Made
+from regnf_worker.engine import Candidate, Engine, Made
 from regnf_worker.models import Context
 
 Report = Callable[[str, float], None]
 
 
-class TinyEngine:
+class TinyEngine(Engine):
     """The label is a method's name."""
 
     def __init__(self, attempt: int = 1) -> None:
-        self.attempt = attempt
+        super().__init__("cpu")
+        object.__setattr__(self, "attempt", attempt)
 
     def describe(self) -> dict[str, Any]:
         return {"version": "tiny", "device": "none"}

@@ -21,7 +21,6 @@ from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from regnf_core.field_notes import FieldNotes
-from regnf_core.rendering.request import RenderRequest
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.logs import log_context
 from regnf_state.manifest import Manifest, read_manifest
@@ -30,30 +29,20 @@ from regnf_state.reasons import problem_document
 from regnf_state.records import WARNINGS, FieldRecord, JobRecord, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.registration_request import RegistrationRequest, RenderingRequest, request_of
+from regnf_worker.artifacts import discard, discard_others, keep_edited_field, publish, store_artifacts, told_by_result
 from regnf_worker.engine import Candidate, Engine, Made
 from regnf_worker.job_limits import (
     JobLimits,
     are_files_away,
     fault,
     held_memory_limit,
-    new_incident,
     open_reserve,
     refusal,
     timeout,
 )
-from regnf_worker.kernel import give_way
 from regnf_worker.models import Context, ObjectModels
-from regnf_worker.resilient_worker import let_worker_go, retry_until_available
-from regnf_worker.settle import (
-    Published,
-    discard,
-    discard_others,
-    finish_result,
-    keep_edited_field,
-    publish,
-    store_artifacts,
-    told_by_result,
-)
+from regnf_worker.pictures import Published, finish_result, let_worker_go
+from regnf_worker.resilient_worker import retry_until_available
 
 # What a job repeats of its fields' imports: in its result all of it, in its record the words of the warnings.
 
@@ -161,50 +150,36 @@ class Heartbeat:
                 self._stop.set()
 
 
-# The fields that a job reads: waited for until their import has ended, then files for as long as the job runs.
-
-_POLL_S = 0.2
-_WAIT_BEFORE_GIVING_BACK_S = 20.0
+# The fields that a job reads, as files for as long as the job runs.
 
 
 class FieldsNotReadyError(Exception):
-    """A field is still being imported; the job goes back to the queue, so that the worker is free for others."""
+    """A field is still being imported; the job goes back to the queue, where it waits for that."""
 
 
 class Fields:
     """Fields of one job. Whatever is opened stays open until ``stack`` closes."""
 
-    def __init__(self, context: Context, heartbeat: Heartbeat, stack: ExitStack) -> None:
+    def __init__(self, context: Context, stack: ExitStack) -> None:
         self._context = context
-        self._heartbeat = heartbeat
         self._stack = stack
-        self._deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
 
     def ready(self, references: Sequence[str]) -> list[FieldRecord]:
-        """The fields' records, once their imports have ended; all of them are asked for at once.
+        """The fields' records.
 
         Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
         """
-        while True:
-            found = self._usable(references)
-            awaited = next((one.sha256 for one in found if one.state == "validating"), None)
-            if awaited is None:
-                return found
-            self._heartbeat.check()
-            if time.monotonic() > self._deadline:
-                raise FieldsNotReadyError(awaited)
-            time.sleep(_POLL_S)
+        found = self._context.records.get_fields(references)
+        fields = [self._checked(field, sha256_of(name)) for field, name in zip(found, references, strict=True)]
+        if any(field.state == "validating" for field in fields):
+            raise FieldsNotReadyError
+        return fields
 
     def file(self, sha256: str) -> Path:
         """The safe field file of a field that is ready."""
         return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
 
-    def _usable(self, references: Sequence[str]) -> list[FieldRecord]:
-        found = self._context.records.get_fields(references)
-        return [self._checked(field, sha256_of(name)) for field, name in zip(found, references, strict=True)]
-
     def _checked(self, field: FieldRecord | None, name: str) -> FieldRecord:
-        """One that may still become, or is, ready."""
         if field is None:
             raise InvalidInputError(f"field {name} was deleted", reason="FIELD_NOT_FOUND")
         if field.state == "rejected":
@@ -260,23 +235,6 @@ def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, heartbe
     return Candidate(sha256_of(sha256), lambda: fields.file(sha256), model)
 
 
-# The work of a rendering job: every field that its edits name, then the engine.
-
-
-def render(
-    engine: Engine,
-    request: RenderRequest,
-    fields: Fields,
-    scene: FieldRecord,
-    objects: Sequence[FieldRecord],
-    heartbeat: Heartbeat,
-    folder: Path,
-) -> list[str]:
-    """Have the engine render what the request asks for; the names of the artifacts in ``folder``."""
-    opened = {sha256_of(one.sha256): partial(fields.file, one.sha256) for one in objects}
-    return engine.render(fields.file(scene.sha256), opened, request, heartbeat.report, folder)
-
-
 logger = logging.getLogger(__name__)
 
 
@@ -302,8 +260,7 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Engine])
         with Heartbeat(context.records, record.id, record.attempt, context.settings.heartbeat_s) as heartbeat:
             done = _published(context, record, make_engine, heartbeat, stack)
         if done is not None and done.manifest.pending:
-            if let_worker_go():
-                give_way(context.settings.job_niceness)
+            let_worker_go()
             finish_result(context, record, done)
 
 
@@ -336,20 +293,14 @@ def _published(
         if are_files_away(error):
             raise
         open_reserve()
-        incident = new_incident()
-        logger.exception("job %s attempt %d failed, incident %s", job_id, attempt, incident)
-        _fail(context, job_id, attempt, fault(error, incident, _limits_held(context)))
+        limits = JobLimits.of(context.settings) if held_memory_limit() is not None else None
+        _fail(context, job_id, attempt, fault(error, f"job {job_id} attempt {attempt}", limits))
     else:
         keep_edited_field(context, record.owner, done.manifest)
         _end(context, job_id, attempt, status="successful", **told_by_result(context.blobs, done.manifest))
         discard_others(context.blobs, done.manifest)
         return done
     return None
-
-
-def _limits_held(context: Context) -> JobLimits | None:
-    """The job's limits, where they hold for this process."""
-    return JobLimits.of(context.settings) if held_memory_limit() is not None else None
 
 
 def _update(context: Context, job_id: str, attempt: int, **changes: Any) -> JobRecord:
@@ -384,16 +335,17 @@ def _give_back(context: Context, job_id: str, attempt: int) -> None:
 def _work(
     context: Context, record: JobRecord, make_engine: Callable[[], Engine], heartbeat: Heartbeat, stack: ExitStack
 ) -> Published:
-    """Do the job and publish its result: the one that counts, of this attempt or an earlier one."""
     request = request_of(record)
-    fields = Fields(context, heartbeat, stack)
+    fields = Fields(context, stack)
     scene, *objects = fields.ready([request.scene, *request.objects])
     folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
     engine = make_engine()
     inputs = record.inputs | warned_of(scene, objects)
     _update(context, record.id, record.attempt, engine=engine.describe(), inputs=inputs)
     if isinstance(request, RenderingRequest):
-        made = Made(render(engine, request.rendering, fields, scene, objects, heartbeat, folder))
+        opened = {sha256_of(one.sha256): partial(fields.file, one.sha256) for one in objects}
+        place = fields.file(scene.sha256)
+        made = Made(engine.render(place, opened, request.rendering, heartbeat.report, folder))
     else:
         made = register(context, engine, request, fields, scene, objects, heartbeat, folder)
     heartbeat.confirm()

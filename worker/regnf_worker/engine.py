@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 from regnf_core import __version__
 from regnf_core.field_notes import NO_NOTES, FieldNotes
@@ -60,70 +60,14 @@ class Candidate:
     fault: str | None = None
 
 
-class Engine(Protocol):
-    """Registers and renders safe field files. Everything may raise RegnfError."""
-
-    def describe(self) -> dict[str, Any]:
-        """Version and device, for the job's record."""
-        ...
-
-    def register(
-        self,
-        scene: Path,
-        object_: Path,
-        model: Model | None,
-        request: RegistrationRequest,
-        report: Report,
-        folder: Path,
-        notes: Notes,
-    ) -> Made:
-        """Do what a request asks for, artifacts into ``folder``. ``model`` saves making one."""
-        ...
-
-    def search(
-        self,
-        scene: Path,
-        candidates: Sequence[Candidate],
-        request: RegistrationRequest,
-        report: Report,
-        folder: Path,
-        notes: Notes,
-    ) -> Made:
-        """The same for a request with candidates."""
-        ...
-
-    def render(
-        self,
-        scene: Path,
-        objects: Mapping[str, Callable[[], Path]],
-        request: RenderRequest,
-        report: Report,
-        folder: Path,
-    ) -> list[str]:
-        """The same for a rendering. objects: what opens the safe field file of each object that edits name."""
-        ...
-
-    def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
-        """Write the model of a safe field as an object."""
-        ...
-
-    def read_model(self, path: Path) -> Model:
-        """A model that ``make_model`` wrote."""
-        ...
-
-    def symmetry(self, model: Model) -> dict[str, Any]:
-        """The object's symmetry as the contract shows it."""
-        ...
-
-
 @dataclass(frozen=True)
-class CoreEngine:
-    """The engine of regnf_core on one device."""
+class Engine:
+    """Registers and renders safe field files on one device. Everything may raise RegnfError."""
 
     device: str
 
     @classmethod
-    def on(cls, choice: Literal["auto", "cpu", "cuda"], sharing: int = 1) -> CoreEngine:
+    def on(cls, choice: Literal["auto", "cpu", "cuda"], sharing: int = 1) -> Engine:
         """``auto``: the GPU if torch can use one, else the CPU. Of a GPU's memory this process may use the part that is
         left to each of ``sharing`` processes; beyond that torch raises OutOfMemoryError."""
         import torch
@@ -134,6 +78,7 @@ class CoreEngine:
         return cls(device)
 
     def describe(self) -> dict[str, Any]:
+        """Version and device, for the job's record."""
         return {"version": __version__, "revision": ENGINE_REVISION, "device": self.device}
 
     def register(
@@ -146,19 +91,20 @@ class CoreEngine:
         folder: Path,
         notes: Notes,
     ) -> Made:
+        """Do what a request asks for, artifacts into ``folder``. ``model`` saves making one."""
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
-        from regnf_core.library import WarmStart, register, with_late_clouds
+        from regnf_core.library import register, with_late_clouds
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         _one_thread()
         start, truth = request.initial_transform, request.ground_truth
         fields = open_field(scene, self.device), open_field(object_, self.device)
         box, options = OrientedBox.from_quaternion(**asdict(request.detection)), request.options
-        warm = WarmStart(Sim3.from_matrix(start) if start else None, model)
+        initial = Sim3.from_matrix(start) if start else None
         # errors against a truth are those of the clouds' points
-        result = register(*fields, box, options, request.seed, report, warm, clouds=bool(truth))
+        result = register(*fields, box, options, request.seed, report, initial, model, bool(truth))
         T_true = Sim3.from_matrix(truth) if truth else None
         said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object)}
         names = write_result(result, folder, truth=T_true, **said)
@@ -177,6 +123,7 @@ class CoreEngine:
         folder: Path,
         notes: Notes,
     ) -> Made:
+        """The same for a request with candidates."""
         from regnf_core.document import ranking_document
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
@@ -212,6 +159,7 @@ class CoreEngine:
         report: Report,
         folder: Path,
     ) -> list[str]:
+        """The same for a rendering. objects: what opens the safe field file of each object that edits name."""
         import torch
 
         from regnf_core.fields.build import open_field
@@ -228,17 +176,20 @@ class CoreEngine:
         return write_result(folder, request, made, self.describe())
 
     def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
+        """Write the model of a safe field as an object."""
         from regnf_core.fields.build import open_field
         from regnf_core.library import model_object, write_object_model
 
         write_object_model(target, model_object(open_field(field, self.device), options.robust))
 
     def read_model(self, path: Path) -> Model:
+        """A model that ``make_model`` wrote."""
         from regnf_core.library import read_object_model
 
         return read_object_model(path)
 
     def symmetry(self, model: Model) -> dict[str, Any]:
+        """The object's symmetry as the contract shows it."""
         return asdict(model.symmetry.group())
 
 

@@ -17,10 +17,10 @@ from rq.timeouts import JobTimeoutException
 from regnf_core.errors import Candidate, FieldFormatError, RegnfError
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.ownership import owner_of
-from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord, SettingsFile, StaleAttemptError
+from regnf_state.records import CANDIDATES, FieldRecord, SettingsFile, StaleAttemptError
 from regnf_state.room import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_worker.engine import Importer
-from regnf_worker.job_limits import are_files_away, fault, new_incident, refusal, timeout
+from regnf_worker.job_limits import are_files_away, fault, refusal, timeout
 from regnf_worker.models import Context
 from regnf_worker.resilient_worker import retry_until_available
 
@@ -65,16 +65,14 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except Exception as error:
         if are_files_away(error):
             raise
-        incident = new_incident()
-        logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
-        _refuse(context, sha256, attempt, fault(error, incident))
+        _refuse(context, sha256, attempt, fault(error, f"import {sha256} attempt {attempt}"))
     else:
-        ended = context.originals.keep_with(report, rejected=False)
-        if ORIGINAL_UNTIL not in ended:
+        until = context.originals.kept_until(None)
+        if until is None:
             delete_upload(context.blobs, field)
         retry_until_available(
             f"the record of import {sha256}",
-            lambda: _end(context, sha256, attempt, state="ready", report=ended, views="pending", drawings=0),
+            lambda: _end(context, sha256, attempt, state="ready", report=report, original_until=until),
         )
 
 
@@ -94,22 +92,16 @@ def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any], a
         if asked:
             error = error | {CANDIDATES: [{"name": one.name, "description": dict(one.description)} for one in asked]}
         context.records.remember_rejection(field, error)
-        ended = context.originals.keep_with(error, rejected=True)
-        if ORIGINAL_UNTIL in ended:
-            delete_all_but_upload(context.blobs, field)
-            ended |= _with_pictures(context, sha256, ended, asked)
-        else:
+        until = context.originals.kept_until(error.get("reason"))
+        if until is None:
             context.blobs.delete_prefix(f"fields/{sha256}")
-        _end(context, sha256, attempt, state="rejected", error=ended)
-
-
-def _with_pictures(context: Context, sha256: str, error: dict[str, Any], asked: Sequence[Candidate]) -> dict[str, Any]:
-    """The candidates of ``error``, saying which have a picture, once these are stored."""
-    for number, one in enumerate(asked, 1):
-        if one.picture is not None:
-            context.blobs.put(candidate_key(sha256, number), one.picture)
-    told = zip(error.get(CANDIDATES, ()), asked, strict=True)
-    return {CANDIDATES: [words | {"picture": one.picture is not None} for words, one in told]} if asked else {}
+        else:
+            delete_all_but_upload(context.blobs, field)
+            for number, one in enumerate(asked, 1):
+                if one.picture is not None:
+                    context.blobs.put(candidate_key(sha256, number), one.picture)
+                    error[CANDIDATES][number - 1]["picture"] = True
+        _end(context, sha256, attempt, state="rejected", error=error, original_until=until)
 
 
 def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:

@@ -9,6 +9,7 @@ RLIMIT_DATA does not. Pages that a fork shares with its worker count for neither
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import resource
 import sys
@@ -65,7 +66,7 @@ class JobLimits:
     def exceeded_by(self, pid: int, scratch: Path) -> str | None:
         """The reason to end the job's process, if it is over a limit."""
         if private_bytes(pid) > self.memory + RESERVE:
-            return "JOB_MEMORY_LIMIT"
+            return "OUT_OF_MEMORY"
         return "JOB_DISK_LIMIT" if folder_bytes(scratch) > self.scratch else None
 
     def is_near(self, peak_memory: int) -> bool:
@@ -147,9 +148,8 @@ def _limit(kind: int, soft: int, hard: int) -> None:
 
 # What went wrong, as the problem object that a record carries. No traceback and no path ever leaves through here.
 
-OVER_LIMIT = {"JOB_MEMORY_LIMIT": "memory", "JOB_DISK_LIMIT": "temporary files"}
-"""Reasons of jobs that were over a limit, and of what."""
-_LIMIT_OF = {"JOB_MEMORY_LIMIT": "memory", "JOB_DISK_LIMIT": "scratch"}
+OVER_LIMIT = {"OUT_OF_MEMORY": ("memory", "memory"), "JOB_DISK_LIMIT": ("temporary files", "scratch")}
+"""Reasons of jobs that were over a limit, of what, and which of ``JobLimits``."""
 _SETTING_OF = {
     "IMPORT_TIMEOUT": "REGNF_IMPORT_TIMEOUT_S",
     "IMPORT_TOO_COSTLY": "REGNF_IMPORT_WORK_S",
@@ -158,6 +158,7 @@ _SETTING_OF = {
 }
 """The settings of the limits, by the reasons that go with them."""
 _GIB = 1 << 30
+logger = logging.getLogger(__name__)
 _OUT_OF_MEMORY_PHRASES = ("can't allocate memory", "out of memory", "cannot allocate memory", "bad_alloc")
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AWAY = {errno.ENOENT, errno.EIO, errno.ENODEV, errno.ENXIO, errno.ENOTCONN, errno.EROFS, errno.ESTALE}
@@ -177,14 +178,16 @@ def timeout(reason: str, limit_s: float) -> dict[str, Any]:
     return problem_document(reason, detail)
 
 
-def fault(error: Exception, incident: str, limits: JobLimits | None = None) -> dict[str, Any]:
-    """The problem of an exception that is not one of regnf's own refusals; ``incident`` finds it in the log.
+def fault(error: Exception, what: str, limits: JobLimits | None = None) -> dict[str, Any]:
+    """The problem of an exception that is not one of regnf's own refusals, and that is being handled.
 
-    limits: those that hold for this process, if any do.
+    It is logged, as that of ``what``, with a word by which a person finds it. limits: those that hold for this process.
     """
+    incident = uuid4().hex[:12]
+    logger.exception("%s failed, incident %s", what, incident)
     if is_out_of_memory(error):
         of_gpu = "cuda" in str(error).lower()
-        return problem_document("OUT_OF_MEMORY") if limits is None or of_gpu else over_limit("JOB_MEMORY_LIMIT", limits)
+        return problem_document("OUT_OF_MEMORY") if limits is None or of_gpu else over_limit("OUT_OF_MEMORY", limits)
     if limits is not None and isinstance(error, OSError) and error.errno == errno.EFBIG:
         return over_limit("JOB_DISK_LIMIT", limits)
     if isinstance(error, StorageFullError) or (isinstance(error, OSError) and error.errno in _FULL):
@@ -193,8 +196,9 @@ def fault(error: Exception, incident: str, limits: JobLimits | None = None) -> d
 
 
 def over_limit(reason: str, limits: JobLimits) -> dict[str, Any]:
-    """The problem of a job that was over one of its limits: JOB_MEMORY_LIMIT or JOB_DISK_LIMIT."""
-    what, limit = OVER_LIMIT[reason], getattr(limits, _LIMIT_OF[reason])
+    """The problem of a job that was over one of its limits: OUT_OF_MEMORY or JOB_DISK_LIMIT."""
+    what, name = OVER_LIMIT[reason]
+    limit = getattr(limits, name)
     detail = f"The job needed more than the {limit / _GIB:.1f} GiB of {what} that one job may use here."
     return problem_document(reason, detail, limit_bytes=limit)
 
@@ -209,11 +213,6 @@ def start_refused(error: OSError) -> str | None:
     if error.errno in _FULL:
         return "STORAGE_FULL"
     return "STORAGE_UNAVAILABLE" if are_files_away(error) else None
-
-
-def new_incident() -> str:
-    """A word by which a person finds a fault in the log."""
-    return uuid4().hex[:12]
 
 
 def is_out_of_memory(error: BaseException) -> bool:

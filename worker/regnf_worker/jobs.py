@@ -17,6 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from redis import Redis
 from redis.exceptions import RedisError
@@ -25,7 +26,7 @@ from regnf_core.errors import RegnfError
 from regnf_core.field_notes import FieldViews
 from regnf_state.ownership import owner_of
 from regnf_state.pieces import delete_views, view_key
-from regnf_state.records import FieldRecord, StaleAttemptError, ViewState
+from regnf_state.records import FieldRecord, StaleAttemptError
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.settings import Settings
 from regnf_worker import kernel
@@ -36,11 +37,11 @@ from regnf_worker.models import Context
 def run_registration(job_id: str, attempt: int, worker: str) -> None:
     """Run the attempt at a job that the queue handed out: its record says what it is, a registration or a rendering."""
     from regnf_worker.attempt import run_attempt
-    from regnf_worker.engine import CoreEngine
+    from regnf_worker.engine import Engine
 
     settings = Settings()
     context = Context.from_settings(settings, existing=True)
-    run_attempt(context, job_id, attempt, worker, lambda: CoreEngine.on(settings.device, settings.workers))
+    run_attempt(context, job_id, attempt, worker, lambda: Engine.on(settings.device, settings.workers))
 
 
 def run_import(sha256: str, attempt: int, worker: str) -> None:
@@ -49,22 +50,20 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
     For a field that became a library's entry after its import, only the model is left to be made.
     """
     from regnf_core.importing.gate.gate import ImportLimits
-    from regnf_worker.engine import CoreEngine, core_importer
+    from regnf_worker.engine import Engine, core_importer
     from regnf_worker.imports import run_import_attempt
     from regnf_worker.job_limits import JobLimits
     from regnf_worker.models import is_unmodeled_entry, model_entry
 
     settings = Settings()
     limits = ImportLimits(
-        wall_s=settings.import_timeout_s,
-        work_s=settings.import_work_s,
-        memory_bytes=settings.import_memory_bytes,
+        wall_s=settings.import_timeout_s, work_s=settings.import_work_s, memory_bytes=settings.import_memory_bytes
     )
     context = Context.from_settings(settings, existing=True)
     run_import_attempt(context, sha256, attempt, worker, core_importer(limits))
     if is_unmodeled_entry(context.records, sha256, attempt):
         JobLimits.of(settings).hold_here()
-        model_entry(context, sha256, CoreEngine.on(settings.device, settings.workers))
+        model_entry(context, sha256, Engine.on(settings.device, settings.workers))
 
 
 def run_drawing(reference: str) -> None:
@@ -103,6 +102,11 @@ def draw_field(context: Context, reference: str, draw: Callable[[Path], FieldVie
         logger.warning("field %s is not drawn: %s", reference, error)
         _note(context, field, views="none")
         return
+    except FileNotFoundError:
+        now = context.records.get_field(reference)
+        if now is not None and now.attempt == field.attempt:
+            raise
+        return  # it was deleted, or is imported anew, while it was opened
     _keep(context, field, made)
 
 
@@ -120,11 +124,10 @@ def _keep(context: Context, field: FieldRecord, made: FieldViews) -> None:
         delete_views(context.blobs, field.sha256)
 
 
-def _note(context: Context, field: FieldRecord, views: ViewState = "pending", drawings: int | None = None) -> bool:
+def _note(context: Context, field: FieldRecord, **changes: Any) -> bool:
     """Write it down; False when the field was deleted, or is imported anew."""
     with suppress(StaleAttemptError):
-        changes = {} if drawings is None else {"drawings": drawings}
-        context.records.update_field(field.sha256, attempt=field.attempt, views=views, **changes)
+        context.records.update_field(field.sha256, attempt=field.attempt, **changes)
         return True
     return False
 
@@ -153,7 +156,6 @@ class FieldDrawer:
         self._records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
         self._lock = settings.scratch_dir / _LOCK
         self._limits = JobLimits.of(settings)
-        self._niceness = min(_NICENESS, settings.job_niceness)
         self._draw = draw
         self._child = 0
         self._until = 0.0
@@ -212,11 +214,10 @@ class FieldDrawer:
         return random.choice(lines) if lines else None  # noqa: S311 -- for fairness, not for secrecy
 
     def _run(self, reference: str) -> None:
-        """What the child does."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         kernel.prefer_as_oom_victim()
-        kernel.give_way(self._niceness)
+        kernel.give_way(_NICENESS)
         self._limits.hold_here()
         resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_S, _PROCESSOR_S + 1))
         self._draw(reference)

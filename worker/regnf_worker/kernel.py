@@ -10,6 +10,7 @@ import logging
 import os
 import select
 import shutil
+import signal
 import time
 from collections.abc import Callable, MutableMapping
 from contextlib import suppress
@@ -71,7 +72,7 @@ def forked(work: Callable[[], object]) -> int:
         die_with_parent(parent)
         work()
         status = 0
-    except BaseException:  # also a handler of signals that raises, as RQ's does, before ``work`` has set its own
+    except BaseException:  # also a handler of signals that raises, before ``work`` has set its own
         if os.getpid() == parent:
             raise
         logger.exception("a forked process ends")
@@ -89,6 +90,12 @@ def in_child(work: Callable[[], object]) -> bool:
         logger.error("no process could be made: %s", error)
         return False
     return os.waitpid(child, 0)[1] == 0
+
+
+def kill_group(pid: int) -> None:
+    """End a child and what it has started."""
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
 
 
 def prefer_as_oom_victim() -> None:

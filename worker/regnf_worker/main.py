@@ -103,6 +103,8 @@ def _mismatch(settings: Settings) -> str:
 
 
 _ASKED = "REGNF_PRELOAD"
+_NICENESS = 5
+"""Jobs give way to the front end: an answer takes milliseconds, a job seconds."""
 logger = logging.getLogger(__name__)
 
 
@@ -119,7 +121,7 @@ def run_worker(settings: Settings) -> None:
         redis.ping()  # before the engine is loaded, which takes seconds
     check_storage(settings)
     share_cores(os.environ, settings.threads, settings.workers)
-    give_way(settings.job_niceness // 2)  # to the front end: an answer takes milliseconds, a job seconds
+    give_way(_NICENESS)
     if settings.preload:
         _preload(os.environ)
     scratch = Scratch(settings.scratch_dir)

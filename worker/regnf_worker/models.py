@@ -71,7 +71,8 @@ class ObjectModels:
         self._engine = engine
         self._options = options
         self._folder = folder
-        self._kept = kept_by_default(options)
+        # the number of its samples is all that options have a say in of the model that is kept
+        self._kept = options.robust.object_samples == RegistrationOptions().robust.object_samples
 
     def of(self, field: FieldRecord, open_field: Callable[[], Path]) -> Model:
         """The model of a field; ``open_field`` is called if it must be made. Raises RegnfError when it cannot be."""
@@ -115,11 +116,6 @@ class ObjectModels:
             logger.info("field %s was deleted: its symmetry is not stored", field.sha256)
         except RedisError as error:
             logger.warning("the symmetry of %s is not stored: %s", field.sha256, error)
-
-
-def kept_by_default(options: RegistrationOptions) -> bool:
-    """Whether the options ask for the model that is kept: the number of its samples is all they have a say in."""
-    return options.robust.object_samples == RegistrationOptions().robust.object_samples
 
 
 # Models of the objects of libraries, made once the object is an entry: no search has to make them first.

@@ -1,29 +1,25 @@
-"""RQ's worker, made to survive a Redis that refuses commands: RQ's own loop ends at the first one.
+"""RQ's worker, made to survive a Redis that refuses commands, and to run only work that the service itself has queued.
 
-There are three kinds of calls:
-- What must succeed before the worker continues, such as its sign of life, is repeated until Redis accepts it. A worker
-  that cannot write takes nothing from the queue.
-- What only keeps RQ's own entries tidy is skipped: job records are the truth, and RQ's entries expire or are swept.
-- What is written while a child runs is never repeated: the child has time limits, which the worker must keep.
-
-An error that does not pass with time still ends the loop: the supervisor of the worker starts another.
+There are three kinds of calls of Redis. What must succeed before the worker continues, such as its sign of life, is
+repeated until Redis accepts it: a worker that cannot write takes nothing. What only keeps RQ's own entries tidy is
+skipped: job records are the truth, and RQ's entries expire. What is written while a child runs is never repeated: the
+child has time limits, which the worker must keep. An error that does not pass with time still ends the loop: the
+supervisor of the worker starts another.
 
 Methods of RQ that are overridden, as read in RQ 2.12 (tests/worker/test_rq_interface.py compares their signatures):
-- repeated until accepted: register_birth, subscribe, check_for_suspension, prepare_job_execution, heartbeat;
-- skipped when refused: set_state, run_maintenance_tasks, teardown; set_shutdown_requested_date does nothing;
-- narrowed to what the service needs: handle_payload, clean_registries. RQ's own read jobs from Redis, and import the
-  callbacks named there, in the worker itself;
-- in regnf_worker.process: dequeue_job_and_maintain_ttl, execute_job, main_work_horse, request_stop,
-  request_force_stop.
+- repeated until accepted: register_birth, subscribe, check_for_suspension, heartbeat; skipped: set_state, teardown;
+- narrowed to what the service needs: handle_payload, run_maintenance_tasks. RQ's own sweep reads jobs from Redis, and
+  imports the callbacks named there, in the worker itself;
+- in regnf_worker.process: dequeue_job_and_maintain_ttl, execute_job, request_stop.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 from redis import Redis
@@ -32,27 +28,28 @@ from redis.exceptions import OutOfMemoryError, ReadOnlyError, RedisError, Respon
 from redis.exceptions import TimeoutError as RedisTimeoutError
 from rq import Worker, worker_registration
 from rq.exceptions import StopRequested
-from rq.executions import ExecutionRegistry
-from rq.registry import FailedJobRegistry, FinishedJobRegistry, StartedJobRegistry
+from rq.registry import StartedJobRegistry
 from rq.utils import current_timestamp, now
-from rq.worker import WorkerStatus
 
-from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
-from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
-from regnf_state.redis import queue
+from regnf_state.queue import Work
+from regnf_state.records import FieldRecord, UnreadableRecordError
 from regnf_state.redis.counters import count
 from regnf_state.redis.documents import text
-from regnf_state.redis.fair_queue import FairQueue
+from regnf_state.redis.fair_queue import LISTS
 from regnf_state.redis.jobs import RecordStore
+from regnf_state.redis.queue import JobQueue
 from regnf_state.transitions import fields_of
-
-# Waiting for a Redis that is full, away or read-only.
+from regnf_worker import kernel
 
 _FIRST_WAIT_S = 0.1
 MAX_WAIT_S = 2.0
 _PASSING = (RedisConnectionError, RedisTimeoutError, OutOfMemoryError, ReadOnlyError)
 _PASSING_WORDS = ("MISCONF ", "OOM ")
 """No class of their own: a disk that Redis cannot write to, and what older servers say of a script without memory."""
+_LIVE_FOR_S = 45
+"""A worker that has not reported for this long is not counted as live."""
+_SHOWN = 120
+_Value = TypeVar("_Value")
 logger = logging.getLogger(__name__)
 
 
@@ -87,11 +84,6 @@ def retry_until_available(what: str, do: Callable[[], _Value], stopped: Callable
             return value
 
 
-_LIVE_FOR_S = 45
-"""A worker that has not reported for this long is not counted as live."""
-_Value = TypeVar("_Value")
-
-
 class ResilientWorker(Worker):
     """An RQ worker that survives a Redis that is full or away, and reacts to SIGTERM while it waits for it."""
 
@@ -106,8 +98,6 @@ class ResilientWorker(Worker):
         except RedisError as error:
             self.log.warning("%s is skipped: %s", what, error)
 
-    # repeated until Redis accepts it
-
     def register_birth(self) -> None:
         register: Callable[[], None] = super().register_birth
 
@@ -121,50 +111,34 @@ class ResilientWorker(Worker):
         self._until_available("subscribing to commands", super().subscribe)
 
     def check_for_suspension(self, burst: bool) -> None:
-        look = super().check_for_suspension
-        self._until_available("looking for a suspension", lambda: look(burst))
-
-    def prepare_job_execution(self, job: Any, remove_from_intermediate_queue: bool = False) -> None:
-        prepare = super().prepare_job_execution
-        self._until_available(f"beginning job {job.id}", lambda: prepare(job, remove_from_intermediate_queue))
+        self._until_available("looking for a suspension", partial(super().check_for_suspension, burst))
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:  # noqa: ARG002 - one time for all
-        if pipeline is not None:
-            self._report(pipeline)
-        elif self._horse_pid:
-            self._if_possible("a sign of life", self._report_now)
-        else:
-            self._until_available("a sign of life", self._report_now)
-
-    def _report(self, pipeline: Any) -> None:
         """The whole registration again each time: Redis may have been emptied, or others have swept it as expired."""
+        if pipeline is None:
+            (self._if_possible if self._horse_pid else self._until_available)("a sign of life", self._report)
+            return
         super().heartbeat(_LIVE_FOR_S, pipeline)
         pipeline.hset(self.key, mapping=self.serialize())
         worker_registration.register(self, pipeline)
 
-    def _report_now(self) -> None:
+    def _report(self) -> None:
         with self.connection.pipeline() as pipeline:
-            self._report(pipeline)
+            self.heartbeat(pipeline=pipeline)
             pipeline.execute()
-
-    # skipped when Redis refuses it
 
     def set_state(self, state: str, pipeline: Any = None) -> None:
-        show = super().set_state
-        self._if_possible("showing the worker's state", lambda: show(state, pipeline))
+        self._if_possible("showing the worker's state", partial(super().set_state, state, pipeline))
 
     def run_maintenance_tasks(self) -> None:
-        self._if_possible("sweeping RQ's entries", self.clean_registries)
-
-    def clean_registries(self) -> None:
-        """Drop RQ's entries that have expired, and workers that have. No job is read, and none is brought back."""
+        """Drop entries of jobs and workers that have expired. No job is read, and none is brought back."""
         self.last_cleaned_at = now()  # type: ignore[assignment]
-        with self.connection.pipeline() as pipeline:
-            for queue in self.queues:
-                for registry in (StartedJobRegistry, FinishedJobRegistry, FailedJobRegistry):
-                    pipeline.zremrangebyscore(registry.key_template.format(queue.name), 0, current_timestamp())
-            pipeline.execute()
+        self._if_possible("sweeping RQ's entries", self._sweep_entries)
+
+    def _sweep_entries(self) -> None:
         for queue in self.queues:
+            key = StartedJobRegistry.key_template.format(queue.name)
+            self.connection.zremrangebyscore(key, 0, current_timestamp())
             worker_registration.clean_worker_registry(queue)
 
     def handle_payload(self, message: Any) -> None:
@@ -177,89 +151,38 @@ class ResilientWorker(Worker):
         match command:
             case {"command": "stop-job", "job_id": str(name)} if current is not None and name == current.job_id:
                 if self._horse_pid:
-                    self.kill_horse()
+                    kernel.kill_group(self._horse_pid)
             case _:
                 self.log.info("a command that is not for the job of this worker is ignored")
-
-    def set_shutdown_requested_date(self) -> None:
-        """Nobody reads it, and the handler of a signal must not wait for Redis."""
 
     def teardown(self) -> None:
         """A worker that cannot sign off is not counted any more once its last report has expired."""
         self._if_possible("signing off", super().teardown)
 
-    # around a job: for ``execute_job``
-
-    def begin_job(self, job: Any) -> None:
-        """Enter the job as taken up by this worker."""
-        self._until_available(f"taking up job {job.id}", lambda: self.prepare_execution(job))
-
-    def report_running(self, job: Any) -> None:
-        """Renew the entries of worker and job while a child runs."""
-        self._if_possible(f"a sign of life of job {job.id}", lambda: self.maintain_heartbeats(job))
-
-    def finish_job(self, job: Any) -> None:
-        """Drop RQ's entries on a job whose child has ended. The outcome is written to the job's own record."""
-        self._if_possible(f"closing RQ's entries on job {job.id}", lambda: self._drop_entries(job))
-        self.set_state(WorkerStatus.IDLE)
-
-    def _drop_entries(self, job: Any) -> None:
-        with self.connection.pipeline() as pipeline:
-            self.cleanup_execution(job, pipeline)
-            pipeline.delete(job.key, ExecutionRegistry(job.id, connection=self.connection).key)
-            pipeline.execute()
-
-
-# The pipe between a job's process and its worker: closed, the process has ended; a byte, the worker may go on.
-#
-# A process says so once its result is out. What it still does, the worker lets it do beside the next job.
-
-_writing: list[int] = []
-"""The end that this process holds, if it is a job's."""
-
-
-def hold(writing: int) -> None:
-    """This process is a job's; its worker reads the other end."""
-    _writing.append(writing)
-
-
-def let_worker_go() -> bool:
-    """Tell the worker that it need not wait for this process. False where this process is no job's, as in tests."""
-    for pipe in _writing:
-        os.write(pipe, b".")
-    return bool(_writing)
-
-
-# How a worker takes work: from the lists that the fair queue fills, and only work that the service itself has queued.
-#
-# What is in Redis under a name is checked and then put aside: the job is made anew from its name. Anything else is
-# removed, logged and counted, and never run. A registration whose fields are still being imported is parked.
-
-LISTS = {f"rq:queue:{name}": name for name in (IMPORT_QUEUE_NAME, QUEUE_NAME)}
-_SHOWN = 120
-
 
 class Taken(NamedTuple):
-    """A name that has left RQ's list of a queue."""
+    """A name that has left RQ's list of a queue. key: of the hash that lies under this name."""
 
     queue_name: str
     name: str
     key: bytes
-    """Of the hash that lies under this name."""
 
 
 class Taking:
-    """Takes work for one worker. Everything may raise RedisError, and may be called again after that."""
+    """Takes work for one worker. Everything may raise RedisError, and may be called again after that.
 
-    def __init__(self, redis: Redis, fair: FairQueue, key: str | None) -> None:
+    What this service has not queued is removed, logged and counted, and never run. A registration whose fields are
+    still being imported is parked.
+    """
+
+    def __init__(self, redis: Redis, queue: JobQueue) -> None:
         self._redis = redis
-        self._fair = fair
-        self._key = key
-        self._records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
+        self._queue = queue
+        self.records = RecordStore(redis)  # without the journal: its storage does not survive the worker's forks
 
     def pop(self, timeout: int | None) -> Taken | None:
         """The next name, waited for so many seconds (None: not at all); None when there is none."""
-        self._fair.turn()
+        self._queue.turn()
         found: Any
         if timeout is not None:
             found = self._redis.blpop(list(LISTS), timeout)
@@ -272,59 +195,43 @@ class Taking:
 
     def accept(self, taken: Taken) -> Work | None:
         """The work that a name means; None when it is not to be run now."""
-        self._fair.turn()  # the next in turn is for the next worker
+        self._queue.turn()  # the next in turn is for the next worker
         try:
             held: Any = self._redis.hgetall(taken.key)
+            work = self._queue.read(taken.queue_name, taken.name, held) if held else None  # it was stopped meanwhile
+        except ValueError as error:
+            self._refuse(taken, str(error))
+            return None
         except ResponseError as error:
             if not str(error).startswith("WRONGTYPE"):
                 raise
             self._refuse(taken, "not a hash")
             return None
-        if not held:
-            self._fair.finish(taken.name, 0.0)
-            return None  # it was stopped meanwhile
         try:
-            work = queue.read(taken.queue_name, taken.name, held, self._redis, self._key)
-        except queue.PayloadError as error:
-            self._refuse(taken, str(error))
-            return None
-        return None if work.kind == "registration" and self._is_put_aside(work) else work
-
-    def _is_put_aside(self, work: Work) -> bool:
-        """Whether the registration waits for an import. One with a record that cannot be read is run, which says so."""
-        try:
-            return self._parked(work)
+            return None if work is None or (work.kind == "registration" and self._is_parked(work)) else work
         except UnreadableRecordError as error:
-            logger.error("%s: %s", work.name, error)
-            return False
+            logger.error("%s: %s", taken.name, error)
+            return work  # whose process says so
 
     def _refuse(self, taken: Taken, why: str) -> None:
-        self._fair.remove(taken.name)
+        self._queue.remove(taken.name)
         self._redis.delete(taken.key)
         count(self._redis, "queue_payloads_refused", taken.queue_name)
         logger.error("%s: %a is not run and removed: %s", taken.queue_name, taken.name[:_SHOWN], why)
 
-    def _parked(self, work: Work) -> bool:
-        """Whether the registration waits for an import, and has been put aside for that."""
-        job = self._job(work)
+    def _is_parked(self, work: Work) -> bool:
+        job = self.records.get_job(work.argument)
         if job is None or job.attempt != work.attempt or job.status != "accepted":
             return False
-        reference = self._awaited(job)
+        found = zip(fields_of(job), self.records.get_fields(fields_of(job)), strict=True)
+        reference = next((name for name, field in found if _is_validating(field)), None)
         if reference is None:
             return False
-        self._fair.park(work, job.owner, reference)
-        if not self._is_validating(self._records.get_field(reference)):
-            self._fair.release(reference)  # its import ended between the two looks
+        self._queue.park(work, job.owner, reference)
+        if not _is_validating(self.records.get_field(reference)):
+            self._queue.release(reference)  # its import ended between the two looks
         return True
 
-    def _job(self, work: Work) -> JobRecord | None:
-        return self._records.get_job(work.argument)
 
-    def _awaited(self, job: JobRecord) -> str | None:
-        names = fields_of(job)
-        found = self._records.get_fields(names)
-        return next((name for name, field in zip(names, found, strict=True) if self._is_validating(field)), None)
-
-    @staticmethod
-    def _is_validating(field: FieldRecord | None) -> bool:
-        return field is not None and field.state == "validating"
+def _is_validating(field: FieldRecord | None) -> bool:
+    return field is not None and field.state == "validating"

@@ -10,7 +10,6 @@ import numpy as np
 from benchmarks.trainer_runs.run import WrittenRun
 from benchmarks.trainer_runs.trainers import (
     deepsdf,
-    implicit,
     instant_nsr_pl,
     nerfstudio,
     neuralangelo,
@@ -29,6 +28,4 @@ TRAINERS: dict[str, Writer] = {
     "instant_nsr_pl": instant_nsr_pl.write_instant_nsr_pl,
     "neuralangelo": neuralangelo.write_neuralangelo,
     "deepsdf": deepsdf.write_deepsdf,
-    "volsdf": implicit.write_volsdf,
-    "idr": implicit.write_idr,
 }

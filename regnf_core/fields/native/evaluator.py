@@ -40,11 +40,9 @@ class NativeEvaluator:
         self._field, self._kept = _described(function)
 
     def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3)."""
         return self._evaluate(points, None)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
         gradient = torch.empty(len(points), 3)
         return self._evaluate(points, gradient), gradient
 

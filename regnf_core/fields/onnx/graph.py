@@ -159,7 +159,6 @@ class OnnxFunction:
 
     @property
     def device(self) -> torch.device:
-        """Where the weights live."""
         floats = (value for value in self.known.values() if value.is_floating_point())
         return next(floats, torch.zeros(0)).device
 
@@ -172,12 +171,10 @@ class OnnxFunction:
         return OnnxFunction(self.steps, moved, self.input, self.output, self.batch)
 
     def value(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) at points (N, 3)."""
         parts = [self._run(part)[: len(part)] for part in torch.split(points, self.batch) if len(part)]
         return torch.cat([points.new_zeros(0), *parts])
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them."""
         distances, gradients = [points.new_zeros(0)], [points.new_zeros(0, 3)]
         for part in torch.split(points, self.batch) if len(points) else ():
             with torch.enable_grad():

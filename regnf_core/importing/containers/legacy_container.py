@@ -7,15 +7,15 @@ imports. There are no checksums; but every byte must be accounted for, so the fi
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.zip_members import DEFLATED, MAX_ENTRIES, STORED, Member, malformed, read_members
 from regnf_core.importing.pickle.pickle_machine import PickleLimits, StorageRef
-from regnf_core.importing.pickle.pickle_reader import LeadingPickle, read_leading_pickle
+from regnf_core.importing.pickle.pickle_reader import read_leading_pickle
 
 # The zip container of torch.save, checked against its own rules instead of a lenient reader's.
 #
@@ -23,95 +23,74 @@ from regnf_core.importing.pickle.pickle_reader import LeadingPickle, read_leadin
 # every entry can be mapped where it lies.
 
 MAX_PICKLE_BYTES = 32 * 1024 * 1024
-_CRC_CHUNK = 1 << 24
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One stored entry: ``size`` bytes at ``offset`` of the file, with the CRC-32 the directory claims."""
-
-    name: str
-    offset: int
-    size: int
-    crc32: int
 
 
 @dataclass(frozen=True)
 class TorchArchive:
-    """The entries by their name below the archive's folder: "data.pkl", "data/0" ..."""
+    """The entries by their name below the archive's folder: "data.pkl", "data/0" ... Those of the older container are
+    its storages, by the names that they have in a zip.
+    """
 
     data: memoryview
-    entries: dict[str, Entry]
+    entries: Mapping[str, Member]
 
     def read(self, name: str) -> memoryview:
-        """The entry's bytes, not copied, after checking their CRC. Raises FieldFormatError (ARCHIVE_CRC_MISMATCH)."""
-        entry = self.entries[name]
-        view = self.data[entry.offset : entry.offset + entry.size]
-        crc32 = 0
-        for start in range(0, entry.size, _CRC_CHUNK):
-            crc32 = zlib.crc32(view[start : start + _CRC_CHUNK], crc32)
-        if crc32 != entry.crc32:
-            raise malformed(f"the bytes of {name} are damaged (CRC)", "ARCHIVE_CRC_MISMATCH")
-        return view
+        """The entry's bytes, not copied, their CRC checked. Raises FieldFormatError (ARCHIVE_CRC_MISMATCH)."""
+        return self.entries[name].content(self.data)
 
 
-def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> TorchArchive:
+def read_archive(
+    data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES, members: list[Member] | None = None
+) -> TorchArchive:
     """Check the container's structure and list its entries. ``data`` is the whole file, usually a memory map.
 
+    members: what ``read_members`` listed, compressed entries and folders too, where the file was read already.
     Raises FieldFormatError: FILE_TRUNCATED, PICKLE_TOO_LARGE and the ARCHIVE_* reasons of docs/import-gate.md.
     """
-    try:
-        listed = read_members(data)
-    except FieldFormatError as error:
-        if error.reason == "ARCHIVE_COMPRESSED_ENTRY" and _is_program(_names_anyway(data)):
-            raise _program() from error
-        raise
-    if _is_program(member.name for member in listed):
-        raise _program()
-    members = _below_one_folder(listed)
-    if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in members) > 1:
+    listed = members or []
+    if not listed or any(member.method != STORED or member.name.endswith("/") for member in listed):
+        listed = _strictly_listed(data)
+    _refuse_programs(listed)
+    entries = _below_one_folder(listed)
+    if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in entries) > 1:
         raise malformed("more than one data.pkl", "ARCHIVE_DUPLICATE_ENTRY")
-    if "data.pkl" not in members:
+    if "data.pkl" not in entries:
         raise malformed("the archive has no data.pkl: torch.save did not write it", "ARCHIVE_NO_PICKLE")
-    if members["data.pkl"].size > max_pickle_bytes:
+    if entries["data.pkl"].size > max_pickle_bytes:
         raise malformed(f"data.pkl is larger than {max_pickle_bytes} bytes", "PICKLE_TOO_LARGE")
-    archive = TorchArchive(data, members)
-    if "byteorder" in members and bytes(archive.read("byteorder")[:16]) != b"little":
+    archive = TorchArchive(data, entries)
+    if "byteorder" in entries and bytes(archive.read("byteorder")[:16]) != b"little":
         raise malformed("the tensors are not little-endian", "ARCHIVE_BYTE_ORDER")
     return archive
 
 
-def _names_anyway(data: memoryview) -> list[str]:
-    """The entries' names, compressed ones among them; none where the container is faulty as well."""
+def _strictly_listed(data: memoryview) -> list[Member]:
     try:
-        return [member.name for member in read_members(data, (STORED, DEFLATED))]
-    except FieldFormatError:
-        return []
+        return read_members(data)
+    except FieldFormatError as error:
+        if error.reason == "ARCHIVE_COMPRESSED_ENTRY":
+            inflatable: list[Member] = []
+            with suppress(FieldFormatError):
+                inflatable = read_members(data, (STORED, DEFLATED))
+            _refuse_programs(inflatable)
+        raise
 
 
-def _is_program(names: Iterable[str]) -> bool:
-    inner = [name.partition("/")[2] for name in names]
-    return any(name == "constants.pkl" or name.startswith("code/") for name in inner)
+def _refuse_programs(members: list[Member]) -> None:
+    inner = [member.name.partition("/")[2] for member in members]
+    if any(name == "constants.pkl" or name.startswith("code/") for name in inner):
+        message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
+        raise malformed(message, "ARCHIVE_TORCHSCRIPT")
 
 
-def _program() -> FieldFormatError:
-    message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
-    return malformed(message, "ARCHIVE_TORCHSCRIPT")
-
-
-def _below_one_folder(members: list[Member]) -> dict[str, Entry]:
+def _below_one_folder(members: list[Member]) -> dict[str, Member]:
     """Entries by their name below the one folder all of them share."""
-    entries = {}
-    folders = set()
-    for member in members:
-        folder, _, name = member.name.partition("/")
-        if not name:
-            raise malformed("an entry lies in no folder", "ARCHIVE_ENTRY_NAME")
-        folders.add(folder)
-        entries[name] = Entry(member.name, member.offset, member.size, member.crc32)
-    if len(folders) != 1:
+    parts = [(member.name.partition("/"), member) for member in members]
+    if not all(name for (_, _, name), _ in parts):
+        raise malformed("an entry lies in no folder", "ARCHIVE_ENTRY_NAME")
+    if len({folder for (folder, _, _), _ in parts}) != 1:
         raise malformed("entries lie in several folders", "ARCHIVE_ENTRY_NAME")
-    return entries
+    return {name: member for (_, _, name), member in parts}
 
 
 _MAGIC = 0x1950A86A20F9469CFC6C
@@ -119,57 +98,34 @@ _PROTOCOL = 1001
 _SMALL = PickleLimits(opcodes=1000, stack=100, marks=10, memo=100)
 _KEYS = PickleLimits(opcodes=4 * MAX_ENTRIES, stack=2 * MAX_ENTRIES, marks=10, memo=2 * MAX_ENTRIES)
 _COUNT_BYTES = 8
-_ELEMENT_BYTES = {
-    "float32": 4,
-    "float64": 8,
-    "float16": 2,
-    "bfloat16": 2,
-    "int64": 8,
-    "int32": 4,
-    "int16": 2,
-    "int8": 1,
-    "uint8": 1,
-    "bool": 1,
-}
+_ELEMENT_BYTES = {"float32": 4, "float64": 8, "float16": 2, "bfloat16": 2}
+_ELEMENT_BYTES |= {"int64": 8, "int32": 4, "int16": 2, "int8": 1, "uint8": 1, "bool": 1}
 
 
-@dataclass(frozen=True)
-class LegacyArchive:
-    """The storages by the names that the zip container gives them: "data/<key>"."""
-
-    data: memoryview
-    entries: Mapping[str, Entry]
-
-    def read(self, name: str) -> memoryview:
-        """The entry's bytes, copied: they may begin at any byte, and numbers want an aligned place."""
-        entry = self.entries[name]
-        return memoryview(bytes(self.data[entry.offset : entry.offset + entry.size]))
-
-
-def read_legacy(data: memoryview) -> tuple[Any, LegacyArchive]:
+def read_legacy(data: memoryview) -> tuple[Any, TorchArchive]:
     """The values that were saved, and the storages of their tensors. ``data`` is the whole file.
 
     Raises FieldFormatError: FILE_TRUNCATED, LEGACY_MALFORMED, ARCHIVE_BYTE_ORDER, ARCHIVE_TOO_MANY_ENTRIES,
     ARCHIVE_TRAILING_DATA, TENSOR_DTYPE, TENSOR_STORAGE_MISSING, TENSOR_STORAGE_MISMATCH and the PICKLE_* reasons.
     """
-    magic, at = _leading(data, 0, _SMALL)
-    protocol, at = _leading(data, at, _SMALL)
-    machine, at = _leading(data, at, _SMALL)
-    if magic.value != _MAGIC or protocol.value != _PROTOCOL or not isinstance(machine.value, dict):
+    magic, at, _ = _leading(data, 0, _SMALL)
+    protocol, at, _ = _leading(data, at, _SMALL)
+    machine, at, _ = _leading(data, at, _SMALL)
+    if magic != _MAGIC or protocol != _PROTOCOL or not isinstance(machine, dict):
         raise _malformed("the file's head is not torch.save's")
-    if machine.value.get("little_endian") is not True:
+    if machine.get("little_endian") is not True:
         raise FieldFormatError("the tensors are not little-endian", reason="ARCHIVE_BYTE_ORDER")
-    values, at = _leading(data, at, PickleLimits())
-    keys, at = _leading(data, at, _KEYS)
-    return values.value, LegacyArchive(data, _entries(data, at, _checked_keys(keys.value), values.storages))
+    values, at, storages = _leading(data, at, PickleLimits())
+    keys, at, _ = _leading(data, at, _KEYS)
+    return values, TorchArchive(data, _entries(data, at, _checked_keys(keys), storages))
 
 
-def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[LeadingPickle, int]:
-    """The pickle at ``at``, and where it ends."""
+def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[Any, int, dict[str, StorageRef]]:
+    """The value of the pickle at ``at``, where it ends, and the storages it names."""
     if at >= len(data):
         raise FieldFormatError("the file was cut short", reason="FILE_TRUNCATED")
-    pickle = read_leading_pickle(data[at : at + MAX_PICKLE_BYTES], limits)
-    return pickle, at + pickle.length
+    value, length, storages = read_leading_pickle(data[at : at + MAX_PICKLE_BYTES], limits)
+    return value, at + length, storages
 
 
 def _checked_keys(keys: object) -> list[str]:
@@ -181,7 +137,7 @@ def _checked_keys(keys: object) -> list[str]:
     return keys
 
 
-def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, StorageRef]) -> dict[str, Entry]:
+def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, StorageRef]) -> dict[str, Member]:
     """Where each storage lies, one behind the other from ``at`` to the end of the file."""
     entries = {}
     for key in keys:
@@ -199,7 +155,7 @@ def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, 
             message = f"a storage of {storage.count} elements has {count} in the file"
             raise FieldFormatError(message, reason="TENSOR_STORAGE_MISMATCH")
         at += _COUNT_BYTES
-        entries[f"data/{key}"] = Entry(f"data/{key}", at, size, crc32=0)
+        entries[f"data/{key}"] = Member(f"data/{key}", STORED, at, size, size, crc32=None)
         at += size
     if at != len(data):
         raise FieldFormatError("something lies behind the last storage", reason="ARCHIVE_TRAILING_DATA")

@@ -10,9 +10,6 @@ import io
 import math
 import tokenize
 import warnings
-import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,57 +34,31 @@ _READERS = {
 }
 _PLAIN_TYPES = frozenset(["<f2", "<f4", "<f8", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "|i1", "|u1", "|b1"])
 _PARSER_ERRORS = (
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-    RecursionError,
-    SyntaxError,
-    tokenize.TokenError,
-    TypeError,
-    ValueError,
+    *(ArithmeticError, LookupError, MemoryError, RecursionError),
+    *(SyntaxError, tokenize.TokenError, TypeError, ValueError),
 )
 """What numpy and Python's parser of literals raise for headers that are malformed."""
 
 
-@dataclass(frozen=True)
-class NpyHeader:
-    """An array's element type and shape, and where its numbers begin, bytes."""
-
-    dtype: np.dtype[np.generic]
-    shape: tuple[int, ...]
-    fortran_order: bool
-    data_at: int
-
-
-def read_npy_header(name: str, data: memoryview) -> NpyHeader:
-    """The header of the array ``name``, whose file begins with ``data``.
-
-    Raises FieldFormatError: NPY_MALFORMED, NPY_OBJECT_ARRAY (pickled objects) or TENSOR_DTYPE (no plain little-endian
-    numbers).
-    """
+def _header(name: str, data: memoryview) -> tuple[np.dtype[np.generic], tuple[int, ...], bool, int]:
+    """Of the array ``name``: its type, its shape, whether it is in Fortran's order, and where its numbers begin."""
     file = io.BytesIO(data[: npy.MAGIC_LEN + 4 + _MAX_HEADER])
+    malformed_header = FieldFormatError(f"{name} has no valid header of an array of numbers", reason="NPY_MALFORMED")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # headers that Python 2 wrote
             read = _READERS[npy.read_magic(file)]
             shape, fortran_order, dtype = read(file, max_header_size=_MAX_HEADER)
     except _PARSER_ERRORS as error:
-        raise _malformed(name) from error
+        raise malformed_header from error
     if dtype.hasobject:
         raise FieldFormatError(f"{name} holds pickled Python objects, not numbers", reason="NPY_OBJECT_ARRAY")
-    if dtype.names is not None or len(shape) > _MAX_DIMENSIONS or not all(_is_extent(extent) for extent in shape):
-        raise _malformed(name)
+    sound = len(shape) <= _MAX_DIMENSIONS and all(type(n) is int and 0 <= n < _MAX_EXTENT for n in shape)
+    if dtype.names is not None or not sound:
+        raise malformed_header
     if dtype.str not in _PLAIN_TYPES:
         raise FieldFormatError(f"{name} is stored as {dtype.str}; plain numbers are needed", reason="TENSOR_DTYPE")
-    return NpyHeader(dtype, shape, fortran_order, file.tell())
-
-
-def _is_extent(value: object) -> bool:
-    return type(value) is int and 0 <= value < _MAX_EXTENT
-
-
-def _malformed(name: str) -> FieldFormatError:
-    return FieldFormatError(f"{name} has no valid header of an array of numbers", reason="NPY_MALFORMED")
+    return dtype, shape, fortran_order, file.tell()
 
 
 MAX_UNPACKED_BYTES = 2 << 30
@@ -98,11 +69,18 @@ _FEW = 64
 
 
 class ArraySource:
-    """The arrays of one .npz file by name. ``budget`` caps their bytes together, as float32 and as stored."""
+    """The arrays of one .npz file by name. ``budget`` caps their bytes together, as float32 and as stored.
 
-    def __init__(self, data: memoryview, budget: int) -> None:
+    members: what ``read_members`` listed, where the file was read already.
+    """
+
+    def __init__(self, data: memoryview, budget: int, members: list[Member] | None = None) -> None:
         self._data = data
-        self._members = _named(read_members(data, (STORED, DEFLATED)))
+        self._members: dict[str, Member] = {}
+        for member in read_members(data, (STORED, DEFLATED)) if members is None else members:
+            if "/" in member.name or not member.name.endswith(_SUFFIX):
+                raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
+            self._members[member.name.removesuffix(_SUFFIX)] = member
         self._budget = budget
         self._unpacked = MAX_UNPACKED_BYTES
 
@@ -120,85 +98,46 @@ class ArraySource:
         Raises FieldFormatError: TENSOR_MISSING, NPY_MALFORMED, NPY_OBJECT_ARRAY, TENSOR_DTYPE, TENSOR_SHAPE,
         TENSOR_TOO_LARGE, TENSOR_NOT_FINITE, TENSOR_STORAGE_MISMATCH, ARCHIVE_DEFLATE_MALFORMED or ARCHIVE_CRC_MISMATCH.
         """
-        values = self._read(name)
-        if values.dtype.kind != "f":
-            raise tensor_error(f"{name} holds {values.dtype.name}; real numbers are needed", "TENSOR_DTYPE")
-        return finite_float32(name, values)
+        return finite_float32(name, self._read(name, "f", "real numbers"))
 
     def integers(self, name: str) -> npt.NDArray[np.int64]:
         """The whole numbers of an array. Raises what :meth:`array` raises."""
-        values = self._read(name)
-        if values.dtype.kind not in "iu" or values.dtype == np.uint64:
-            raise tensor_error(f"{name} holds {values.dtype.name}; whole numbers are needed", "TENSOR_DTYPE")
+        values = self._read(name, "iu", "whole numbers")
+        if values.dtype == np.uint64:
+            raise tensor_error(f"{name} holds uint64; whole numbers are needed", "TENSOR_DTYPE")
         return np.ascontiguousarray(values, dtype=np.int64)
 
     def weights(self, name: str) -> Float32Array:
         """An array's numbers, of either sort, none below zero. Raises what :meth:`array` raises."""
-        values = self._read(name)
-        if values.dtype.kind not in "iuf":
-            raise tensor_error(f"{name} holds {values.dtype.name}; numbers are needed", "TENSOR_DTYPE")
-        return np.maximum(finite_float32(name, values), np.float32(0.0))
+        return np.maximum(finite_float32(name, self._read(name, "iuf", "numbers")), np.float32(0.0))
 
     def numbers(self, name: str) -> npt.NDArray[np.float64]:
         """A few numbers of either sort, in double precision, in their own shape. Raises what :meth:`array` raises."""
-        values = self._read(name, _FEW)
-        if values.dtype.kind not in "iuf":
-            raise tensor_error(f"{name} holds {values.dtype.name}; numbers are needed", "TENSOR_DTYPE")
-        few = np.asarray(values, dtype=np.float64)
+        few = np.asarray(self._read(name, "iuf", "numbers", _FEW), dtype=np.float64)
         if not np.isfinite(few).all():
             raise tensor_error(f"{name} holds a number that is not finite", "TENSOR_NOT_FINITE")
         return few
 
-    def _read(self, name: str, most: int | None = None) -> npt.NDArray[Any]:
+    def _read(self, name: str, kinds: str, needed: str, most: int | None = None) -> npt.NDArray[Any]:
+        """The array, of one of numpy's kinds of numbers."""
         member = self._members.get(name)
         if member is None:
             raise tensor_error(f"{name} is missing", "TENSOR_MISSING")
         self._unpacked -= member.size
         if self._unpacked < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
-        raw = _unpack(name, self._data[member.offset : member.offset + member.packed_size], member)
-        header = read_npy_header(name, raw)
-        require_possible(name, header.shape)
-        count = math.prod(header.shape)
+        raw = member.content(self._data)
+        dtype, shape, fortran_order, data_at = _header(name, raw)
+        require_possible(name, shape)
+        count = math.prod(shape)
         if most is not None and count > most:
             raise tensor_error(f"{name} has {count} numbers, expected a few", "TENSOR_SHAPE")
         self._budget -= 4 * count
         if self._budget < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
-        if len(raw) - header.data_at != count * header.dtype.itemsize:
-            raise tensor_error(f"{name} has another size than its shape {header.shape}", "TENSOR_STORAGE_MISMATCH")
-        return _array(raw, header)
-
-
-def _named(members: list[Member]) -> Mapping[str, Member]:
-    named = {}
-    for member in members:
-        if "/" in member.name or not member.name.endswith(_SUFFIX):
-            raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
-        named[member.name.removesuffix(_SUFFIX)] = member
-    return named
-
-
-def _unpack(name: str, packed: memoryview, member: Member) -> memoryview:
-    """The entry's content. Never more than one byte beyond the claimed size is made."""
-    content = packed
-    if member.method == DEFLATED:
-        inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-        try:
-            content = memoryview(inflater.decompress(packed, member.size + 1))
-        except zlib.error as error:
-            raise _faulty_deflate(name) from error
-        if len(content) != member.size or not inflater.eof or inflater.unused_data:
-            raise _faulty_deflate(name)
-    if zlib.crc32(content) != member.crc32:
-        raise FieldFormatError(f"the bytes of {name} are damaged (CRC)", reason="ARCHIVE_CRC_MISMATCH")
-    return content
-
-
-def _faulty_deflate(name: str) -> FieldFormatError:
-    return malformed(f"{name} does not inflate to what the archive claims", "ARCHIVE_DEFLATE_MALFORMED")
-
-
-def _array(raw: memoryview, header: NpyHeader) -> npt.NDArray[Any]:
-    flat = np.frombuffer(raw[header.data_at :], dtype=header.dtype)
-    return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
+        if len(raw) - data_at != count * dtype.itemsize:
+            raise tensor_error(f"{name} has another size than its shape {shape}", "TENSOR_STORAGE_MISMATCH")
+        if dtype.kind not in kinds:
+            raise tensor_error(f"{name} holds {dtype.name}; {needed} are needed", "TENSOR_DTYPE")
+        flat = np.frombuffer(raw[data_at:], dtype)
+        return flat.reshape(shape, order="F" if fortran_order else "C")

@@ -129,10 +129,8 @@ _ZIP_NAME_AT = 30
 _TORCH_MEMBERS = frozenset(
     b"data.pkl data .data version byteorder .format_version .storage_alignment constants.pkl code".split()
 )
-_ONNX_VERSIONS, _ONNX_NEXT = (
-    tuple(bytes([n]) for n in range(3, 32)),
-    (b"\x12", b"\x1a", b"\x22", b"\x28", b"\x32", b"\x3a", b"\x42"),
-)
+_ONNX = re.compile(rb"\x08[\x03-\x1f][\x12\x1a\x22\x28\x32\x3a\x42]")
+"""A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
 _PACKAGES = ((b"[Content_Types].xml", "a 3MF model, or an office document"), (b"3D/", "a 3MF model"))
 _KERAS_MEMBERS = (b"metadata.json", b"config.json", b"model.weights.h5")
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
@@ -140,19 +138,15 @@ RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
 """Formats in which a whole training run may be given."""
 _PACKED = ((b"\x1f\x8b\x08", "gzip"), (b"BZh", "bzip2"), (b"\xfd7zXZ\x00", "xz"))
 _TAR_MAGIC, _TAR_MAGIC_AT, _OLD_TORCH_TAR = b"ustar", 257, b"sys_info\0"
+_PICTURE = "picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"
+_PAGE = "an HTML page, not a field; the download failed, or it needs a login"
 _OTHER_FILES = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
-    (b"<!doctype html", "an HTML page, not a field; the download failed, or it needs a login"),
-    (b"<html", "an HTML page, not a field; the download failed, or it needs a login"),
+    *((b"<!doctype html", _PAGE), (b"<html", _PAGE)),
     (b"<?xml", "an XML document, not a field; export a model as .glb, .ply, .obj or .stl"),
-    (b"\x89PNG", "a PNG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
-    (b"\xff\xd8\xff", "a JPEG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
-    (b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"),
-    (b"%PDF", "a PDF document, not a field"),
-    (
-        b"\x89HDF",
-        "an HDF5 file, as Keras writes it; export the network as ONNX, or save its arrays by numpy.savez",
-    ),
+    *((b"\x89PNG", f"a PNG {_PICTURE}"), (b"\xff\xd8\xff", f"a JPEG {_PICTURE}")),
+    *((b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"), (b"%PDF", "a PDF document, not a field")),
+    (b"\x89HDF", "an HDF5 file, as Keras writes it; export the network as ONNX, or save its arrays by numpy.savez"),
     (b"\x08\x01\x12", "a TensorFlow model; export the network as ONNX"),
 )
 """Files that people give by mistake: their first bytes, and what they are."""
@@ -199,7 +193,7 @@ def sniff_format(head: bytes) -> str | None:
         return "sqlite"
     if head[8:9] == b"{":
         return "safetensors"
-    return "onnx" if _may_be_onnx(head) else sniff_mesh(head)
+    return "onnx" if _ONNX.match(head) else sniff_mesh(head)
 
 
 def explain_refusal(head: bytes) -> tuple[str, str]:
@@ -234,11 +228,6 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         "FORMAT_NOT_RECOGNIZED",
         "none of the formats taken: torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of a run",
     )
-
-
-def _may_be_onnx(head: bytes) -> bool:
-    """A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
-    return head[:1] == b"\x08" and head[1:2] in _ONNX_VERSIONS and head[2:3] in _ONNX_NEXT
 
 
 def _package(first: bytes) -> str | None:

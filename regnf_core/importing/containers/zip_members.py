@@ -9,14 +9,13 @@ from __future__ import annotations
 import re
 import stat
 import struct
-from collections.abc import Collection
+import zlib
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
 from regnf_core.errors import FieldFormatError
 
-# The records of a zip file, decoded and bounds-checked one at a time. ``container`` checks what they say.
-
-Bytes = memoryview
+# The records of a zip file, decoded and bounds-checked one at a time.
 
 LOCAL_SIGNATURE = b"PK\x03\x04"
 _CENTRAL_SIGNATURE = b"PK\x01\x02"
@@ -42,13 +41,8 @@ def malformed(message: str, reason: str = "ARCHIVE_MALFORMED") -> FieldFormatErr
     return FieldFormatError(message, reason=reason)
 
 
-@dataclass(frozen=True)
-class Directory:
-    """Where the central directory lies (bytes from the file's start) and how many entries it claims."""
-
-    offset: int
-    end: int
-    count: int
+_Directory = tuple[int, int, int]
+"""Where the central directory begins and ends (bytes from the file's start), and how many entries it claims."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +61,7 @@ class Header:
     mode: int = 0
 
 
-def read_directory_end(data: Bytes) -> Directory:
+def _directory_end(data: memoryview) -> _Directory:
     """The end-of-central-directory record, which must be the file's last 22 bytes, and its zip64 companion if any.
 
     Raises FieldFormatError: ARCHIVE_MALFORMED, or ARCHIVE_MULTI_DISK for a part of a split archive.
@@ -78,8 +72,8 @@ def read_directory_end(data: Bytes) -> Directory:
         raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
     locator_at = at - _LOCATOR64.size
     if locator_at >= 0 and data[locator_at : locator_at + 4] == _LOCATOR64_SIGNATURE:
-        wide = _read_directory_end64(data, locator_at)
-        narrow = ((count, wide.count, _MAX16), (size, wide.end - wide.offset, _MAX32), (offset, wide.offset, _MAX32))
+        wide = start, end, entries = _directory_end64(data, locator_at)
+        narrow = ((count, entries, _MAX16), (size, end - start, _MAX32), (offset, start, _MAX32))
         if any(short not in (long, sentinel) for short, long, sentinel in narrow):
             raise malformed("the two directory records disagree")
         return wide
@@ -87,10 +81,10 @@ def read_directory_end(data: Bytes) -> Directory:
         raise malformed("the zip64 directory record is missing")
     if offset + size != at:
         raise malformed("the central directory does not end where the record says")
-    return Directory(offset, at, count)
+    return offset, at, count
 
 
-def _read_directory_end64(data: Bytes, locator_at: int) -> Directory:
+def _directory_end64(data: memoryview, locator_at: int) -> _Directory:
     _, disk, end64_at, disks = _LOCATOR64.unpack_from(data, locator_at)
     if disk or disks != 1:
         raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
@@ -101,10 +95,10 @@ def _read_directory_end64(data: Bytes, locator_at: int) -> Directory:
         raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
     if record != _END64.size - 12 or offset + size != end64_at:
         raise malformed("the central directory does not end where the zip64 record says")
-    return Directory(offset, end64_at, count)
+    return offset, end64_at, count
 
 
-def read_central_header(data: Bytes, at: int, limit: int) -> Header:
+def _central_header(data: memoryview, at: int, limit: int) -> Header:
     """The central header at ``at``; nothing of it may reach past ``limit``."""
     if at + _CENTRAL.size > limit or data[at : at + 4] != _CENTRAL_SIGNATURE:
         raise malformed("the central directory holds something that is not an entry")
@@ -123,7 +117,7 @@ def read_central_header(data: Bytes, at: int, limit: int) -> Header:
     return Header(name, flags, method, crc32, packed, size, offset, end, mode)
 
 
-def read_local_header(data: Bytes, at: int, limit: int) -> Header:
+def _local_header(data: memoryview, at: int, limit: int) -> Header:
     """The local header at ``at``; sizes and CRC are zero where a descriptor after the data carries them."""
     if at + _LOCAL.size > limit or data[at : at + 4] != LOCAL_SIGNATURE:
         raise malformed("no local header where the central directory says", "ARCHIVE_HEADER_MISMATCH")
@@ -137,7 +131,7 @@ def read_local_header(data: Bytes, at: int, limit: int) -> Header:
     return Header(bytes(data[name_at : name_at + name_length]), flags, method, crc32, packed, size, at, end)
 
 
-def _zip64_values(extra: Bytes) -> list[int]:
+def _zip64_values(extra: memoryview) -> list[int]:
     """The 64-bit numbers of the zip64 extra field, in order; the other extra fields (padding) are only walked."""
     found: list[int] | None = None
     at = fields = 0
@@ -167,6 +161,7 @@ def _widened(value: int, wide: list[int]) -> int:
 
 
 MAX_ENTRIES = 16_384
+_PIECE = 1 << 20
 STORED, DEFLATED = 0, 8
 _ENCRYPTION_FLAGS = 0x0001 | 0x0040 | 0x2000
 _DESCRIPTOR_FLAG = 0x0008
@@ -183,7 +178,46 @@ class Member:
     offset: int
     packed_size: int
     size: int
-    crc32: int
+    crc32: int | None
+    """None: there is no checksum."""
+
+    def content(self, data: memoryview, join: Callable[[Iterator[bytes], int], memoryview] | None = None) -> memoryview:
+        """The member's bytes in the zip file ``data``: a view of what is stored, else what they inflate to.
+
+        join: makes one of the inflated pieces, of so many bytes in all; None: in memory. Raises FieldFormatError:
+        ARCHIVE_DEFLATE_MALFORMED or ARCHIVE_CRC_MISMATCH.
+        """
+        content = data[self.offset : self.offset + self.packed_size]
+        if self.method == DEFLATED:
+            pieces = self._inflated(content)
+            content = memoryview(b"".join(pieces)) if join is None else join(pieces, self.size)
+        crc32 = 0
+        for start in range(0, len(content), _PIECE):
+            crc32 = zlib.crc32(content[start : start + _PIECE], crc32)
+        if self.crc32 not in (None, crc32):
+            raise malformed(f"the bytes of {self.name} are damaged (CRC)", "ARCHIVE_CRC_MISMATCH")
+        return content
+
+    def _inflated(self, packed: memoryview) -> Iterator[bytes]:
+        """Piece by piece; never more than the archive claims."""
+        inflater, left, at = zlib.decompressobj(-zlib.MAX_WBITS), self.size, 0
+        faulty = malformed(f"{self.name} does not inflate to what the archive claims", "ARCHIVE_DEFLATE_MALFORMED")
+        waiting: bytes | memoryview = b""
+        while not inflater.eof:
+            if not waiting:
+                waiting = packed[at : at + _PIECE]
+                at += len(waiting)
+            try:
+                piece = inflater.decompress(waiting, min(_PIECE, left + 1))
+            except zlib.error as error:
+                raise faulty from error
+            if len(piece) > left or (not piece and not waiting):
+                raise faulty
+            waiting = inflater.unconsumed_tail
+            left -= len(piece)
+            yield piece
+        if left or waiting or inflater.unused_data or at != len(packed):
+            raise faulty
 
 
 def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders: bool = False) -> list[Member]:
@@ -195,8 +229,8 @@ def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders
     docs/import-gate.md.
     """
     _check_ends(data)
-    directory = read_directory_end(data)
-    return _tile(data, _central_headers(data, directory, methods), directory.offset, folders)
+    directory = _directory_end(data)
+    return _tile(data, _central_headers(data, directory, methods), directory[0], folders)
 
 
 def _check_ends(data: memoryview) -> None:
@@ -213,17 +247,17 @@ def _check_ends(data: memoryview) -> None:
     raise FieldFormatError("the archive's end is missing: the file was cut short", reason="FILE_TRUNCATED")
 
 
-def _central_headers(data: memoryview, directory: Directory, methods: Collection[int]) -> list[Header]:
-    if not 0 < directory.count <= MAX_ENTRIES:
-        raise malformed(f"{directory.count} entries; at most {MAX_ENTRIES} are read", "ARCHIVE_TOO_MANY_ENTRIES")
+def _central_headers(data: memoryview, directory: _Directory, methods: Collection[int]) -> list[Header]:
+    at, end, count = directory
+    if not 0 < count <= MAX_ENTRIES:
+        raise malformed(f"{count} entries; at most {MAX_ENTRIES} are read", "ARCHIVE_TOO_MANY_ENTRIES")
     headers = []
-    at = directory.offset
-    for _ in range(directory.count):
-        header = read_central_header(data, at, directory.end)
-        _check_header(header, directory.offset, methods)
+    for _ in range(count):
+        header = _central_header(data, at, end)
+        _check_header(header, directory[0], methods)
         headers.append(header)
         at = header.end
-    if at != directory.end:
+    if at != end:
         raise malformed("the central directory holds more than its entries")
     if len({header.name for header in headers}) != len(headers):
         raise malformed("two entries share a name", "ARCHIVE_DUPLICATE_ENTRY")
@@ -239,17 +273,13 @@ def _check_header(header: Header, data_end: int, methods: Collection[int]) -> No
         raise malformed("the archive holds something else than plain files", "ARCHIVE_SPECIAL_FILE")
     if header.method not in methods:
         raise malformed("an entry is compressed in a way that is not taken", "ARCHIVE_COMPRESSED_ENTRY")
-    if header.flags & ~(_DESCRIPTOR_FLAG | _UTF8_FLAG | _deflate_flags(header)):
+    # A deflated entry may tell how hard the packer tried, in two flags.
+    if header.flags & ~(_DESCRIPTOR_FLAG | _UTF8_FLAG | (0x0006 if header.method == DEFLATED else 0)):
         raise malformed("an entry has flags that no trainer's library sets")
     if header.method == STORED and header.compressed_size != header.size:
         raise malformed("a stored entry has two sizes", "ARCHIVE_HEADER_MISMATCH")
     if header.compressed_size > data_end or header.local_offset >= data_end:
         raise malformed("an entry claims bytes beyond the file's", "ARCHIVE_ENTRY_OUT_OF_BOUNDS")
-
-
-def _deflate_flags(header: Header) -> int:
-    """The two flags in which a deflated entry may tell how hard the packer tried."""
-    return 0x0006 if header.method == DEFLATED else 0
 
 
 def _tile(data: memoryview, headers: list[Header], data_end: int, folders: bool) -> list[Member]:
@@ -259,7 +289,7 @@ def _tile(data: memoryview, headers: list[Header], data_end: int, folders: bool)
     for central in sorted(headers, key=lambda header: header.local_offset):
         if central.local_offset != expected:
             raise _gap(expected, central.local_offset)
-        local = read_local_header(data, central.local_offset, data_end)
+        local = _local_header(data, central.local_offset, data_end)
         _check_same(central, local)
         end = local.end + central.compressed_size
         if end > data_end:
@@ -272,7 +302,10 @@ def _tile(data: memoryview, headers: list[Header], data_end: int, folders: bool)
 
 
 def _member(header: Header, offset: int, folders: bool) -> Member:
-    name = _decoded(header)
+    try:
+        name = header.name.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise malformed("an entry's name is not UTF-8", "ARCHIVE_ENTRY_NAME") from error
     path = name.removesuffix("/") if folders and header.size == 0 else name
     if not all(_PART.fullmatch(part) and part not in (".", "..") for part in path.split("/")):
         raise malformed("an entry's name leaves the archive's folder or is not a valid name", "ARCHIVE_ENTRY_NAME")
@@ -308,10 +341,3 @@ def _descriptor_size(data: memoryview, central: Header, at: int, limit: int) -> 
         if bytes(data[at : at + length]) == wanted:
             return length
     raise malformed("the descriptor behind an entry contradicts the central directory", "ARCHIVE_HEADER_MISMATCH")
-
-
-def _decoded(header: Header) -> str:
-    try:
-        return header.name.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise malformed("an entry's name is not UTF-8", "ARCHIVE_ENTRY_NAME") from error

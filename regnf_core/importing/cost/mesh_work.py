@@ -22,16 +22,12 @@ SAMPLES = 16_384
 """Points that a field is checked at."""
 TRIAL_POINTS = 1_024
 """Points that each of several readings is tried at, with its gradient."""
-MAX_TRIED, TRIED_MORE, TRIED_NEAR = 64, 128, 32
-"""The most usual readings, which are all tried; more of them, where no levels tell; and those next to the best one."""
-CLIMB_POINTS, MAX_CLIMBS = 2_048, 3
-"""Points at which better readings are looked for beside the best one, and how often from there on."""
-WRITTEN_NEAR, READINGS_BESIDE = 13, 11
-"""Readings that are tried beside the best one: of numbers that somebody would write, and of others."""
+MAX_TRIED, TRIED_MORE = 64, 32
+"""The most usual readings, which are all tried; and those of the best grid over other cubes or beside other sines."""
 FINAL_POINTS, FINALISTS = 8_192, 12
 """Points of the second round, and how many rivals may come into it."""
-LAST_POINTS, LAST_FINALISTS = 32_768, 3
-"""The same of the third round, for what the second one leaves open. The interpolation is told at as many points."""
+LAST_POINTS = 32_768
+"""Points of the third round, in which the interpolation is told where the second one leaves it open."""
 SHARES = (1, 2, 4, 8)
 """Of a field whose trials would take too long, all rounds but the first have a half, a quarter or an eighth of the
 points."""
@@ -67,15 +63,11 @@ def calls_of_check(samples: int) -> Calls:
 def calls_of_trials(readings: int, share: int = 1) -> Calls:
     """What the choice among so many readings evaluates at most; after the first round at one ``share``-th of the
     points."""
-    first = (TRIAL_POINTS,) * (min(readings, MAX_TRIED + TRIED_MORE + TRIED_NEAR) + 1)
-    climbs = (CLIMB_POINTS,) * (MAX_CLIMBS * (WRITTEN_NEAR + READINGS_BESIDE) + 1)
-    final = (FINAL_POINTS,) * (2 * min(readings, FINALISTS) + LAST_FINALISTS + READINGS_BESIDE + 7)
-    last = (LAST_POINTS,) * (LAST_FINALISTS + 3)
-    values = tuple(
-        4 * points // share
-        for points in (CLIMB_POINTS, FINAL_POINTS, FINAL_POINTS, FINAL_POINTS, LAST_POINTS, LAST_POINTS)
-    )
-    gradients = tuple(points // share for points in climbs + final + last)
+    first = (TRIAL_POINTS,) * (min(readings, MAX_TRIED + TRIED_MORE) + 2)
+    final = (FINAL_POINTS,) * (2 * min(readings, FINALISTS) + 7)
+    last = (LAST_POINTS,) * 2
+    values = tuple(4 * points // share for points in (FINAL_POINTS, FINAL_POINTS, LAST_POINTS))
+    gradients = tuple(points // share for points in final + last)
     return Calls((4 * TRIAL_POINTS, *values), first + gradients)
 
 
@@ -184,9 +176,13 @@ def require_within(seconds: float, work_s: float) -> None:
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
 
 
-def require_room(needed: int, memory_bytes: int) -> None:
-    """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more bytes are estimated than libraries and upload leave."""
-    room = max(memory_bytes - _LIBRARIES, memory_bytes // 2)
+def free_room(memory_bytes: int) -> int:
+    """Bytes that libraries and upload leave of so many."""
+    return max(memory_bytes - _LIBRARIES, memory_bytes // 2)
+
+
+def require_room(needed: int, room: int) -> None:
+    """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more bytes are estimated than there are."""
     if needed > room:
         message = f"the field's values would take an estimated {needed >> 20} MiB at once; {room >> 20} MiB are free"
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")

@@ -8,12 +8,10 @@ from typing import Any
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families import (
     deepsdf,
-    deepsdf_blocks,
     instant_nsr_pl,
     neuralangelo,
     neus,
     pin_slam,
-    plain_network,
     sdfstudio,
     siren,
     unsupported,
@@ -30,15 +28,13 @@ but cannot be taken."""
 FAMILIES: tuple[Family, ...] = (
     sdfstudio.convert,
     neus.convert,
-    neus.convert_implicit,
     instant_nsr_pl.convert,
     neuralangelo.convert,
     deepsdf.convert,
-    deepsdf_blocks.convert,
+    deepsdf.convert_blocks,
     siren.convert,
     pin_slam.convert,
     unsupported.refuse,
-    plain_network.convert,
 )
 
 _SHOWN_KEYS = 8

@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.npz import ArraySource
-from regnf_core.importing.families import dense_grid, plain_arrays, voxel_block_grid
+from regnf_core.importing.families import dense_grid, voxel_block_grid
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.upload_description import UploadDescription
 
 ArrayFamily = Callable[[ArraySource, UploadDescription], ConvertedField | None]
 """Returns None unless the arrays are the family's; raises FieldFormatError if they are but cannot be taken."""
 
-ARRAY_FAMILIES: tuple[ArrayFamily, ...] = (voxel_block_grid.convert, dense_grid.convert, plain_arrays.convert)
+ARRAY_FAMILIES: tuple[ArrayFamily, ...] = (voxel_block_grid.convert, dense_grid.convert)
 
 _SHOWN_NAMES = 8
 

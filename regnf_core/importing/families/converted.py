@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from regnf_core.errors import MOST_CANDIDATES, FieldFormatError
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.schema.description import FREE, OBSERVATION, UNSEEN, ObservationGrid
 
@@ -30,34 +33,12 @@ class Reading:
     """How a grid is interpolated: said or the only way of the family, or asked unless the weights tell."""
     scale: float | None = None
     """Natural logarithm of the finest resolution: how far two layouts are apart."""
-    is_written: bool = True
-    """Whether somebody would put its numbers into a configuration; others are only compared with."""
-
-    def has_sines_of(self, other: Reading) -> bool:
-        """Whether both divide the first layer's columns alike."""
-        return self.description.get("positional_encoding") == other.description.get("positional_encoding")
 
     def is_grid_of(self, other: Reading) -> bool:
         """Whether both have the same grid, but for the growth's last digits."""
         mine, others = (dict(reading.description.get("hash") or {}) for reading in (self, other))
         growths = mine.pop("per_level_scale", 0.0), others.pop("per_level_scale", 0.0)
         return mine == others and math.isclose(*growths, rel_tol=1e-9)
-
-
-@dataclass(frozen=True)
-class OpenReading:
-    """A reading that is made only when it is tried: there may be many, and each has tensors of its own."""
-
-    name: str
-    """What to say in a description to get it."""
-    family: str
-    make: Callable[[], Reading]
-    ends_at: float | None = None
-    """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
-    known_to: float | None = None
-    """The distance beyond which the trainer leaves values to themselves, where it is known."""
-    nearby: tuple[Callable[[], Reading], ...] = ()
-    """Readings a little off this one, which behave less well if it is the right one of a family of many."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +49,19 @@ class Variant:
     name: str
     say: dict[str, Any]
     of: Callable[[Reading], Reading]
+
+
+@dataclass(frozen=True)
+class Assumed:
+    """A number that no tensor tells: the usual one is taken if the field then behaves like a distance.
+
+    say: the entries of a description that give it · beside: readings with the number a little off, which behave less
+    well if it is right · others: what else it usually is.
+    """
+
+    say: dict[str, Any]
+    beside: tuple[Callable[[], Reading], ...] = ()
+    others: tuple[Variant, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,13 +77,46 @@ class ConvertedField:
     readings: tuple[Reading, ...] = ()
     """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
     one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
-    open_readings: tuple[OpenReading, ...] = ()
-    """The same where what decides is how a network of plain layers behaves; see
-    :mod:`regnf_core.importing.gate.network_form`."""
+    assumed: Assumed | None = None
     untold: tuple[Variant, ...] = ()
     """Functions between which no behavior decides: a person is asked, once the readings are settled."""
     sign_is_open: bool = False
     """Whether trainers of this family save fields of either sign, and the upload does not say which this is."""
+
+    @property
+    def reading(self) -> Reading:
+        """The function as it is now."""
+        return Reading(self.family, self.description, self.tensors)
+
+
+@dataclass(frozen=True)
+class OpenCandidate:
+    """name: what distinguishes it · say: the entries of a description that choose it · make: gives its function."""
+
+    name: str
+    say: dict[str, Any]
+    make: Callable[[], Reading] = field(repr=False)
+
+
+class AmbiguousError(FieldFormatError):
+    """The evidence leaves several functions; ``asked`` holds those that are shown, the likeliest first."""
+
+    reason = "LAYOUT_AMBIGUOUS"
+
+    def __init__(self, message: str, asked: Sequence[OpenCandidate]) -> None:
+        super().__init__(message)
+        lines: dict[str, OpenCandidate] = {}
+        for one in asked:
+            if one.say:
+                lines.setdefault(json.dumps(one.say, sort_keys=True), one)
+        self.asked = tuple(lines.values())[:MOST_CANDIDATES]
+
+
+def untold_error(converted: ConvertedField, variants: Sequence[Variant], what: str) -> AmbiguousError:
+    """The refusal of a field that is one of ``variants``, because of ``what``."""
+    asked = [OpenCandidate(one.name, one.say, partial(one.of, converted.reading)) for one in variants]
+    lines = " or ".join(json.dumps(one.say) for one in asked[:MOST_CANDIDATES])
+    return AmbiguousError(f"{what}; add to the description {lines}", asked)
 
 
 def converted_of(

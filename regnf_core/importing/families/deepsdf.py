@@ -7,7 +7,6 @@ shape is constant, so it is folded into the biases, and what remains is a field.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -19,24 +18,24 @@ from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
     Layers,
+    folded_weight,
     layer_names,
     read_layers,
     refuse_other_entries,
     require_extra_columns,
     require_family,
     shared_entries,
+    states,
     strip_prefix,
 )
-from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
+from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, form_variant, network_field
 from regnf_core.importing.pickle.pickle_machine import TensorRef
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
-FAMILY, IGR = "deepsdf", "igr"
+FAMILY = "deepsdf"
 _PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
-_CLAMP = 0.1
-"""Where published configurations cut distances off."""
 
 
 def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
@@ -55,8 +54,13 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     names = layer_names(state, "lin")
     layers = read_layers(state, names, source, column=overrides.output_column or 0)
     norms = _norms(state, layers, source)
-    own = _is_deepsdfs(state, norms)
-    require_family(overrides, IGR if overrides.family == IGR and not own else FAMILY)
+    require_family(overrides, FAMILY)
+    if overrides.family is None and not norms and all(f"{name}.weight" in state for name in names[:-1]):
+        message = (
+            "a DeepSDF without weight normalization, or IGR's network, which has the same names: say"
+            ' {"family": "deepsdf"} if it is the first; of the other give the mesh'
+        )
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
     width = layers.input_width - 3
     if width < 0:
         raise tensor_error(f"lin0 has {layers.input_width} columns, expected 3 or more", "TENSOR_SHAPE")
@@ -70,33 +74,13 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
     )
     folded = Network(at_code(layers, latent, (0, *whole)), tuple(seeing), norms)
-    return network_field(folded, _forms(overrides, own), shared_entries(overrides, UNIT_CUBE), why)
-
-
-def _is_deepsdfs(state: dict[str, Any], norms: dict[str, Float32Array]) -> bool:
-    """IGR's network (Gropp et al. 2020) has the same names; DeepSDF's has normalized weights or normalized layers."""
-    return bool(norms) or not all(f"lin{i}.weight" in state for i in range(len(state) // 2 - 1))
-
-
-def _forms(overrides: UploadDescription, own: bool) -> list[OpenForm]:
-    """DeepSDF's, with one tanh at the end, or with ``use_tanh`` two; IGR's where the names leave it open."""
-    tanhs = (1, 2) if overrides.output_tanh is None else (overrides.output_tanh,)
-    forms = [
-        OpenForm(
-            told(output_tanh=n),
-            Form("relu", output_tanh=n).said(replace(overrides, output_tanh=n)),
-            FAMILY,
-            known_to=_CLAMP,
-        )
-        for n in tanhs
-    ]
-    igr = Form("softplus", skip_factor=math.sqrt(0.5)).said(overrides)
-    if overrides.family == IGR:
-        return [OpenForm(told(family=IGR), igr, IGR)]
-    if own or overrides.family == FAMILY:
-        return forms
-    named = (replace(one, name=told(family=FAMILY, output_tanh=one.form.output_tanh)) for one in forms)
-    return [OpenForm(told(family=IGR), igr, IGR), *named]
+    entries, form = shared_entries(overrides, UNIT_CUBE), Form("relu", output_tanh=1).said(overrides)
+    converted = network_field(folded, form, FAMILY, entries, why)
+    if overrides.output_tanh is not None:
+        return converted
+    forms = [replace(form, output_tanh=tanhs) for tanhs in (1, 2)]  # the second where ``use_tanh`` is set
+    untold = tuple(form_variant(folded, one, FAMILY, entries, output_tanh=one.output_tanh) for one in forms)
+    return replace(converted, untold=untold)
 
 
 def _refuse_codes_alone(checkpoint: dict[Any, Any]) -> None:
@@ -163,3 +147,74 @@ def at_code(layers: Layers, latent: Float32Array, whole: tuple[int, ...]) -> Lay
         biases[i] = np.asarray(biases[i] + coded @ latent, dtype=np.float32)
         weights[i] = np.delete(weights[i], slice(start, start + len(latent)), axis=1)
     return Layers(tuple(weights), tuple(biases))
+
+
+# DeepSDF as widespread later code writes it: blocks ``net.*.0`` of a layer and ReLU, ``final_layer.0`` and one tanh.
+#
+# A narrower ``skip_layer.0``, behind which the network sees its input again, is in the file even where it is not used,
+# and nothing says behind which block it is: if several places fit, it is asked.
+
+BLOCKS = "deepsdf_blocks"
+_USUAL = 3
+"""How many blocks usually stand before the narrower layer."""
+
+
+def convert_blocks(
+    checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription
+) -> ConvertedField | None:
+    """The signed distance field of one shape, or None where the keys are not theirs.
+
+    Raises FieldFormatError: LATENT_MISSING, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what TensorSource
+    raises.
+    """
+    found = [state for _, state in states(checkpoint) if "final_layer.0.bias" in state and "net.0.0.bias" in state]
+    if len(found) != 1:
+        return None
+    (state,) = found
+    require_family(overrides, BLOCKS)
+    refuse_other_entries(overrides, BLOCKS, ("latent", "latent_index", "skip_layer", *FORM_ENTRIES))
+    blocks = [f"net.{name}.0" for name in layer_names(strip_prefix(state, "net."), "", minimum=1)]
+    plain = read_layers(state, [*blocks, "final_layer.0"], source, column=overrides.output_column or 0)
+    width = plain.input_width - 3
+    if width < 0 or any(plain.extra_columns):
+        raise tensor_error("net: a block does not continue the one before", "TENSOR_SHAPE")
+    latent, whence = latent_code(checkpoint, source, overrides, width)
+    form = replace(Form("relu"), output_tanh=1 if overrides.output_tanh is None else overrides.output_tanh)
+    form = form.said(overrides)
+    entries = shared_entries(overrides, UNIT_CUBE)
+    places = [
+        (place, Network(at_code(layers, latent, (0, *skips)), skips))
+        for place, layers, skips in _places(state, plain, source, overrides)
+    ]
+    if not places:
+        raise FieldFormatError("description.skip_layer: there is no such place", reason="INVALID_DESCRIPTION")
+    why = (
+        f"keys net.*.0 and final_layer.0, {len(blocks)} blocks",
+        whence,
+        "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
+    )
+    converted = network_field(places[0][1], form, BLOCKS, entries, why)
+    if len(places) == 1:
+        return converted
+    untold = tuple(form_variant(network, form, BLOCKS, entries, skip_layer=place) for place, network in places)
+    return replace(converted, untold=untold)
+
+
+def _places(
+    state: dict[str, Any], plain: Layers, source: TensorSource, overrides: UploadDescription
+) -> list[tuple[int, Layers, tuple[int, ...]]]:
+    """How many blocks stand before the narrower layer (0: it is not used), the layers, and which see the input."""
+    found: list[tuple[int, Layers, tuple[int, ...]]] = [(0, plain, ())]
+    if any(name.startswith("skip_layer.0.") for name in state):
+        weight = folded_weight(state, "skip_layer.0", source)
+        bias = source.array("skip_layer.0.bias", lookup(state, "skip_layer.0.bias"))
+        require_shape("skip_layer.0.bias", bias, (weight.shape[0],))
+        for place in sorted(range(1, len(plain.weights)), key=lambda place: (place != _USUAL, place)):
+            weights = (*plain.weights[:place], weight, *plain.weights[place:])
+            biases = (*plain.biases[:place], bias, *plain.biases[place:])
+            layers = Layers(weights, biases)
+            extra = [i for i, columns in enumerate(layers.extra_columns) if columns]
+            if extra == [place + 1] and layers.extra_columns[place + 1] == plain.input_width:
+                found.append((place, layers, (place + 1,)))
+        found.sort(key=lambda one: one[0] != _USUAL)
+    return [one for one in found if overrides.skip_layer in (None, one[0])]

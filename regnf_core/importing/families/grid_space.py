@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ def solve(
 
 def _full(cap: int, levels: int, bases: Sequence[int]) -> Iterator[GridInterval]:
     """The grids all of whose levels have ``cap`` entries, if that is a power of two: one, whatever base and growth."""
-    beyond = [base for base in bases if _round_up(base**3) >= cap]
+    beyond = [base for base in bases if base**3 + _ALIGNMENT > cap]  # rounded up it has cap entries or more
     if cap & (cap - 1) == 0 and beyond:
         yield GridInterval(levels, cap.bit_length() - 1, min(beyond), 1.0, MAX_GROWTH, base_is_free=len(beyond) > 1)
 
@@ -164,12 +164,7 @@ def _function(interval: GridInterval) -> object:
     if interval.levels == 1:
         interval = GridInterval(1, interval.log2_table_size, interval.base_resolution, 1.0, 1.0)
     sizes = HashGridConfig(
-        interval.levels,
-        1,
-        interval.log2_table_size,
-        interval.base_resolution,
-        interval.lowest,
-        interval.resolutions,
+        interval.levels, 1, interval.log2_table_size, interval.base_resolution, interval.lowest, interval.resolutions
     ).level_entries()
     return interval.base_resolution, interval.lowest, interval.highest, sizes
 
@@ -182,11 +177,7 @@ def _ints(values: Sequence[int]) -> _Ints:
     return np.array(values, dtype=np.int64)
 
 
-@overload
-def _round_up(nodes: int) -> int: ...
-@overload
-def _round_up(nodes: _Ints) -> _Ints: ...
-def _round_up(nodes: int | _Ints) -> int | _Ints:
+def _round_up(nodes: _Ints) -> _Ints:
     return -(-nodes // _ALIGNMENT) * _ALIGNMENT
 
 

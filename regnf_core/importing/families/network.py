@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +12,7 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array
-from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
+from regnf_core.importing.families.converted import ConvertedField, Reading, Variant
 from regnf_core.importing.families.layers import Layers, contradiction, require_extra_columns
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds import LEAKY_SLOPE
@@ -22,7 +20,6 @@ from regnf_core.schema.kinds import LEAKY_SLOPE
 OMEGA, BETA = 30.0, 100.0
 """The usual factors of a sine's argument and of softplus's."""
 _USUAL_SCALES = {"softplus": BETA, "sine": OMEGA, "leaky_relu": LEAKY_SLOPE}
-_A_LITTLE = (0.97, 1.03)
 FORM_ENTRIES = (
     "activation",
     "activation_scale",
@@ -56,7 +53,6 @@ class Form:
     degree: int = 0
     order: Order = "frequency"
     base_frequency: float = 1.0
-    off_axis: bool = False
     skip_factor: float = 1.0
     """Of [hidden, input] where a layer sees the input again."""
     input_first: bool = False
@@ -71,11 +67,6 @@ class Form:
     def scale(self) -> float:
         """The activation's factor, the usual one where none is said."""
         return self.activation_scale or _USUAL_SCALES.get(self.activation, 1.0)
-
-    @property
-    def sines_width(self) -> int:
-        """Columns of sines and cosines."""
-        return (42 if self.off_axis else 6) * self.degree
 
     def said(self, overrides: UploadDescription) -> Form:
         """This form with what the description says of it. Raises FieldFormatError (INVALID_DESCRIPTION)."""
@@ -110,10 +101,8 @@ class Network:
     norms: Mapping[str, Float32Array] = field(default_factory=dict)
 
 
-def network_reading(
-    name: str, network: Network, form: Form, entries: Mapping[str, Any], source: Mapping[str, Any]
-) -> Reading:
-    """The field of kind ``mlp``. entries: those that all kinds share · source: notes on the field's origin."""
+def network_reading(family: str, network: Network, form: Form, entries: Mapping[str, Any]) -> Reading:
+    """The field of kind ``mlp``. entries: those that all kinds share."""
     tensors = _folded(network, form)
     normalized = sorted({int(name.split(".")[1]) for name in network.norms})
     description = {
@@ -123,69 +112,28 @@ def network_reading(
         "input_at": list(network.skips),
         "normalized": normalized,
         "output_tanh": form.output_tanh,
-        "source": dict(source),
+        "source": {"family": family},
     }
     if form.activation == "leaky_relu":
         description["negative_slope"] = form.scale
     if form.degree:
         frequency = form.base_frequency * form.input_scale
-        description["positional_encoding"] = {
-            "degree": form.degree,
-            "base_frequency": frequency,
-            "off_axis": form.off_axis,
-        }
-    return Reading(name, description, tensors)
-
-
-@dataclass(frozen=True)
-class OpenForm:
-    """A form that a network may have, the family that it would be, and what to say to get it."""
-
-    name: str
-    form: Form
-    family: str
-    network: Network | None = None
-    """Where its layers are other ones than the network's own."""
-    ends_at: float | None = None
-    """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
-    known_to: float | None = None
-    """The distance beyond which the trainer leaves values to themselves, where it is known."""
-    scale_is_open: bool = False
-    """Whether the activation's factor is a guess at a number that might be any."""
+        description["positional_encoding"] = {"degree": form.degree, "base_frequency": frequency, "off_axis": False}
+    return Reading(family, description, tensors)
 
 
 def network_field(
-    network: Network, forms: Sequence[OpenForm], entries: Mapping[str, Any], why: tuple[str, ...], assumed: bool = False
+    network: Network, form: Form, family: str, entries: Mapping[str, Any], why: tuple[str, ...]
 ) -> ConvertedField:
-    """The field of one form, or of the first of several, the others to be tried; the most usual is the first.
-
-    assumed: whether even a single form is a guess that the field's behavior must confirm.
-    """
-
-    def make(one: OpenForm) -> Reading:
-        return network_reading(one.name, one.network or network, one.form, entries, {"family": one.family})
-
-    first = make(forms[0])
-    others = tuple(_open_reading(one, make) for one in forms)
-    tried = others if assumed or len(forms) > 1 else ()
-    return ConvertedField(forms[0].family, why, first.description, first.tensors, open_readings=tried)
+    """The field of one form."""
+    reading = network_reading(family, network, form, entries)
+    return ConvertedField(family, why, reading.description, reading.tensors)
 
 
-def _open_reading(one: OpenForm, make: Callable[[OpenForm], Reading]) -> OpenReading:
-    nearby = [partial(make, replace(one, form=form)) for form in _nearby(one.form)] if one.scale_is_open else []
-    return OpenReading(one.name, one.family, partial(make, one), one.ends_at, one.known_to, tuple(nearby))
-
-
-def _nearby(form: Form) -> list[Form]:
-    """With one of the activation's factors a little smaller or larger, the other as it is."""
-    if form.activation not in _USUAL_SCALES:
-        return []
-    first = form.first_activation_scale or form.scale if form.activation == "sine" else None
-    near = [replace(form, activation_scale=form.scale * by, first_activation_scale=first) for by in _A_LITTLE]
-    if first is not None:
-        near += [replace(form, first_activation_scale=first * by) for by in _A_LITTLE]
-        near += [replace(form, activation_scale=form.scale * by, first_activation_scale=first * by) for by in _A_LITTLE]
-    return near
+def form_variant(network: Network, form: Form, family: str, entries: Mapping[str, Any], **say: object) -> Variant:
+    """The network in another form; ``say``: the entries of a description that choose it."""
+    name = ", ".join(f"{key} {value}" for key, value in say.items())
+    return Variant(name, say, lambda _: network_reading(family, network, form, entries))
 
 
 def _folded(network: Network, form: Form) -> dict[str, Float32Array]:
@@ -218,7 +166,7 @@ def _row_factor(form: Form, layer: int, before: float) -> float:
 
 def _column_factors(width: int, network: Network, layer: int, form: Form, after: float) -> npt.NDArray[np.float64]:
     """Of each column of a layer: hidden ones by ``after``, the position by the input's scale, a skip by its factor."""
-    inputs = 3 + form.sines_width
+    inputs = 3 + 6 * form.degree
     own = np.ones(inputs)
     own[:3] = form.input_scale
     if layer == 0:
@@ -236,8 +184,8 @@ def _in_our_order(weight: Float32Array, width: int, form: Form, first: bool) -> 
     start = 0 if form.input_first else hidden
     own = weight[:, start : start + width]
     rest = np.delete(weight, slice(start, start + width), axis=1) if hidden else weight[:, :0]
-    bare = width - form.sines_width
-    sines = own[:, bare:][:, encoding_order(form.order, form.degree, form.sines_width)]
+    bare = width - 6 * form.degree
+    sines = own[:, bare:][:, encoding_order(form.order, form.degree, 6 * form.degree)]
     position = own[:, :3] if bare else np.zeros((len(weight), 3), dtype=np.float32)
     whole = np.concatenate((rest, position, sines), axis=1)
     return np.asarray(whole, dtype=np.float32)
@@ -269,11 +217,6 @@ def skips_of(layers: Layers, names: Sequence[str]) -> tuple[int, ...]:
     skips = tuple(i for i, extra in enumerate(layers.extra_columns) if extra)
     require_extra_columns(layers, names, dict.fromkeys(skips, layers.input_width))
     return skips
-
-
-def told(**entries: object) -> str:
-    """Entries as a description has them: what to say to get a reading."""
-    return json.dumps(entries)
 
 
 def _invalid(name: str, message: str) -> FieldFormatError:

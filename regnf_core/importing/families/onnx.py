@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
-from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
+from regnf_core.importing.families.converted import Assumed, ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
     contradiction,
@@ -62,9 +61,7 @@ def convert_onnx(data: memoryview, tensor_bytes: int, overrides: UploadDescripti
     converted = ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
     if column is None or overrides.output_column is not None:
         return converted
-    name = json.dumps({"output_column": column})
-    guess = OpenReading(name, "onnx", lambda: Reading(name, description, parts.tensors))
-    return replace(converted, open_readings=(guess,))
+    return replace(converted, assumed=Assumed({"output_column": column}))
 
 
 def _column(made: Port, overrides: UploadDescription) -> int | None:

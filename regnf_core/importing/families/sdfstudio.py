@@ -16,7 +16,7 @@ import numpy as np
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.color import studio
-from regnf_core.importing.families.color.head import with_assumption, with_color, with_deviation
+from regnf_core.importing.families.color.head import ASSUMED, with_color, with_deviation
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces, most_usual, space_readings
 from regnf_core.importing.families.layers import (
@@ -33,6 +33,7 @@ from regnf_core.importing.families.layers import (
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder
 from regnf_core.importing.tensor_source import TensorSource, as_tensor, lookup
 from regnf_core.importing.upload_description import GridDescription, UploadDescription
+from regnf_core.schema.description import COLOR
 from regnf_core.schema.kinds import SKIP_LAYER
 
 _RADIUS = 2.0
@@ -96,7 +97,10 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         return converted
     color, two_pi = overrides.color, variant.two_pi
     converted = with_color(converted, lambda: studio.read_color(state, names[-1], source, color, two_pi))
-    return with_assumption(converted, studio.assumed_of(state, color))
+    assumed = studio.assumed_of(state, color)
+    if assumed is None or COLOR not in converted.description:
+        return converted
+    return replace(converted, warnings=(*converted.warnings, f"{ASSUMED}: {assumed}"))
 
 
 def _tell_variant(state: dict[str, Any], layers: int, overrides: UploadDescription) -> tuple[_Variant, str]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from regnf_core.importing.arrays import tensor_error
-from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.converted import Assumed, ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
     layer_names,
@@ -17,13 +20,21 @@ from regnf_core.importing.families.layers import (
     shared_entries,
     strip_prefix,
 )
-from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
+from regnf_core.importing.families.network import (
+    FORM_ENTRIES,
+    Form,
+    Network,
+    form_variant,
+    network_field,
+    network_reading,
+)
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "siren"
-OMEGAS = (30.0, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 60.0, 100.0)
-_FIRST_OMEGAS = (10.0, 20.0, 30.0, 60.0)
+OMEGAS = (30.0, 20.0, 10.0, 15.0, 60.0, 1.0)
+"""The factor in the authors' code, and others that are usual."""
+_A_LITTLE = (0.97, 1.03)
 _PREFIX = "net.net."
 
 
@@ -42,38 +53,25 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     if layers.input_width != 3:
         raise tensor_error(f"{_PREFIX}{names[0]} has {layers.input_width} columns, expected 3", "TENSOR_SHAPE")
     require_extra_columns(layers, names)
-    said = Form("sine").said(overrides)
+    network, form, entries = Network(layers), Form("sine").said(overrides), shared_entries(overrides, UNIT_CUBE)
     why = (
         f"keys {_PREFIX}*.0, {len(names)} layers",
         "bounds [-1, 1]: beyond the cube in which SIREN trains its sines repeat",
     )
-    assumed = overrides.activation_scale is None
-    forms = [OpenForm(sine_name(form), form, FAMILY, scale_is_open=assumed) for form in sine_forms(said, overrides)]
-    converted = network_field(Network(layers), forms, shared_entries(overrides, UNIT_CUBE), why, assumed)
+    converted = network_field(network, form, FAMILY, entries, why)
+    if overrides.activation_scale is None:
+        first, *others = (
+            form_variant(network, replace(form, activation_scale=omega), FAMILY, entries, activation_scale=omega)
+            for omega in OMEGAS
+        )
+        beside = tuple(partial(network_reading, FAMILY, network, near, entries) for near in _near(form))
+        converted = replace(converted, assumed=Assumed(first.say, beside, tuple(others)))
     return replace(converted, sign_is_open=overrides.sign is None)
 
 
-def sine_forms(said: Form, overrides: UploadDescription) -> list[Form]:
-    """The usual factors of a network of sines, the most usual first, but for those that the description says.
-
-    The first layer's may be another than that of the rest.
-    """
-    if said.activation != "sine" or overrides.activation_scale is not None:
-        return [said]
-    scales = [replace(said, activation_scale=omega) for omega in OMEGAS]
-    if said.first_activation_scale is not None:
-        return scales
-    firsts = [
-        replace(form, first_activation_scale=first)
-        for form in scales
-        for first in _FIRST_OMEGAS
-        if first != form.activation_scale
-    ]
-    return scales + firsts
-
-
-def sine_name(form: Form) -> str:
-    """What to say to get these factors."""
-    if form.first_activation_scale is None:
-        return told(activation_scale=form.scale)
-    return told(activation_scale=form.scale, first_activation_scale=form.first_activation_scale)
+def _near(form: Form) -> Iterator[Form]:
+    """With the factors a little off: the first layer's, the others', both."""
+    first = form.first_activation_scale or form.scale
+    for own, rest in itertools.product((1.0, *_A_LITTLE), repeat=2):
+        if own != 1.0 or rest != 1.0:
+            yield replace(form, first_activation_scale=own * first, activation_scale=rest * form.scale)

@@ -124,7 +124,6 @@ def _before(vertices: Float64Array, faces: Int64Array, drawn: Int64Array) -> Flo
 
 # Faces that are turned round among their neighbors: exporters and repairs leave such, each a dent in the field.
 
-"""Share of the edges that may disagree: less is not worth a change."""
 _FEWER = 0.5
 """Of the edges that disagree so many may be left, or the faces stay as they are."""
 
@@ -137,8 +136,7 @@ def agreeing(vertices: Float64Array, faces: Int64Array) -> tuple[Int64Array, tup
     oriented, patch = igl.bfs_orient(np.ascontiguousarray(faces))
     patch = np.asarray(patch).reshape(-1)
     kept = (oriented == faces).all(axis=1)
-    corner, first, second = (vertices[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(first - corner, second - corner), axis=1)
+    area = areas(vertices, faces)
     for_it = np.bincount(patch, np.where(kept, area, -area))
     turned = kept == (for_it[patch] < 0.0)
     found = np.where(turned[:, None], faces[:, ::-1], faces)

@@ -28,6 +28,7 @@ _KNOWN = (
     _Known("torch-ngp's", _MESH, ("model",), ("encoder.",)),
     _Known("torch-ngp's", _MESH, (), ("encoder.", "backbone.")),
     _Known("Co-SLAM's", "give the mesh that it writes to the run's folder", ("model",), ("decoder.sdf_net.",)),
+    _Known("IDR's, VolSDF's or MonoSDF's", _MESH, (), ("implicit_network.",)),
     _Known("iSDF's", _MESH, ("model_state_dict",), ("in_layer.", "out_alpha.")),
     _Known("NGLOD's", _MESH, (), ("features.0.fm", "louts.")),
     _Known(

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import IO, Literal
 
@@ -56,29 +57,20 @@ _MAX_ENTRIES = 64
 _BLOCK = 512
 
 Trespass = Literal["threads", "output"]
+Watch = Callable[[], Trespass | None]
 
 
-@dataclass(frozen=True)
-class Watch:
-    """A look at one child: how many threads it has, and how much lies in its folder."""
-
-    folder: Path
-    folder_bytes: int
-
-    def look(self, pid: int) -> Trespass | None:
-        """Which limit the child is beyond, if any."""
-        if _threads(pid) > MAX_THREADS:
-            return "threads"
-        return "output" if self._too_much_output() else None
-
-    def _too_much_output(self) -> bool:
-        total = 0
-        with suppress(FileNotFoundError), os.scandir(self.folder) as entries:  # a file may just be renamed
-            for count, entry in enumerate(entries):
-                total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
-                if count >= _MAX_ENTRIES or total > self.folder_bytes:
-                    return True
-        return False
+def trespass_of(pid: int, folder: Path, folder_bytes: int) -> Trespass | None:
+    """Which limit the child is beyond, if any: how many threads it has, how much lies in its folder."""
+    if _threads(pid) > MAX_THREADS:
+        return "threads"
+    total = 0
+    with suppress(FileNotFoundError), os.scandir(folder) as entries:  # a file may just be renamed
+        for count, entry in enumerate(entries):
+            total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
+            if count >= _MAX_ENTRIES or total > folder_bytes:
+                return "output"
+    return None
 
 
 def _threads(pid: int) -> int:
@@ -120,7 +112,7 @@ def run_child(
 ) -> ChildOutcome:
     """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds by a fair clock.
 
-    It is stopped too when it has many threads, or more than ``folder_bytes`` in ``folder``: see ``Watch``. The child
+    It is stopped too when it has many threads, or more than ``folder_bytes`` in ``folder``. The child
     leads a process group of its own; at the end the whole group is killed, whatever became of the child.
     ``request`` must fit into a pipe (64 KiB).
     """
@@ -137,7 +129,7 @@ def run_child(
     clock = FairClock(process.pid, wall_s)
     _inherit_priority(process.pid)
     stopped: Stopped | None = "late"
-    watch = Watch(folder, folder_bytes)
+    watch = partial(trespass_of, process.pid, folder, folder_bytes)
     said = (bytearray(), bytearray())
     try:
         with contextlib.suppress(BrokenPipeError):
@@ -185,7 +177,7 @@ def _listen(
             ready = selector.select(min(clock.left_s(), _LOOK_S))
             if not clock.left_s():
                 return "late"
-            if trespass := watch.look(process.pid):
+            if trespass := watch():
                 return trespass
             for key, _ in ready:
                 chunk = os.read(key.fd, _MAX_OUTPUT)
@@ -205,7 +197,7 @@ def _stays(pid: int, watch: Watch, clock: FairClock) -> Stopped | None:
     while os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
         if not clock.left_s():
             return "late"
-        if trespass := watch.look(pid):
+        if trespass := watch():
             return trespass
         time.sleep(0.005)
     return None

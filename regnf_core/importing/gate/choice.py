@@ -1,9 +1,7 @@
 """Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-The reading is looked for whose levels do the most for the gradient, from the listed ones on to those beside the best.
-It is taken if it beats every other function that the tensors may stand for, one by one at the same points, and those
-beside it. Where no levels tell, only readings of the same resolutions, or without a grid, are weighed against each
-other. What stays open is refused, with the line to add to the description for each.
+The reading is taken whose gradient's norm is clearly nearest to 1, unless the grid's levels speak against it. What
+stays open is refused, with the line to add to the description for each.
 """
 
 from __future__ import annotations
@@ -13,165 +11,81 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from typing import Any
 
 from torch import Tensor
 
-from regnf_core.errors import MOST_CANDIDATES
+from regnf_core.errors import MOST_CANDIDATES, FieldFormatError
 from regnf_core.importing.cost.mesh_work import (
-    CLIMB_POINTS,
     FINAL_POINTS,
     FINALISTS,
-    LAST_FINALISTS,
     LAST_POINTS,
-    MAX_CLIMBS,
     MAX_TRIED,
     TRIAL_POINTS,
-    TRIED_MORE,
-    TRIED_NEAR,
-    WRITTEN_NEAR,
 )
-from regnf_core.importing.families.converted import ConvertedField, Reading
-from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, CLEARLY, LEAST, LEAST_SUPPORT, Evidence, Trial
-from regnf_core.importing.gate.plausibility import without_new_code
-from regnf_core.importing.gate.readings_beside import (
+from regnf_core.importing.families.converted import (
     AmbiguousError,
+    Assumed,
+    ConvertedField,
     OpenCandidate,
-    readings_beside,
-    readings_written_near,
+    Reading,
+    Variant,
+    untold_error,
 )
+from regnf_core.importing.gate.evidence import LEAST_SUPPORT, Evidence, Trial
+from regnf_core.importing.gate.plausibility import without_new_code
 from regnf_core.schema.hash_grid_config import Interpolation
 
-# Linear or smoothstep: how a hash grid was interpolated in training, told from the gradient within its cells.
-#
-# Smoothstep modulates a level's slope within each cell; training makes the other levels cancel that. So under the
-# interpolation of training the rest of the gradient's norm does not follow the difference between the two
-# interpolations, and under the other one it makes up for all of it. And only as it was in training does a level's
-# part correct what the coarser levels leave at every place of a cell. One of both has to be clear, and the other one
-# must not speak against it. A field that was trained too shortly does not tell.
-
-_TRAINED = 0.08
-"""Only a field whose gradient is this near to 1 tells that it was interpolated linearly: one that was trained for
-shorter under smoothstep looks like that, too."""
-_SMOOTH, _LINEAR = 0.15, -0.3
-"""How much more the norm follows the difference under linear than under smoothstep, at least or at most."""
-_NEAR = 1.0
-_CLEAR = 2.0 * LEAST_SUPPORT
-"""Chance is not all of the difference: both readings have the right rows, and linear interpolation is less noisy. Of
-fields trained for 150 steps the wrong one was ahead by 14 at most."""
-_AGAINST = -3.0
-"""Standard errors by which no level may speak against what the others tell."""
-
-
-def told_interpolation(linear: Trial, smoothstep: Trial) -> Interpolation | None:
-    """How the grid was interpolated, by one reading's trials under both; None where they do not tell."""
-    by_norm = _told_by_norm(linear, smoothstep)
-    if by_norm is None:
-        return _told_by_levels(linear, smoothstep)
-    one, other = (linear, smoothstep) if by_norm == "linear" else (smoothstep, linear)
-    return by_norm if one.support_over(other) > -LEAST_SUPPORT else None
-
-
-def _told_by_levels(linear: Trial, smoothstep: Trial) -> Interpolation | None:
-    if _is_corrected(linear, smoothstep):
-        return "linear"
-    return "smoothstep" if _is_corrected(smoothstep, linear) else None
-
-
-def _is_corrected(one: Trial, other: Trial) -> bool:
-    if one.levels is None or other.levels is None or one.support_over(other) < _CLEAR:
-        return False
-    return float(one.levels.over(other.levels).in_errors().min()) > _AGAINST
-
-
-def _told_by_norm(linear: Trial, smoothstep: Trial) -> Interpolation | None:
-    if linear.gradient is None or smoothstep.gradient is None:
-        return None
-    more = _share_undone(smoothstep.gradient, linear.gradient) - _share_undone(linear.gradient, smoothstep.gradient)
-    if more > _SMOOTH:
-        return "smoothstep"
-    if more < _LINEAR and linear.mean < _TRAINED:
-        return "linear"
-    return None
-
-
-def _share_undone(gradient: Tensor, other: Tensor) -> float:
-    """Slope of the norm of ``gradient`` over what the ``other`` one would add to it: 0 under the right one."""
-    norm = gradient.norm(dim=-1).clamp_min(1e-6)
-    added = ((other - gradient) * gradient).sum(dim=-1) / norm
-    kept = ((norm - 1.0).abs() < _NEAR) & (added.abs() < _NEAR)
-    added, beyond = added[kept] - added[kept].mean(), norm[kept] - norm[kept].mean()
-    return float((added * beyond).sum() / added.square().sum().clamp_min(1e-12))
-
-
-# The choice among readings by how far the gradient's norm is from 1 on average, and by usual numbers.
-#
-# Readings that fit clearly worse than the best are out. Those left that are one function need no choice. Of the
-# others the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident.
-
+_CLEARLY, _LEAST = 0.1, 0.01
+"""A misfit is clearly greater by this share of the other's, and by this much at least."""
 _FINALLY = 0.04
 """In the second round, at more points, a reading is out that fits worse by this share of the best's misfit."""
 _ACCIDENT = 0.5 * math.log(2.0)
 """Usual numbers are powers of two: among layouts spread by less than this (log of the finest resolution), one of them
 is no accident."""
-
-
-def chosen_by_misfit(trials: Sequence[Trial], finest: Evidence) -> tuple[Trial | None, list[Trial]]:
-    """The reading that the misfit and its numbers tell, or None where they do not; and all that fit as well.
-
-    finest: more points, near the surface of the reading that fits best.
-    """
-    best = min(trials, key=lambda trial: trial.mean)
-    left = [trial for trial in trials if not best.is_distance or not best.is_better(trial, CLEARLY, LEAST)]
-    if best.is_distance and len(left) > 1 and not all(trial.is_same(best) for trial in left):
-        left = _second_round(left, finest)
-    usual = min(left, key=lambda trial: (trial.reading.tier, trial.mean))
-    others = [trial for trial in left if not trial.is_same(usual)]
-    return (usual if _is_no_accident(usual, others) else None), [usual, *others]
-
-
-def _second_round(trials: Sequence[Trial], finest: Evidence) -> list[Trial]:
-    """Those of ``trials`` that are as good as the best of them at more points. The least usual ones are not asked."""
-    finalists = sorted(trials, key=lambda trial: (trial.reading.tier, trial.mean))[:FINALISTS]
-    again = [finest.of(trial.reading) for trial in finalists]
-    best = min(again, key=lambda trial: trial.mean)
-    return [trial for trial in again if not best.is_better(trial, _FINALLY)]
-
-
-def _is_no_accident(usual: Trial, others: Sequence[Trial]) -> bool:
-    """Whether ``usual`` is the only one, or of numbers so usual that its place among the others is no chance."""
-    if not others:
-        return True
-    scales = [trial.reading.scale for trial in (usual, *others)]
-    told = [scale for scale in scales if scale is not None]
-    if usual.reading.tier > 0 or any(trial.reading.tier == 0 for trial in others) or len(told) < len(scales):
-        return False
-    return max(told) - min(told) <= _ACCIDENT
-
-
-_SHOWN = MOST_CANDIDATES
+_CLEAR_SUPPORT = 50.0
+"""What readings over different cubes need, whose difference chance is not all of."""
 _KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 
 
-def choose_reading(converted: ConvertedField, share: int = 1) -> ConvertedField:
-    """``converted`` with the reading that its weights speak for, and with what was decided, and by what, in ``why``.
+@without_new_code()
+def settled(converted: ConvertedField, share: int = 1) -> ConvertedField:
+    """``converted`` as the one function that its weights speak for, with what was decided, and by what, in ``why``.
 
     share: after the first round the readings are tried at one ``share``-th of the points.
 
     Raises AmbiguousError: readings that differ fit alike.
     """
-    if not converted.readings:
-        return converted
-    with without_new_code():
+    if converted.readings:
         chosen, why = _choose(converted.readings, share)
-    return replace(
-        converted,
-        why=(*converted.why, *why),
-        description=chosen.description,
-        tensors=chosen.tensors,
-        readings=(),
+        converted = replace(
+            converted,
+            why=(*converted.why, *why),
+            description=chosen.description,
+            tensors=chosen.tensors,
+            readings=(),
+        )
+    return converted if converted.assumed is None else _confirmed(converted, converted.assumed)
+
+
+def _confirmed(converted: ConvertedField, assumed: Assumed) -> ConvertedField:
+    """``converted`` if it behaves like a distance at its surface, and better than with the number a little off."""
+    evidence = Evidence(converted.reading, TRIAL_POINTS)
+    misfit = evidence.of(converted.reading).misfit_near
+    if math.isinf(misfit):
+        raise FieldFormatError("values and gradients are not finite", reason="FIELD_NOT_FINITE")
+    said = json.dumps(assumed.say)
+    if misfit < _CONFIRMED and all(misfit <= evidence.of(make()).misfit_near for make in assumed.beside):
+        why = f"{said}, as is usual: the gradient's norm at the surface is {misfit:.2f} from 1"
+        return replace(converted, why=(*converted.why, why), assumed=None)
+    usual = Variant(said, assumed.say, lambda reading: reading)
+    raise untold_error(
+        converted, (usual, *assumed.others), "the field does not behave like a distance under the usual number"
     )
+
+
+_CONFIRMED = 0.25
+"""How far the gradient's norm at the surface may be from 1 for an assumed number to be right."""
 
 
 def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]]:
@@ -186,11 +100,9 @@ def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]
     finest = Evidence(nearest.reading, FINAL_POINTS // share)
     chosen, fitting = chosen_by_misfit(trials, finest)
     if chosen is None or _is_doubtful(chosen, trials, finest):
-        trials = _searched(readings, trials, evidence)
         best = _best(trials)
-        if not best.is_telling:
-            raise _ambiguous([trial.reading for trial in fitting])
-        chosen = _proven(trials, best, share)
+        likely = [best] if best.is_telling and not any(trial.reading is best.reading for trial in fitting) else []
+        raise _ambiguous([trial.reading for trial in (*likely, *fitting)])
     if others := _over_other_cubes(chosen, readings, finest):
         raise _ambiguous([trial.reading for trial in (chosen, *others)])
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
@@ -199,19 +111,55 @@ def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]
     return chosen.reading, why
 
 
+# By how far the gradient's norm is from 1 on average, and by usual numbers.
+#
+# Readings that fit clearly worse than the best are out. Those left that are one function need no choice. Of the
+# others the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident.
+
+
+def chosen_by_misfit(trials: Sequence[Trial], finest: Evidence) -> tuple[Trial | None, list[Trial]]:
+    """The reading that the misfit and its numbers tell, or None where they do not; and all that fit as well.
+
+    finest: more points, near the surface of the reading that fits best.
+    """
+    best = min(trials, key=lambda trial: trial.mean)
+    left = [trial for trial in trials if not best.is_distance or not best.is_better(trial, _CLEARLY, _LEAST)]
+    if best.is_distance and len(left) > 1 and not all(trial.is_same(best) for trial in left):
+        # The least usual ones are not asked again.
+        finalists = sorted(left, key=lambda trial: (trial.reading.tier, trial.mean))[:FINALISTS]
+        again = [finest.of(trial.reading) for trial in finalists]
+        best = min(again, key=lambda trial: trial.mean)
+        left = [trial for trial in again if not best.is_better(trial, _FINALLY)]
+    usual = min(left, key=lambda trial: (trial.reading.tier, trial.mean))
+    others = [trial for trial in left if not trial.is_same(usual)]
+    return (usual if _is_no_accident(usual, others) else None), [usual, *others]
+
+
+def _is_no_accident(usual: Trial, others: Sequence[Trial]) -> bool:
+    """Whether ``usual`` is the only one, or of numbers so usual that its place among the others is no chance."""
+    if not others:
+        return True
+    scales = [trial.reading.scale for trial in (usual, *others)]
+    told = [scale for scale in scales if scale is not None]
+    if usual.reading.tier > 0 or any(trial.reading.tier == 0 for trial in others) or len(told) < len(scales):
+        return False
+    return max(told) - min(told) <= _ACCIDENT
+
+
+# By what the levels of a grid do, which contradicts the misfit: a misread grid of low resolution is smoother than the
+# right one.
+
+
 def _is_doubtful(chosen: Trial, trials: Sequence[Trial], finest: Evidence) -> bool:
-    """Whether the levels contradict what the misfit and the usual numbers chose: subtracted they do better than added,
-    or those of another function do much more."""
+    """Whether the levels do better subtracted than added, or those of another function are more supported."""
     first = next(trial for trial in trials if trial.reading is chosen.reading)
-    if chosen.levels is None or not _others(trials, first):
+    if chosen.levels is None or all(trial.is_same(first) for trial in trials):
         return False
     mine, best = finest.of(chosen.reading), _best(trials)
     if mine.support < -LEAST_SUPPORT or not best.is_telling:
         return mine.support < -LEAST_SUPPORT
     other = finest.of(best.reading)
-    return not other.is_same(mine) and (
-        mine.support < LEAST_SUPPORT or other.support_over(mine) + other.usual_over(mine) > LEAST_SUPPORT
-    )
+    return not other.is_same(mine) and (mine.support < LEAST_SUPPORT or other.support_over(mine) > 0.0)
 
 
 def _over_other_cubes(chosen: Trial, readings: Sequence[Reading], finest: Evidence) -> list[Trial]:
@@ -221,19 +169,7 @@ def _over_other_cubes(chosen: Trial, readings: Sequence[Reading], finest: Eviden
     cube = chosen.reading.description.get("grid_radius")
     others = [one for one in readings if one.is_grid_of(chosen.reading) and one.description.get("grid_radius") != cube]
     trials = [trial for trial in map(finest.of, others) if trial.is_telling and not trial.is_same(mine)]
-    return [trial for trial in trials if mine.support - trial.support < CLEAR_SUPPORT]
-
-
-def _searched(readings: Sequence[Reading], trials: list[Trial], evidence: Evidence) -> list[Trial]:
-    """``trials``, and those of further readings: next to the best of them where it tells, else of the most usual."""
-    best, tried = _best(trials), {id(trial.reading) for trial in trials}
-    rest = [reading for reading in readings if id(reading) not in tried]
-    if not best.is_telling:
-        trials = trials + [evidence.of(reading) for reading in rest[:TRIED_MORE]]
-        best, rest = _best(trials), rest[TRIED_MORE:]
-    beside = [reading for reading in rest if _group(reading) == _group(best.reading)]
-    near = sorted(beside, key=lambda reading: abs((reading.scale or 0.0) - (best.reading.scale or 0.0)))
-    return trials + [evidence.of(reading) for reading in near[: TRIED_NEAR if best.is_telling else 0]]
+    return [trial for trial in trials if mine.support - trial.support < _CLEAR_SUPPORT]
 
 
 def _best(trials: Sequence[Trial]) -> Trial:
@@ -242,81 +178,40 @@ def _best(trials: Sequence[Trial]) -> Trial:
     return best if best.is_telling else min(trials, key=lambda trial: trial.mean)
 
 
-def _group(reading: Reading) -> object:
-    grid = reading.description.get("hash") or {}
-    names = ("levels", "features_per_level", "log2_table_size", "base_resolution")
-    return (reading.description.get("use_grid"), *(grid.get(name) for name in names))
+# Linear or smoothstep: how a hash grid was interpolated in training, told from the gradient within its cells.
+#
+# Smoothstep modulates a level's slope within each cell; training makes the other levels cancel that. So under the
+# interpolation of training the rest of the gradient's norm does not follow the difference between the two
+# interpolations, and under the other one it makes up for all of it. A field that was trained too shortly does not tell.
+
+_TRAINED = 0.08
+"""Only a field whose gradient is this near to 1 tells that it was interpolated linearly: one that was trained for
+shorter under smoothstep looks like that, too."""
+_SMOOTH, _LINEAR = 0.15, -0.3
+"""How much more the norm follows the difference under linear than under smoothstep, at least or at most."""
+_NEAR = 1.0
 
 
-def _proven(trials: Sequence[Trial], best: Trial, share: int) -> Trial:
-    """The best reading if it beats every other one, at more points, and those beside it, too; or a refusal."""
-    tier = min(trial.reading.tier for trial in trials if trial.reading.has_sines_of(best.reading))
-    found = _climbed(best.reading, tier, Evidence(best.reading, CLIMB_POINTS // share))
-    finest = Evidence(best.reading, FINAL_POINTS // share)
-    rivals = [trial.reading for trial in _nearest(_standing(trials, best), best, FINALISTS)]
-    rivals = [rival for rival in rivals if not any(rival.is_grid_of(reading) for reading in found)]
-    again = [finest.of(reading) for reading in (*found, *rivals)]
-    chosen = _most_supported(again, again[0])
-    beside = [finest.of(reading) for reading in readings_beside(chosen.reading, tier)]
-    standing = _nearest(_standing((*again, *beside), chosen), chosen, LAST_FINALISTS)
-    if standing:
-        last, kind = Evidence(best.reading, LAST_POINTS // share), _likelier_interpolation(chosen, finest)
-        chosen, *rest = [last.of(_compared(trial.reading, kind)) for trial in (chosen, *standing)]
-        standing = _standing(rest, chosen)
-    if not standing and chosen.support < CLEAR_SUPPORT:
-        standing = _others(trials, best)
-    if standing or not chosen.reading.is_written:
-        raise _ambiguous([trial.reading for trial in (chosen, *_usual_first(standing))])
-    return chosen
-
-
-def _climbed(reading: Reading, tier: int, evidence: Evidence) -> list[Reading]:
-    """The better supported reading to which ``reading`` leads over those beside it, and the nearest to that.
-
-    Raises AmbiguousError: there are still better ones.
-    """
-    best = evidence.of(reading)
-    tried = [best]
-    for _ in range(MAX_CLIMBS):
-        near = (*islice(readings_written_near(best.reading, tier), WRITTEN_NEAR), *readings_beside(best.reading, tier))
-        tried += [evidence.of(other) for other in near if not any(t.reading.is_grid_of(other) for t in tried)]
-        better = _most_supported(tried, best)
-        if better is best:
-            written = [trial for trial in tried if trial.reading.is_written and trial is not best]
-            return [best.reading, *(trial.reading for trial in _nearest(written, best, LAST_FINALISTS))]
-        best = better
-    raise _ambiguous([trial.reading for trial in _nearest(tried, best, LAST_FINALISTS)])
-
-
-def _most_supported(trials: Sequence[Trial], best: Trial) -> Trial:
-    """The one of ``trials`` that is most ahead of ``best``, or ``best``."""
-    return max((best, *trials), key=lambda trial: trial.support_over(best) + trial.usual_over(best))
-
-
-def _nearest(rivals: Sequence[Trial], best: Trial, most: int) -> list[Trial]:
-    """The rivals that come nearest to the ``best`` one: who is behind these is behind it, too."""
-    return sorted(rivals, key=lambda rival: best.support_over(rival) + best.usual_over(rival))[:most]
-
-
-def _standing(trials: Sequence[Trial], best: Trial) -> list[Trial]:
-    """Those of ``trials`` that are another function than the ``best`` and not beaten by it."""
-    return [trial for trial in _others(trials, best) if not best.beats(trial)]
-
-
-def _others(trials: Sequence[Trial], best: Trial) -> list[Trial]:
-    return [trial for trial in trials if not trial.is_same(best)]
-
-
-def _usual_first(trials: Sequence[Trial]) -> list[Trial]:
-    return sorted(trials, key=lambda trial: (trial.reading.tier, -trial.support))
-
-
-def _likelier_interpolation(trial: Trial, evidence: Evidence) -> Interpolation | None:
-    """The interpolation under which layouts are compared: the better supported one, unless it is known."""
-    if trial.reading.interpolation == "known":
+def told_interpolation(linear: Trial, smoothstep: Trial) -> Interpolation | None:
+    """How the grid was interpolated, by one reading's trials under both; None where they do not tell, or where the
+    levels speak against it."""
+    if linear.gradient is None or smoothstep.gradient is None:
         return None
-    linear, smooth = (evidence.of(_with_interpolation(trial.reading, kind)) for kind in _KINDS)
-    return "linear" if linear.support_over(smooth) > 0.0 else "smoothstep"
+    more = _share_undone(smoothstep.gradient, linear.gradient) - _share_undone(linear.gradient, smoothstep.gradient)
+    if more > _SMOOTH and smoothstep.support_over(linear) > -LEAST_SUPPORT:
+        return "smoothstep"
+    if more < _LINEAR and linear.mean < _TRAINED and linear.support_over(smoothstep) > -LEAST_SUPPORT:
+        return "linear"
+    return None
+
+
+def _share_undone(gradient: Tensor, other: Tensor) -> float:
+    """Slope of the norm of ``gradient`` over what the ``other`` one would add to it: 0 under the right one."""
+    norm = gradient.norm(dim=-1).clamp_min(1e-6)
+    added = ((other - gradient) * gradient).sum(dim=-1) / norm
+    kept = ((norm - 1.0).abs() < _NEAR) & (added.abs() < _NEAR)
+    added, beyond = added[kept] - added[kept].mean(), norm[kept] - norm[kept].mean()
+    return float((added * beyond).sum() / added.square().sum().clamp_min(1e-12))
 
 
 def _interpolated(reading: Reading, share: int, why: list[str]) -> tuple[Reading, list[str]]:
@@ -336,35 +231,29 @@ def _interpolated(reading: Reading, share: int, why: list[str]) -> tuple[Reading
     raise _ambiguous(asked, whole=True)
 
 
-def _compared(reading: Reading, kind: Interpolation | None) -> Reading:
-    """``reading`` as it is compared with others: under the likelier interpolation where that is open."""
-    if kind is None:
-        return reading
-    grid = {**reading.description["hash"], "interpolation": kind}
-    return replace(reading, description={**reading.description, "hash": grid})
-
-
 def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:
     grid = {**reading.description["hash"], "interpolation": kind}
-    name = f"{reading.name}, {kind}"
     say = {**reading.say, "hash": {**reading.say.get("hash", {}), "interpolation": kind}}
-    return replace(reading, name=name, say=say, description={**reading.description, "hash": grid})
+    description = {**reading.description, "hash": grid}
+    return replace(reading, name=f"{reading.name}, {kind}", say=say, description=description)
+
+
+# What is said: the line of the report, or the refusal with what to add.
 
 
 def _ambiguous(readings: Sequence[Reading], whole: bool = False) -> AmbiguousError:
     """The refusal: what the description may say, the most usual first. whole: with what all have in common, too."""
     say = [reading.say for reading in readings]
     asked = [
-        OpenCandidate(one.name, one.say if whole else _shortest(one.say, say), partial(_same, one)) for one in readings
+        OpenCandidate(one.name, one.say if whole else _shortest(one.say, say), partial(replace, one))
+        for one in readings
     ]
     lines = list(dict.fromkeys(json.dumps(one.say) for one in asked))
-    more = f", or {len(lines) - _SHOWN} others" if len(lines) > _SHOWN else ""
-    message = f"{len(lines)} readings fit this table alike; add one to the description: {' or '.join(lines[:_SHOWN])}"
-    return AmbiguousError(message + more, asked)
-
-
-def _same(reading: Reading) -> Reading:
-    return reading
+    more = f", or {len(lines) - MOST_CANDIDATES} others" if len(lines) > MOST_CANDIDATES else ""
+    shown = " or ".join(lines[:MOST_CANDIDATES])
+    return AmbiguousError(
+        f"{len(lines)} readings fit this table alike; add one to the description: {shown}{more}", asked
+    )
 
 
 def _shortest(entry: dict[str, Any], say: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -381,11 +270,5 @@ def _said(trials: Sequence[Trial], chosen: Trial) -> str:
     if not rest:
         return f"{start}, and all are the same function"
     second = min(rest, key=lambda trial: trial.mean)
-    return (
-        f"{start}, under this one the gradient's norm is {_by(chosen)} from 1; under {second.reading.name},"
-        f" {_by(second)}"
-    )
-
-
-def _by(trial: Trial) -> str:
-    return f"{trial.mean:.2f}" if math.isfinite(trial.mean) else "any amount"
+    by = (f"{trial.mean:.2f}" if math.isfinite(trial.mean) else "any amount" for trial in (chosen, second))
+    return f"{start}, under this one the gradient's norm is {next(by)} from 1; under {second.reading.name}, {next(by)}"

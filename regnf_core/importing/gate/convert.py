@@ -17,26 +17,24 @@ import re
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.gate.picture import PICTURE_NAME
+from regnf_core.importing.cost.mesh_work import Calls
+from regnf_core.importing.families.converted import AmbiguousError, untold_error
+from regnf_core.importing.gate.picture import PICTURE_NAME, candidate_name
 from regnf_core.importing.gate.reading import Companions
-from regnf_core.importing.gate.readings_beside import AmbiguousError, require_told
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
 from regnf_core.schema.description import OBSERVATION, split_color
 from regnf_core.schema.kinds import WEIGHTS
 
 if TYPE_CHECKING:
-    from regnf_core.fields.observation import SdfField
-    from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.families.converted import OpenCandidate
     from regnf_core.importing.gate.reading import ReadUpload
-    from regnf_core.importing.upload_description import UploadDescription
 
 FIELD_NAME = "field.safetensors"
 _ROOM = 32 << 10
@@ -52,6 +50,8 @@ _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
 _PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
 """Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
+_SMALL_PICTURE = Calls((40_000, 37_000), (12_000,))
+"""About as many points as a small picture takes."""
 _THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz"}
 """May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
@@ -72,41 +72,33 @@ def convert_file(
     """
     from regnf_core.schema.safe_format import add_to_source
 
-    beside = beside or Companions()
-    read = _read(upload, out_dir, description, limits, beside)
-    target = out_dir / FIELD_NAME
-    stored = _stored(read, target, limits, beside.cameras is not None)
-    drawing = _Drawing(out_dir / PICTURE_NAME if picture else None, stored.up_axis)
-    judged = None if read.description.accept_implausible else stored.guess
-    measured, more, surface = _evaluated(target, drawing, judged, stored.reported["kind"] == "mesh")
-    if stored.sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
+    read = _read(upload, out_dir, description, limits, beside or Companions())
+    target, said = out_dir / FIELD_NAME, read.description
+    cameras = beside is not None and beside.cameras is not None
+    # What is kept of the field: its tensors are let go of before the evaluation.
+    reported, warnings, sign, sign_is_open, up_axis = _stored(read, target, limits, cameras)
+    measured, more, surface = _evaluated(
+        target, reported["kind"] == "mesh", picture, up_axis, bool(said.accept_implausible), sign
+    )
+    if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
-    warned = list(kept_warnings(_latest([*stored.warnings, *more])))
+    # Of warnings with the same word the last: a safe field brings those of its first import.
+    latest = {warning.partition(":")[0]: warning for warning in (*warnings, *more)}
+    warned = list(kept_warnings(list(latest.values())))
     add_to_source(target, {WARNINGS: warned} if warned else {})
     told = {"plausibility": measured, "surface_bounds": surface, "warnings": warned, "settings": read.settings}
-    return {**stored.reported, **told}
+    return {**reported, **told}
 
 
-@dataclass(frozen=True)
-class _Stored:
-    """What is kept of a field whose tensors are on disk: they are let go of before the evaluation.
-
-    reported: values of the report · warnings: of the reading · guess: the sign, where nothing says it · sign_is_open:
-    whether the values will tell · up_axis: of the description.
-    """
-
-    reported: dict[str, Any]
-    warnings: Sequence[str]
-    guess: _Guess
-    sign_is_open: bool
-    up_axis: str | None
-
-
-def _stored(read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool) -> _Stored:
+def _stored(
+    read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool
+) -> tuple[dict[str, Any], Sequence[str], int | None, bool, str | None]:
     """Write the safe field of what was read to ``target``. cameras: whether they came with it.
 
-    Raises FieldFormatError.
+    Returns values of the report, warnings, the sign where nobody has said it, whether the values will tell it, and the
+    up axis. Raises FieldFormatError.
     """
+    from regnf_core.importing.families import safe_field
     from regnf_core.importing.gate.cost_estimate import affordable_share, require_affordable, with_affordable_color
     from regnf_core.importing.gate.observed import observed
     from regnf_core.importing.gate.report import placed
@@ -114,8 +106,15 @@ def _stored(read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool)
 
     _require_text(read.field.description)
     require_affordable(read.field, limits)
-    settled = _settled(read.field, affordable_share(read.field, limits))
-    converted = placed(with_affordable_color(settled, limits), read.description)
+    converted = read.field
+    if converted.readings or converted.assumed:
+        from regnf_core.importing.gate.choice import settled  # loads torch
+
+        converted = settled(converted, affordable_share(converted, limits))
+    if converted.untold:
+        what = "neither the tensors nor how they behave tell which function this is"
+        raise untold_error(converted, converted.untold, what)
+    converted = placed(with_affordable_color(converted, limits), read.description)
     converted = observed(converted, read, limits, required=cameras)
     said = converted.description
     write_safe_field(target, said, converted.tensors, _ROOM)
@@ -128,8 +127,11 @@ def _stored(read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool)
         "parameters": sum(array.size for name, array in own.items() if name not in _SEEN),
         "label": said["label"],
     }
-    guess = _Guess(None if _sign_is_said(converted, read.description) else int(said["sign"]))
-    return _Stored(reported, converted.warnings, guess, converted.sign_is_open, said["up_axis"])
+    # A mesh's faces say it, and a safe field was imported before.
+    known = (
+        read.description.sign or read.description.as_ or said["kind"] == "mesh" or converted.family == safe_field.FAMILY
+    )
+    return reported, converted.warnings, None if known else int(said["sign"]), converted.sign_is_open, said["up_axis"]
 
 
 def _read(
@@ -145,65 +147,28 @@ def _read(
         remove_unpacked(out_dir)
 
 
-def _latest(warnings: Sequence[str]) -> list[str]:
-    """Of warnings with the same word the last: a safe field brings those of its first import."""
-    return list({warning.partition(":")[0]: warning for warning in warnings}.values())
-
-
-def _sign_is_said(converted: ConvertedField, said: UploadDescription) -> bool:
-    """By the description, by a mesh's faces, or by a safe field, which was imported before."""
-    from regnf_core.importing.families.safe_field import FAMILY
-
-    return bool(said.sign or said.as_) or converted.description["kind"] == "mesh" or converted.family == FAMILY
-
-
-@dataclass(frozen=True)
-class _Guess:
-    """sign: the one that the values are read with, where nothing says it."""
-
-    sign: int | None
-
-
-@dataclass(frozen=True)
-class _Drawing:
-    """The picture that is to be left for people to look at; ``path``: where, None: nowhere."""
-
-    path: Path | None
-    up_axis: str | None
-
-    def of(self, field: SdfField) -> None:
-        """Draw it if that can be done: it is not a condition of the import."""
-        from regnf_core.importing.gate.plausibility import without_new_code
-
-        if self.path is not None:
-            with without_new_code(), contextlib.suppress(RegnfError, MemoryError):
-                _draw(field, self.up_axis, self.path)
-
-
 def _evaluated(
-    path: Path, drawing: _Drawing, judged: _Guess | None, is_mesh: bool
+    path: Path, is_mesh: bool, picture: bool, up_axis: str | None, accept_implausible: bool, sign: int | None
 ) -> tuple[dict[str, float], list[str], list[list[float]]]:
-    """What ``check_plausibility`` tells of the field in the file ``path``; it is drawn if that is quick.
+    """What ``check_plausibility`` tells of the field in the file ``path``; if that is quick, a picture of it beside it.
 
-    judged: None takes it even if it does not behave like a signed distance. Raises FieldFormatError.
+    sign: see ``require_plausible``. Raises FieldFormatError.
     """
     # These load torch, which takes seconds and which a file that is refused before never needs.
     from regnf_core.fields.build import open_field
-    from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible
+    from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible, without_new_code
 
     field, started = open_field(path), time.process_time()
     measured, warnings, surface = check_plausibility(field, is_mesh=is_mesh)
-    if judged is not None:
-        require_plausible(measured, judged.sign)
-    if time.process_time() - started < _QUICK_S:
-        drawing.of(field)
+    if not accept_implausible:
+        require_plausible(measured, sign)
+    if picture and time.process_time() - started < _QUICK_S:
+        from regnf_core.viewing.field_picture import field_picture
+
+        # It is not a condition of the import.
+        with without_new_code(), contextlib.suppress(RegnfError, MemoryError):
+            field_picture(field, up_axis).save(path.with_name(PICTURE_NAME))
     return measured, warnings, surface
-
-
-def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
-    from regnf_core.viewing.field_picture import field_picture
-
-    field_picture(field, up_axis).save(path)
 
 
 def _require_text(description: dict[str, Any]) -> None:
@@ -221,25 +186,28 @@ def _require_text(description: dict[str, Any]) -> None:
         raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
 
 
-def _settled(converted: ConvertedField, share: int) -> ConvertedField:
-    """The one function that the field stands for, where its shapes leave several. share: see calls_of_trials."""
-    if converted.open_readings:
-        from regnf_core.importing.gate.network_form import settle_form
+def draw_asked(asked: Sequence[OpenCandidate], out_dir: Path, seconds: float) -> None:
+    """A picture of each function that a person is asked about, in so many processor seconds: as many as there can be.
 
-        converted = settle_form(converted)
-    if converted.readings:
-        from regnf_core.importing.gate.choice import choose_reading
+    The refusal does without those that cannot be drawn. torch lacks memory with a RuntimeError.
+    """
+    from regnf_core.importing.gate.cost_estimate import seconds_of
+    from regnf_core.importing.gate.evidence import field_of
+    from regnf_core.importing.gate.plausibility import without_new_code
+    from regnf_core.viewing.field_picture import SMALL, field_picture
 
-        converted = choose_reading(converted, share)
-    require_told(converted)
-    return converted
+    deadline = time.process_time() + seconds
 
+    def look(_: int) -> None:
+        if time.process_time() > deadline:
+            raise RegnfError("no time is left for the picture")
 
-def _draw_asked(error: AmbiguousError, out_dir: Path, left_s: float) -> None:
-    """A picture of each function that a person is asked about, in a part of the time that is left."""
-    from regnf_core.importing.gate.candidate_pictures import draw_candidates  # loads torch
-
-    draw_candidates(error.asked, out_dir, min(_PICTURES_S, _PICTURES_SHARE * left_s))
+    for number, candidate in enumerate(asked, 1):
+        with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():
+            reading = candidate.make()
+            if seconds_of(reading.description, reading.tensors, _SMALL_PICTURE) < deadline - time.process_time():
+                drawn = field_picture(field_of(reading), reading.description.get("up_axis"), SMALL, look)
+                drawn.save(out_dir / candidate_name(number))
 
 
 def run(
@@ -257,7 +225,8 @@ def run(
         return convert_file(upload, out_dir, description, limits, picture, beside)
     except AmbiguousError as error:
         if ask_by_picture:
-            _draw_asked(error, out_dir, limits.longest_s - (time.monotonic() - started))
+            left_s = limits.longest_s - (time.monotonic() - started)
+            draw_asked(error.asked, out_dir, min(_PICTURES_S, _PICTURES_SHARE * left_s))
         asked = [{"name": one.name, "description": one.say} for one in error.asked]
         return {"reason": error.reason, "detail": str(error), "candidates": asked}
     except FieldFormatError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,12 +17,12 @@ from regnf_core.importing.cost.mesh_work import (
     calls_of_check,
     calls_of_trials,
     color_work,
+    free_room,
     mesh_work,
     network_work,
     require_room,
     require_within,
 )
-from regnf_core.importing.cost.onnx_work import onnx_bytes, onnx_work
 from regnf_core.importing.families.color.head import ASSUMED, LEFT_OUT
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.report import ImportLimits
@@ -36,14 +37,18 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
     Raises FieldFormatError: IMPORT_TOO_COSTLY beyond the limits on work and memory, and what the description is
     refused for.
     """
+    description = parse_description(converted.description)
+    if isinstance(description, OnnxDescription):
+        most, room = limits.refused_beyond_s, free_room(limits.memory_bytes)
+        seconds, size = _onnx_needs(description, converted.tensors, calls_of_check(SAMPLES), most, room)
+        require_within(seconds, most)
+        require_room(size, room)
+        return seconds
     if converted.readings:
         seconds = _share_and_seconds(converted.readings, limits)[1]
     else:
         seconds = seconds_of(converted.description, converted.tensors, calls_of_check(SAMPLES))
     require_within(seconds, limits.refused_beyond_s)
-    description = parse_description(converted.description)
-    if isinstance(description, OnnxDescription):
-        require_room(onnx_bytes(description, converted.tensors), limits.memory_bytes)
     return seconds
 
 
@@ -104,7 +109,22 @@ def _checked(description: dict[str, object], tensors: Mapping[str, StoredArray])
 def _work(description: FieldDescription, tensors: Mapping[str, StoredArray], calls: Calls) -> float:
     match description:
         case OnnxDescription():
-            return onnx_work(description, tensors, calls)
+            return _onnx_needs(description, tensors, calls)[0]
         case MeshDescription():
             return mesh_work(tensors["vertices"], tensors["faces"], calls)
     return network_work(description, tensors, calls)
+
+
+def _onnx_needs(
+    description: OnnxDescription,
+    tensors: Mapping[str, StoredArray],
+    calls: Calls,
+    most_s: float = math.inf,
+    most_bytes: float = math.inf,
+) -> tuple[float, int]:
+    # These load torch, which a file that is refused before never needs.
+    from regnf_core.importing.cost.onnx_work import onnx_needs
+    from regnf_core.importing.gate.plausibility import without_new_code
+
+    with without_new_code():
+        return onnx_needs(description, tensors, calls, most_s, most_bytes)

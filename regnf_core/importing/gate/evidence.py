@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,9 +19,8 @@ from regnf_core.fields.build import build_field
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.fields.observation import SdfField
 from regnf_core.fields.user_fields import FunctionField
-from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.families.converted import Reading
-from regnf_core.schema.safe_format import parse_description
+from regnf_core.schema.safe_format import parse_description, tensor_specs
 
 # How much each level of a hash grid does for the gradient's norm: what a level read by another layout cannot do.
 #
@@ -59,54 +55,18 @@ class LevelGains:
         """The differences to ``other``, of as many levels at the same points."""
         return LevelGains(self.gains - other.gains, torch.minimum(self.scales, other.scales), self.places)
 
-    def in_errors(self) -> Tensor:
-        """The levels' means (A,) in standard errors; of few blocks, errors of as much likelihood (Student's t)."""
-        told = [
-            _in_errors(gain, float(scale), self.places) for gain, scale in zip(self.gains, self.scales, strict=True)
-        ]
-        return torch.stack(told)
-
     def support(self) -> float:
         """Log likelihood ratio that the levels' gains are more than chance; what speaks against it counts as much."""
-        errors = self.in_errors()
-        return 0.5 * float((errors * errors.abs()).sum())
-
-
-@dataclass(frozen=True)
-class PartsOfGradient:
-    """Distances (N,), gradients (N, 3) but for the grid's part, each level's part (A, N, 3), and where the points are.
-
-    scales, places: see :class:`LevelGains`.
-    """
-
-    distance: Tensor
-    rest: Tensor
-    levels: Tensor
-    scales: Tensor
-    places: Tensor
-
-    def gains(self) -> LevelGains:
-        """The levels' gains."""
-        return LevelGains(level_gains(self.rest, self.levels), self.scales, self.places)
+        errors = [
+            _in_errors(gain, float(scale), self.places) for gain, scale in zip(self.gains, self.scales, strict=True)
+        ]
+        return 0.5 * sum(error * abs(error) for error in errors)
 
 
 def norm_misfit(gradient: Tensor) -> Tensor:
     """How far the norm of ``gradient`` (..., 3) is from 1: the absolute value of its logarithm (...)."""
     norm = torch.linalg.vector_norm(gradient, dim=-1)
     return torch.clamp(norm.clamp_min(1e-9).log().abs(), max=_MOST)
-
-
-def parts_of_gradient(field: SdfField, points: Tensor) -> PartsOfGradient | None:
-    """The parts at points (N, 3) within the cube that the grid covers; None without a grid."""
-    function = field.function if isinstance(field, FunctionField) else None
-    encoding = function.hash_encoding if isinstance(function, NeusFactoFunction) else None
-    if encoding is None:
-        return None
-    assert isinstance(function, NeusFactoFunction)
-    chunks = [function.gradient_by_level(chunk) for chunk in torch.split(points, _CHUNK)]
-    distance, rest, levels = zip(*chunks, strict=True)
-    parts = torch.cat(distance), torch.cat(rest), torch.cat(levels, dim=1)
-    return PartsOfGradient(*parts, encoding.scales, function.places(points))
 
 
 def level_gains(rest: Tensor, levels: Tensor) -> Tensor:
@@ -120,8 +80,8 @@ def level_gains(rest: Tensor, levels: Tensor) -> Tensor:
     return gains
 
 
-def _in_errors(gain: Tensor, scale: float, places: Tensor) -> Tensor:
-    """The mean of one level's gain (N,) in standard errors."""
+def _in_errors(gain: Tensor, scale: float, places: Tensor) -> float:
+    """The mean of one level's gain (N,) in standard errors; of few blocks in those of as much likelihood (Student)."""
     across = max(1, int(scale / _BLOCK))
     cell = (places.double() * across).floor().clamp(0, across - 1).long()
     block = torch.unique((cell[:, 0] * across + cell[:, 1]) * across + cell[:, 2], return_inverse=True)[1]
@@ -130,8 +90,8 @@ def _in_errors(gain: Tensor, scale: float, places: Tensor) -> Tensor:
     sums = torch.zeros(count, dtype=torch.float64).index_add_(0, block, gain.double() - mean)
     error = sums.square().sum().sqrt() / len(gain)
     if count < 2 or float(error) == 0.0:
-        return torch.zeros(())
-    return (mean.sign() * (count * torch.log1p((mean / error).square() / count)).sqrt()).float()
+        return 0.0
+    return float(mean.sign() * (count * torch.log1p((mean / error).square() / count)).sqrt())
 
 
 SAME_SHARE = 9e-4
@@ -151,10 +111,15 @@ class Trial:
     misfit: Tensor | None = None
     levels: LevelGains | None = None
 
-    @property
+    @cached_property
     def mean(self) -> float:
         """The mean misfit; infinite where the reading is no field."""
         return math.inf if self.misfit is None else float(self.misfit.mean())
+
+    @property
+    def misfit_near(self) -> float:
+        """The median misfit of the points near the surface, which are the second half."""
+        return math.inf if self.misfit is None else float(self.misfit[len(self.misfit) // 2 :].median())
 
     @cached_property
     def support(self) -> float:
@@ -171,63 +136,18 @@ class Trial:
         """Whether the levels do clearly more than chance, and the reading is clearly a distance."""
         return self.support > LEAST_SUPPORT and self.is_distance
 
-    def has_levels_of(self, other: Trial) -> bool:
-        """Whether both divide the table into as many levels, so that these can be compared one by one."""
-        if self.levels is None or other.levels is None:
-            return self.levels is other.levels
-        return len(self.levels.gains) == len(other.levels.gains)
-
-    def has_resolutions_of(self, other: Trial) -> bool:
-        """Whether both differ at most in how rows are counted, or have no grid: misread, they are equally noisy.
-
-        Over another cube the cells have another length, and a misread grid another noise.
-        """
-        if self.levels is None or other.levels is None:
-            return self.levels is other.levels
-        radii = (trial.reading.description.get("grid_radius") for trial in (self, other))
-        return len(set(radii)) == 1 and torch.equal(self.levels.scales, other.levels.scales)
-
     def support_over(self, other: Trial) -> float:
         """The same against ``other``: level by level at the same points where both have as many levels."""
-        if self.levels is None or other.levels is None or not self.has_levels_of(other):
+        if self.levels is None or other.levels is None or len(self.levels.gains) != len(other.levels.gains):
             return self.support - other.support
         return self.levels.over(other.levels).support()
-
-    def usual_over(self, other: Trial) -> float:
-        """What usual numbers say for this reading against ``other``, as support. Strides are not anybody's numbers."""
-        if self.has_resolutions_of(other):
-            return 0.0
-        tiers = other.reading.tier - self.reading.tier
-        mine, others = self.reading.scale, other.reading.scale
-        if tiers and mine is not None and others is not None and abs(mine - others) < _ACCIDENT:
-            return math.copysign(LEAST_SUPPORT + _USUAL, tiers)
-        return _USUAL * tiers
-
-    def beats(self, other: Trial) -> bool:
-        """Whether the levels speak clearly for this reading and not for ``other``.
-
-        The misfit alone speaks only where both have the same resolutions: a misread grid of low resolution has less of
-        it than the right one. Readings of other numbers of levels have no levels in common: then more must speak for
-        this one. A reading without a grid is the simplest one: it stands where a grid's levels say nothing and only
-        worsen the misfit.
-        """
-        if other.misfit is None:
-            return self.misfit is not None
-        if self.levels is None and other.levels is not None:
-            return other.support < LEAST_SUPPORT and self.is_better(other, CLEARLY, LEAST)
-        if self.has_resolutions_of(other) and self.is_better(other, CLEARLY, LEAST):
-            return True
-        if self.has_levels_of(other):
-            return self.support_over(other) + self.usual_over(other) > _LIKELIER
-        return self.support_over(other) > CLEAR_SUPPORT
 
     def is_better(self, other: Trial, share: float, least: float = 0.0) -> bool:
         """Whether this one fits better than ``other`` by more than chance, ``share`` of its misfit and ``least``."""
         if self.misfit is None or other.misfit is None:
             return other.misfit is None and self.misfit is not None
         more = other.misfit - self.misfit
-        error = float(more.std()) / math.sqrt(len(more))
-        mean = float(more.mean())
+        mean, error = float(more.mean()), float(more.std()) / math.sqrt(len(more))
         return mean > max(least, share * self.mean) and mean > _DEVIATIONS * error
 
     def is_same(self, other: Trial) -> bool:
@@ -240,19 +160,8 @@ class Trial:
 
 LEAST_SUPPORT = 15.0
 """Support is clear beyond so much: a likelihood ratio of three million."""
-_LIKELIER = 10.0
-"""What a reading needs against one of as many levels, usual numbers included: odds of twenty thousand. Levels that tell
-nothing add 3 to it by chance (the standard deviation of twelve)."""
-_USUAL = 5.0
-"""A tier of numbers is written this much more often than the next: 150 times, as a logarithm."""
-_ACCIDENT = 0.01
-"""Logarithm of finest resolutions within which a more usual number is no accident."""
-CLEAR_SUPPORT = 50.0
-"""What two readings need whose difference chance is not all of: readings of other levels, interpolations, nothing."""
 _DISTANCE = 0.4
 """A reading of a greater mean misfit is itself no distance, and speaks against no other."""
-CLEARLY, LEAST = 0.1, 0.01
-"""A misfit is clearly greater by this share of the other's, and by this much at least."""
 _DEVIATIONS = 4.5
 """A difference counts beyond this many standard errors of its mean."""
 
@@ -265,47 +174,45 @@ class Evidence:
         box = torch.tensor(first.description["bounds"], dtype=torch.float32)
         scattered = torch.rand(4 * points, 3, generator=torch.Generator().manual_seed(seed))
         scattered = box[0] + (box[1] - box[0]) * scattered
-        field = _field(first.description, first.tensors)
         nearest = torch.arange(points // 2)
-        if field is not None:
-            nearest = field.signed_distance(scattered[points // 2 :]).abs().nan_to_num(math.inf).argsort()
+        try:
+            distance = field_of(first).signed_distance(scattered[points // 2 :])
+            nearest = distance.abs().nan_to_num(math.inf).argsort()
+        except FieldFormatError:
+            pass
         near = scattered[points // 2 :][nearest[: points // 2]]
         self._points = torch.cat((scattered[: points // 2], near))
 
     def of(self, reading: Reading) -> Trial:
-        """The reading's trial."""
-        field = _field(reading.description, reading.tensors)
-        if field is None:
-            return Trial(reading)
+        """The reading's trial; an empty one where the description is beyond what a field may have."""
         try:
-            distance, gradient, levels = self._evaluate(field)
+            field = field_of(reading)
+            distance, gradient, levels = _evaluated(field, self._points)
         except FieldFormatError:
             return Trial(reading)
         if not torch.isfinite(distance).all() or not torch.isfinite(gradient.norm(dim=-1)).all():
             return Trial(reading)
         return Trial(reading, distance, gradient, norm_misfit(gradient), levels)
 
-    def _evaluate(self, field: SdfField) -> tuple[Tensor, Tensor, LevelGains | None]:
-        """Distance, gradient, and what the levels do where there is a grid."""
-        parts = parts_of_gradient(field, self._points)
-        if parts is None:
-            return *field.signed_distance_and_gradient(self._points), None
-        return parts.distance, parts.rest + parts.levels.sum(dim=0), parts.gains()
+
+def _evaluated(field: SdfField, points: Tensor) -> tuple[Tensor, Tensor, LevelGains | None]:
+    """Distance, gradient, and what the levels do where there is a grid."""
+    function = field.function if isinstance(field, FunctionField) else None
+    if not isinstance(function, NeusFactoFunction) or function.hash_encoding is None:
+        return *field.signed_distance_and_gradient(points), None
+    chunks = [function.gradient_by_level(chunk) for chunk in torch.split(points, _CHUNK)]
+    parts = zip(*chunks, strict=True)  # (N,), (N, 3) and (A, N, 3)
+    distance, rest, levels = (torch.cat(part, dim=max(0, part[0].dim() - 2)) for part in parts)
+    gains = LevelGains(level_gains(rest, levels), function.hash_encoding.scales, function.places(points))
+    return distance, rest + levels.sum(dim=0), gains
 
 
-def _field(description: dict[str, Any], tensors: Mapping[str, StoredArray]) -> SdfField | None:
-    """The field, or None where the description is beyond what a field may have."""
-    try:
-        with _read_only():
-            named = {name: torch.from_numpy(array) for name, array in tensors.items()}
-        return build_field(parse_description(description), named)
-    except FieldFormatError:
-        return None
-
-
-@contextmanager
-def _read_only() -> Iterator[None]:
-    """The map of the upload is only read: torch need not say that it could not be written to."""
+def field_of(reading: Reading) -> SdfField:
+    """Raises FieldFormatError where it is no field: a factor beyond what a field may have, for example."""
+    description = parse_description(reading.description)
+    description.check(tensor_specs(reading.tensors))
     with warnings.catch_warnings():
+        # the map of the upload is only read
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")
-        yield
+        tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
+    return build_field(description, tensors)

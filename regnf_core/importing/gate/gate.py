@@ -49,12 +49,11 @@ def _candidate(value: Any, folder: Path, number: int) -> Candidate | None:
         entries = UploadDescription.from_dict(said).non_default()
     except FieldFormatError:
         return None
+    if not entries:
+        return None
+    picture = folder / candidate_name(number)
     plain = "".join(c for c in name if c.isprintable())[:_MAX_CANDIDATE_NAME]
-    return Candidate(plain, entries, _picture(folder / candidate_name(number))) if entries else None
-
-
-def _picture(path: Path) -> bytes | None:
-    return path.read_bytes() if is_sound_picture(path, CANDIDATE_BYTES) else None
+    return Candidate(plain, entries, picture.read_bytes() if is_sound_picture(picture, CANDIDATE_BYTES) else None)
 
 
 __all__ = ["FIELD_NAME", "ImportLimits", "ImportReport", "import_field"]

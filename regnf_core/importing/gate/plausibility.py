@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import torch
 from scipy.spatial import ConvexHull, QhullError
@@ -37,22 +36,18 @@ _NEARER = 0.5
 INSIST = "with accept_implausible: true in the description it is taken"
 
 
-@dataclass(frozen=True)
-class Box:
-    """Bounds. low, high: (3,)."""
-
-    low: Tensor
-    high: Tensor
-
-
-def measured_enclosure(points: Tensor, distance: Tensor, surface: Tensor, slope: float, box: Box) -> dict[str, float]:
+def measured_enclosure(
+    points: Tensor, distance: Tensor, surface: Tensor, slope: float, box: tuple[Tensor, Tensor]
+) -> dict[str, float]:
     """free_share_of_hull, inner_share_inside (without the rim), and inner_clearance: the least of the distances there,
     as a share of that to the bounds; 0 where all of it is matter.
 
-    points: (N, 3) anywhere in the box · distance: (N,) there · surface: (M, 3) · slope: of the field at its surface.
+    points: (N, 3) anywhere in the box · distance: (N,) there · surface: (M, 3) · slope: of the field at its surface ·
+    box: lowest and highest corner.
     """
-    edge = box.high - box.low
-    rim = torch.minimum(points - box.low, box.high - points)  # (N, 3)
+    low, high = box
+    edge = high - low
+    rim = torch.minimum(points - low, high - points)  # (N, 3)
     inner = (rim > _RIM * edge).all(dim=-1)
     inside = distance < 0
     free = inner & ~inside
@@ -160,7 +155,7 @@ def check_plausibility(
         "gradient_p10": low,
         "gradient_median": median,
         "gradient_p90": high,
-        **measured_enclosure(points, distance, surface, median, Box(lower, upper)),
+        **measured_enclosure(points, distance, surface, median, (lower, upper)),
     }
     return measured, _warnings(measured), torch.stack([surface.amin(0), surface.amax(0)]).tolist()
 

@@ -143,7 +143,6 @@ class _Translation:
 
 def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: ImportLimits) -> ConvertedField:
     """By the format's own reader. path: the upload itself, or where a field file out of an archive may be written."""
-    from regnf_core.importing.families.arrays import convert_arrays
     from regnf_core.importing.families.safe_field import convert_safe_field
     from regnf_core.importing.settings.facts import Facts
 
@@ -151,11 +150,12 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
     head = bytes(data[:HEAD_BYTES])
     kind = sniff_format(head)
     if kind in ("torch-zip", "torch-legacy"):
-        return _convert_torch(kind, data, tensor_bytes, describe)
+        return _convert_torch(kind, opened, tensor_bytes, describe)
     if kind == "npz":
         from regnf_core.importing.containers.npz import ArraySource
+        from regnf_core.importing.families.arrays import convert_arrays  # loads scipy
 
-        return convert_arrays(ArraySource(data, tensor_bytes), describe(Facts()))
+        return convert_arrays(ArraySource(data, tensor_bytes, opened.members), describe(Facts()))
     if kind == "safetensors":
         if opened.name is not None:
             path.write_bytes(data)
@@ -177,7 +177,7 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
     raise FieldFormatError(detail, reason=reason)
 
 
-def _convert_torch(kind: str, data: memoryview, tensor_bytes: int, describe: Describe) -> ConvertedField:
+def _convert_torch(kind: str, opened: OpenedUpload, tensor_bytes: int, describe: Describe) -> ConvertedField:
     from regnf_core.importing.containers.legacy_container import read_archive, read_legacy
     from regnf_core.importing.families import convert_checkpoint
     from regnf_core.importing.pickle.pickle_reader import read_pickle
@@ -186,10 +186,10 @@ def _convert_torch(kind: str, data: memoryview, tensor_bytes: int, describe: Des
 
     source: TensorSource
     if kind == "torch-zip":
-        archive = read_archive(data)
+        archive = read_archive(opened.data, members=opened.members)
         values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes)
     else:
-        values, legacy = read_legacy(data)
+        values, legacy = read_legacy(opened.data)
         source = TensorSource(legacy, tensor_bytes)
     return convert_checkpoint(values, source, describe(facts_of(values, source)))
 

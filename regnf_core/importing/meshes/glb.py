@@ -5,21 +5,24 @@ the shape and is not applied is said.
 
 from __future__ import annotations
 
+import base64
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.meshes.glb_buffers import COMPRESSED, Accessors
 from regnf_core.importing.meshes.triangle_files import (
+    MAX_TRIANGLES,
     Float64Array,
     Geometry,
     Int64Array,
     Siblings,
+    elsewhere,
     fan,
     malformed,
     require_room,
@@ -28,43 +31,142 @@ from regnf_core.importing.meshes.triangle_files import (
     within_unit,
 )
 
+# The numbers: accessors into buffers, every extent checked first. A buffer is the file's own binary chunk, text within
+# the document, or a file that came with it. None is ever looked for.
+
+_CONTRADICTIONS = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
+"""What faulty JSON ends in, where no check says more."""
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_MAX_ITEMS = 3 * MAX_TRIANGLES
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+
+
+class Accessors:
+    """Reads accessors of ``document``. binary: the file's chunk, None in text form · siblings: files beside it."""
+
+    def __init__(self, document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> None:
+        self._accessors, self._views, self._buffers = (
+            document.get(key, []) for key in ("accessors", "bufferViews", "buffers")
+        )
+        self._binary = binary
+        self._siblings = siblings
+        self._read: dict[int, memoryview] = {}
+
+    def array(self, number: object, width: int) -> Float64Array:
+        """The items (N, width) of accessor ``number``.
+
+        Raises FieldFormatError: MESH_INVALID, FORMAT_NOT_SUPPORTED or MESH_EXTERNAL_REFERENCE.
+        """
+        accessor = self._accessors[_whole(number)]
+        component = _COMPONENTS.get(accessor["componentType"])
+        if component is None or _WIDTHS.get(accessor["type"]) != width:
+            raise malformed("a glTF accessor of an unexpected type")
+        count = _whole(accessor["count"])
+        if count > _MAX_ITEMS:
+            raise malformed(f"a glTF accessor of {count} items")
+        items = np.zeros((count, width))
+        if "bufferView" in accessor:
+            items = self._items(accessor, component, count, width)
+        if "sparse" in accessor:
+            said = accessor["sparse"]
+            changed, type_ = _whole(said["count"]), _COMPONENTS.get(said["indices"]["componentType"])
+            if type_ is None or type_[1] != "u" or changed > count:
+                raise malformed("a glTF sparse accessor of more items than there are")
+            at = self._items(said["indices"], type_, changed, 1).reshape(-1).astype(np.int64)
+            if len(at) and at.max() >= count:
+                raise malformed("a glTF sparse accessor of an item that does not exist")
+            items[at] = self._items(said["values"], component, changed, width)
+        if accessor.get("normalized", False) and component != "<f4":
+            items = np.maximum(items / float(np.iinfo(np.dtype(component)).max), -1.0)
+        return items
+
+    def is_stored(self, number: object) -> bool:
+        """Whether accessor ``number`` has numbers of its own."""
+        accessor = self._accessors[_whole(number)]
+        return "bufferView" in accessor or "sparse" in accessor
+
+    def _items(self, said: dict[str, Any], component: str, count: int, width: int) -> Float64Array:
+        """(count, width) numbers of a buffer view, from a byte offset on."""
+        view, item = self._views[_whole(said["bufferView"])], np.dtype(component).itemsize * width
+        data = self._view(view)
+        stride, start = _whole(view.get("byteStride", item)), _whole(said.get("byteOffset", 0))
+        if stride < item or start + stride * max(count - 1, 0) + item * min(count, 1) > len(data):
+            raise malformed("a glTF accessor reaches beyond its buffer view")
+        items = np.ndarray((count, width), component, data, start, (stride, np.dtype(component).itemsize))
+        return items.astype(np.float64)
+
+    def _view(self, view: dict[str, Any]) -> memoryview:
+        if any(name in view.get("extensions", {}) for name in COMPRESSED):
+            raise unsupported("the glTF file's buffers are compressed: export it without mesh compression")
+        data = self._buffer(_whole(view["buffer"]))
+        start, size = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])
+        if start + size > len(data):
+            raise malformed("a glTF buffer view reaches beyond its buffer")
+        return data[start : start + size]
+
+    def _buffer(self, number: int) -> memoryview:
+        """The bytes of a buffer, no more than it claims."""
+        if number not in self._read:
+            buffer = self._buffers[number]
+            claimed = _whole(buffer["byteLength"])
+            if "uri" in buffer:
+                data = self._elsewhere(buffer["uri"], claimed)
+            elif number == 0 and self._binary is not None:
+                data = self._binary
+            else:
+                raise malformed("a glTF buffer without data")
+            self._read[number] = data[: min(len(data), claimed)]
+        return self._read[number]
+
+    def _elsewhere(self, uri: object, claimed: int) -> memoryview:
+        """The bytes that a buffer's ``uri`` holds, or that came under this name."""
+        if not isinstance(uri, str):
+            raise malformed("a glTF buffer's uri is not text")
+        if uri.startswith("data:"):
+            head, comma, text = uri.partition(",")
+            if not comma or not head.endswith(";base64") or len(text) * 3 // 4 > claimed + 3:
+                raise malformed("a glTF buffer's data is not base64 of the length that it claims")
+            try:
+                return memoryview(base64.b64decode(text, validate=True))
+            except ValueError as error:
+                raise malformed("a glTF buffer's data is not base64") from error
+        name = unquote(uri).removeprefix("./")
+        if name not in self._siblings:
+            missing = "the glTF file keeps its geometry in another file or address: "
+            raise elsewhere(missing + "give both in one archive, or export it as one .glb")
+        return self._siblings[name]
+
+
+def _whole(value: object) -> int:
+    if type(value) is not int or not 0 <= value < 1 << 48:
+        raise malformed("a glTF count, offset or index that is not a number")
+    return value
+
+
 # The colors of a glTF document's vertices: their own times the material's, linear light as sRGB. No textures.
 
 _GRAY = 0.8
 """Of parts without any color, beside others that have one."""
 
 
-def primitive_colors(
+def _primitive_colors(
     document: dict[str, Any], primitive: dict[str, Any], accessors: Accessors, vertices: int
 ) -> Float64Array | None:
     """(V, 3) in [0, 1], R, G, B, of one primitive; None where it has none, or none that makes sense."""
+    own = None
     try:
-        own = _own_colors(document, primitive, accessors)
+        if (number := primitive["attributes"].get("COLOR_0")) is not None:
+            width = 4 if document["accessors"][number]["type"] == "VEC4" else 3
+            own = accessors.array(number, width)[:, :3]
         factor = _factor(document, primitive)
-    except (AttributeError, FieldFormatError, IndexError, KeyError, OverflowError, TypeError, ValueError):
+    except (FieldFormatError, *_CONTRADICTIONS):
         return None
-    if own is None and factor is None:
+    if (own is None and factor is None) or (own is not None and len(own) != vertices):
         return None
-    linear = np.ones((vertices, 3)) if own is None else own
-    if len(linear) != vertices:
-        return None
-    return _as_srgb(within_unit(linear * (1.0 if factor is None else factor)))
-
-
-def joined_colors(parts: Sequence[Float64Array | None], counts: Sequence[int]) -> Float64Array | None:
-    """The colors of all vertices; None where no part has any. counts: vertices of each part."""
-    if all(part is None for part in parts):
-        return None
-    filled = [np.full((count, 3), _GRAY) if part is None else part for part, count in zip(parts, counts, strict=True)]
-    return np.concatenate(filled)
-
-
-def _own_colors(document: dict[str, Any], primitive: dict[str, Any], accessors: Accessors) -> Float64Array | None:
-    number = primitive["attributes"].get("COLOR_0")
-    if number is None:
-        return None
-    width = 4 if document["accessors"][number]["type"] == "VEC4" else 3
-    return accessors.array(number, width)[:, :3]
+    linear = within_unit((np.ones((vertices, 3)) if own is None else own) * (1.0 if factor is None else factor))
+    # IEC 61966-2-1: images have such numbers, glTF has linear light.
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
 def _factor(document: dict[str, Any], primitive: dict[str, Any]) -> Float64Array | None:
@@ -75,12 +177,6 @@ def _factor(document: dict[str, Any], primitive: dict[str, Any]) -> Float64Array
     if "baseColorTexture" in surface or "baseColorFactor" not in surface:
         return None
     return np.array(surface["baseColorFactor"][:3], dtype=np.float64).reshape(3)
-
-
-def _as_srgb(linear: Float64Array) -> Float64Array:
-    """IEC 61966-2-1: images have such numbers, glTF has linear light."""
-    curved: Float64Array = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-    return curved
 
 
 # The scene graph of a glTF document: which mesh stands where, how often, and how its vertices are moved there.
@@ -115,7 +211,9 @@ def placed_meshes(document: dict[str, Any], accessors: Accessors) -> Iterator[Pl
     if len(nodes) > _MAX_NODES:
         raise malformed(f"a glTF scene of {len(nodes)} nodes")
     center = _translation(document.get("extensions", {}).get(CENTER, {}).get("center", (0.0, 0.0, 0.0)))
-    drawn = dict(_visited(nodes, _roots(document, nodes), center))
+    scenes = document.get("scenes", [])
+    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(nodes)
+    drawn = dict(_visited(nodes, roots, center))
     poses = dict(drawn)
     if any("skin" in nodes[number] for number in drawn):  # a joint may stand in no scene, or be invisible
         poses |= dict(_visited(nodes, _without_parent(nodes), center, hidden=True))
@@ -146,14 +244,6 @@ def _visited(
         matrix = above @ _pose(node)
         yield number, matrix
         waiting.extend((child, matrix) for child in node.get("children", []))
-
-
-def _roots(document: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
-    scenes = document.get("scenes", [])
-    if scenes:
-        roots: list[int] = scenes[document.get("scene", 0)].get("nodes", [])
-        return roots
-    return _without_parent(nodes)
 
 
 def _without_parent(nodes: list[dict[str, Any]]) -> list[int]:
@@ -261,7 +351,7 @@ def read_gltf(data: memoryview, siblings: Siblings | None = None) -> Geometry:
 def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> Geometry:
     try:
         return _scene(document, Accessors(document, binary, siblings))
-    except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
+    except _CONTRADICTIONS as error:
         raise malformed(f"the glTF document contradicts itself ({type(error).__name__})") from error
 
 
@@ -318,7 +408,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
             corners = _triangles(primitive, accessors, len(places))
             if len(corners) and (corners.min() < 0 or corners.max() >= len(places)):
                 raise malformed("a glTF face names a vertex that does not exist")
-            painted = primitive_colors(document, primitive, accessors, len(places))
+            painted = _primitive_colors(document, primitive, accessors, len(places))
             count = len(placed.matrices) if placed.joints is None else 1
             require_room(so_far + count * len(places), triangles + count * len(corners))
             for matrix in placed.matrices[:count]:
@@ -330,10 +420,12 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
                 faces.append((corners[:, ::-1] if turned else corners) + so_far)
                 so_far, triangles = so_far + len(places), triangles + len(corners)
     empty = np.zeros((0, 3))
+    parts = zip(colors, vertices, strict=True)
+    shown = [np.full((len(part), 3), _GRAY) if color is None else color for color, part in parts]
     return Geometry(
         np.concatenate([empty, *vertices]),
         np.concatenate([empty.astype(np.int64), *faces]),
-        colors=joined_colors(colors, [len(part) for part in vertices]),
+        colors=None if all(color is None for color in colors) else np.concatenate(shown),
         left_out=(*sorted(flat), *(word for key, word in _IGNORED.items() if document.get(key))),
         not_applied=tuple(f"extension {name}" for name in used if name not in _APPLIED),
     )

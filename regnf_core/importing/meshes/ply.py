@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -31,12 +30,8 @@ ByteOrder = Literal["<", ">"]
 
 _MAX_HEADER = 1 << 16
 _MAX_PARTS = 64
-_CODES = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"} | {
-    "i4": "int int32",
-    "u4": "uint uint32",
-    "f4": "float float32",
-    "f8": "double float64",
-}
+_CODES = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
+_CODES |= {"i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64"}
 _TYPES = {name: code for code, names in _CODES.items() for name in names.split()}
 _FORMATS: dict[str, ByteOrder | None] = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"(?:^|\n)end_header[ \t]*\r?\n")
@@ -46,7 +41,7 @@ _SPLAT = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
 
 
 @dataclass(frozen=True)
-class Property:
+class _Property:
     """One value of a row, or a list of them: numpy type codes without byte order."""
 
     name: str
@@ -56,25 +51,22 @@ class Property:
 
 
 @dataclass(frozen=True)
-class Element:
+class _Element:
     """``count`` rows of the same properties."""
 
     name: str
     count: int
-    properties: tuple[Property, ...]
+    properties: tuple[_Property, ...]
+
+    def cut_short(self) -> FieldFormatError:
+        return malformed(f"the PLY file ends within its {self.name[:40]} rows")
 
 
-@dataclass(frozen=True)
-class Header:
-    """The header takes ``size`` bytes; ``byte_order`` None means text."""
+def _read_header(data: memoryview) -> tuple[ByteOrder | None, tuple[_Element, ...], int]:
+    """The byte order, None for text; the elements; the header's bytes.
 
-    byte_order: ByteOrder | None
-    elements: tuple[Element, ...]
-    size: int
-
-
-def read_ply_header(data: memoryview) -> Header:
-    """The header. Raises FieldFormatError: MESH_INVALID, or FAMILY_NOT_SUPPORTED for Gaussian splats."""
+    Raises FieldFormatError: MESH_INVALID, or FAMILY_NOT_SUPPORTED for Gaussian splats.
+    """
     head = bytes(data[:_MAX_HEADER])
     end = _END.search(head)
     if end is None:
@@ -84,24 +76,23 @@ def read_ply_header(data: memoryview) -> Header:
     words = [line for line in words if line[0] not in ("comment", "obj_info")]
     if not words or words[0][0] != "format" or len(words[0]) != 3 or words[0][1] not in _FORMATS:
         raise malformed("the PLY header names no known format")
-    return Header(_FORMATS[words[0][1]], _elements(words[1:]), end.end())
+    return _FORMATS[words[0][1]], _elements(words[1:]), end.end()
 
 
-def _elements(lines: list[list[str]]) -> tuple[Element, ...]:
-    found: list[tuple[str, int, list[Property]]] = []
+def _elements(lines: list[list[str]]) -> tuple[_Element, ...]:
+    found: list[tuple[str, int, list[_Property]]] = []
     for line in lines:
         match line:
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 16:
                 found.append((name, int(count), []))
             case ["property", "list", count_type, type_, name] if found and {count_type, type_} <= _TYPES.keys():
-                found[-1][2].append(Property(name, _TYPES[type_], _TYPES[count_type]))
+                found[-1][2].append(_Property(name, _TYPES[type_], _TYPES[count_type]))
             case ["property", type_, name] if found and type_ in _TYPES:
-                found[-1][2].append(Property(name, _TYPES[type_]))
+                found[-1][2].append(_Property(name, _TYPES[type_]))
             case _:
                 raise malformed("the PLY header has a line that makes no sense")
-    elements = tuple(Element(name, count, tuple(properties)) for name, count, properties in found)
-    names = [element.name for element in elements]
-    if len(elements) > _MAX_PARTS or len(set(names)) != len(names):
+    elements = tuple(_Element(name, count, tuple(properties)) for name, count, properties in found)
+    if len(elements) > _MAX_PARTS or len({element.name for element in elements}) != len(elements):
         raise malformed("the PLY header names an element twice, or too many of them")
     for element in elements:
         properties = [p.name for p in element.properties]
@@ -110,180 +101,101 @@ def _elements(lines: list[list[str]]) -> tuple[Element, ...]:
             raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
         if not properties or len(properties) > _MAX_PARTS or len(set(properties)) != len(properties):
             raise malformed(f"the PLY element {element.name[:40]} has no properties, too many, or one twice")
-        if any(p.count_type is not None and p.count_type.startswith("f") for p in element.properties):
+        if any((p.count_type or "").startswith("f") for p in element.properties):
             raise malformed("a PLY list whose length is not an integer")
     return elements
 
 
-# The rows of a PLY file, as text or in binary: single values at once, rows with lists one by one if they must be.
-
 _USUAL_CORNERS = (3, 4)
 
 
-class Body(ABC):
-    """Hands out one element after the other, in the header's order."""
+class _Body:
+    """The rows behind the header: hands out one element after the other. Text is read as numbers of float64 each."""
 
     flat_faces: int = 0
     """Faces of fewer than three corners, which were left out."""
 
-    @abstractmethod
-    def scalars(self, element: Element) -> dict[str, Float64Array]:
-        """The columns (count,) of an element's single values; lists beside them are passed over."""
+    def __init__(self, data: memoryview, order: ByteOrder | None) -> None:
+        self._data = numbers_of(bytes(data), "PLY").data.cast("B") if order is None else data
+        self._order = order
 
-    @abstractmethod
-    def _regular(self, element: Element, corners: int) -> Any | None:
-        """(count, columns) rows by name if every list has this length; None, nothing taken, if not."""
+    def _type(self, code: str) -> np.dtype[Any]:
+        return np.dtype(np.float64 if self._order is None else self._order + code)
 
-    @abstractmethod
-    def _rows(self, element: Element) -> Iterator[dict[str, Any]]:
-        """The rows one by one; lists as arrays."""
-
-    def _scalars_beside_lists(self, element: Element) -> dict[str, Float64Array]:
-        names = [p.name for p in element.properties if p.count_type is None]
-        table = [[float(row[name][0]) for name in names] for row in self._rows(element)]
-        columns = np.array(table, dtype=np.float64).reshape(-1, len(names)).T
-        return dict(zip(names, columns, strict=True))
-
-    def skip(self, element: Element) -> None:
-        """Pass over an element."""
-        if all(p.count_type is None for p in element.properties):
-            self.scalars(element)
-        else:
-            for _ in self._rows(element):
-                pass
-
-    def lists(self, element: Element, name: str) -> Iterator[Int64Array]:
-        """The list called ``name`` of every row, of any length."""
-        for row in self._rows(element):
-            yield np.asarray(row[name], dtype=np.int64)
-
-    def triangles(self, element: Element, name: str) -> Int64Array:
-        """(F, 3) indices from the lists called ``name``, longer ones as fans."""
-        for corners in _USUAL_CORNERS:
-            rows = self._regular(element, corners)
-            if rows is not None:
-                require_room(0, (corners - 2) * element.count)
-                return fans(rows[name])
-        found: list[Int64Array] = []
-        triangles = 0
-        for row in self._rows(element):
-            polygon = np.asarray(row[name], dtype=np.int64)
-            self.flat_faces += len(polygon) < 3
-            triangles += max(len(polygon) - 2, 0)
-            require_room(0, triangles)
-            found.append(fan(polygon))
-        return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
-
-
-class BinaryBody(Body):
-    """Rows of packed numbers."""
-
-    def __init__(self, data: memoryview, byte_order: ByteOrder) -> None:
-        self._data = data
-        self._order = byte_order
-
-    def scalars(self, element: Element) -> dict[str, Float64Array]:
-        if any(p.count_type is not None for p in element.properties):
-            return self._scalars_beside_lists(element)
-        rows = self._table(element, 0)
-        if rows is None:
-            raise malformed(f"the PLY file ends within its {element.name[:40]} rows")
-        self._data = self._data[rows.nbytes :]
-        return {p.name: rows[p.name].astype(np.float64) for p in element.properties}
-
-    def _regular(self, element: Element, corners: int) -> Any | None:
-        lists = [p.name for p in element.properties if p.count_type is not None]
-        rows = self._table(element, corners)
-        if len(lists) != 1 or rows is None or not (rows[f"{lists[0]} length"] == corners).all():
+    def _table(self, element: _Element, corners: int = 0) -> Any | None:
+        """(count,) rows by name if every list has ``corners`` items; None, nothing taken, if not."""
+        fields: list[tuple[Any, ...]] = []
+        for p in element.properties:
+            if p.count_type is not None:
+                fields.append((f"{p.name} length", self._type(p.count_type)))
+            fields.append((p.name, self._type(p.type), () if p.count_type is None else (corners,)))
+        row = np.dtype(fields)
+        if element.count * row.itemsize > len(self._data):
+            return None
+        rows = np.frombuffer(self._data, row, element.count) if element.count else np.zeros(0, row)
+        lengths = [name for name in row.names or () if name.endswith(" length")]
+        if not all((rows[name] == corners).all() for name in lengths):
             return None
         self._data = self._data[rows.nbytes :]
         return rows
 
-    def _table(self, element: Element, corners: int) -> Any | None:
-        """The rows if every list has ``corners`` items; None if there are not so many bytes."""
-        fields: list[tuple[Any, ...]] = []
-        for p in element.properties:
-            if p.count_type is None:
-                fields.append((p.name, self._order + p.type))
-            else:
-                fields.append((f"{p.name} length", self._order + p.count_type))
-                fields.append((p.name, self._order + p.type, (corners,)))
-        row = np.dtype(fields)
-        if element.count * row.itemsize > len(self._data):
-            return None
-        return np.frombuffer(self._data, dtype=row, count=element.count)
-
-    def _rows(self, element: Element) -> Iterator[dict[str, Any]]:
+    def rows(self, element: _Element) -> Iterator[dict[str, Any]]:
+        """The rows one by one; lists as arrays."""
         data, at = self._data, 0
-        types = [(p, np.dtype(self._order + p.type), p.count_type) for p in element.properties]
+        types = [
+            (p.name, self._type(p.type), None if p.count_type is None else self._type(p.count_type))
+            for p in element.properties
+        ]
         for _ in range(element.count):
             row: dict[str, Any] = {}
-            for p, type_, count_type in types:
-                count = 1
+            for name, type_, count_type in types:
+                count = 1.0
                 if count_type is not None:
-                    width = np.dtype(count_type).itemsize
-                    order, signed = ("little" if self._order == "<" else "big"), count_type.startswith("i")
-                    count = int.from_bytes(data[at : at + width], order, signed=signed)  # type: ignore[arg-type]
-                    at += width
-                size = count * type_.itemsize
-                if count < 0 or at + size > len(data):
-                    raise malformed(f"the PLY file ends within its {element.name[:40]} rows")
-                row[p.name] = np.frombuffer(data[at : at + size], dtype=type_)
+                    if at + count_type.itemsize > len(data):
+                        raise element.cut_short()
+                    count = np.frombuffer(data, count_type, 1, at)[0]
+                    at += count_type.itemsize
+                if not 0 <= count <= (len(data) - at) // type_.itemsize:
+                    raise element.cut_short()
+                size = int(count) * type_.itemsize
+                row[name] = np.frombuffer(data[at : at + size], dtype=type_)
                 at += size
             yield row
         self._data = data[at:]
 
+    def scalars(self, element: _Element) -> dict[str, Float64Array]:
+        """The columns (count,) of an element's single values; lists beside them are passed over."""
+        names = [p.name for p in element.properties if p.count_type is None]
+        if len(names) == len(element.properties):
+            rows = self._table(element)
+            if rows is None:
+                raise element.cut_short()
+            return {name: rows[name].astype(np.float64) for name in names}
+        table = [[float(row[name][0]) for name in names] for row in self.rows(element)]
+        columns = np.array(table, dtype=np.float64).reshape(element.count, len(names)).T
+        return dict(zip(names, columns, strict=True))
 
-class TextBody(Body):
-    """Rows of numbers between spaces."""
-
-    def __init__(self, data: memoryview) -> None:
-        self._numbers = numbers_of(bytes(data), "PLY")
-
-    def scalars(self, element: Element) -> dict[str, Float64Array]:
-        if any(p.count_type is not None for p in element.properties):
-            return self._scalars_beside_lists(element)
-        width = len(element.properties)
-        rows = self._take(element, element.count * width).reshape(element.count, width)
-        return {p.name: rows[:, i] for i, p in enumerate(element.properties)}
-
-    def _regular(self, element: Element, corners: int) -> Any | None:
-        if len(element.properties) != 1 or element.count * (corners + 1) > len(self._numbers):
-            return None
-        rows = self._numbers[: element.count * (corners + 1)].reshape(element.count, corners + 1)
-        if not (rows[:, 0] == corners).all():
-            return None
-        self._take(element, rows.size)
-        return {element.properties[0].name: _whole(rows[:, 1:])}
-
-    def _rows(self, element: Element) -> Iterator[dict[str, Any]]:
-        numbers, at = self._numbers, 0
-        for _ in range(element.count):
-            row: dict[str, Any] = {}
-            for p in element.properties:
-                count = 1
-                if p.count_type is not None:
-                    claimed = numbers[at] if at < len(numbers) else -1.0
-                    count = int(claimed) if 0 <= claimed <= len(numbers) else -1
-                    at += 1
-                if count < 0 or at + count > len(numbers):
-                    raise malformed(f"the PLY file ends within its {element.name[:40]} rows")
-                values = numbers[at : at + count]
-                row[p.name] = _whole(values) if p.count_type is not None else values
-                at += count
-            yield row
-        self._numbers = numbers[at:]
-
-    def _take(self, element: Element, count: int) -> Float64Array:
-        if count > len(self._numbers):
-            raise malformed(f"the PLY file ends within its {element.name[:40]} rows")
-        taken, self._numbers = self._numbers[:count], self._numbers[count:]
-        return taken
+    def triangles(self, element: _Element, name: str) -> Int64Array:
+        """(F, 3) indices from the lists called ``name``, longer ones as fans."""
+        for corners in _USUAL_CORNERS:
+            rows = self._table(element, corners)
+            if rows is not None:
+                require_room(0, (corners - 2) * element.count)
+                return fans(_whole(rows[name]))
+        found: list[Int64Array] = [np.zeros((0, 3), np.int64)]
+        triangles = 0
+        for row in self.rows(element):
+            polygon = _whole(row[name])
+            self.flat_faces += len(polygon) < 3
+            triangles += max(len(polygon) - 2, 0)
+            require_room(0, triangles)
+            found.append(fan(polygon))
+        return np.concatenate(found)
 
 
-def _whole(values: Float64Array) -> Int64Array:
+def _whole(values: npt.NDArray[Any]) -> Int64Array:
     """Numbers as indices. Raises FieldFormatError (MESH_INVALID) for what is none."""
-    if not (np.isfinite(values) & (np.abs(values) < 2.0**53)).all():
+    if values.dtype.kind == "f" and not (np.isfinite(values) & (np.abs(values) < 2.0**53)).all():
         raise malformed("a PLY index that is not a number")
     return values.astype(np.int64)
 
@@ -298,13 +210,12 @@ def read_ply(data: memoryview) -> Geometry:
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE.
     """
-    header = read_ply_header(data)
-    rest = data[header.size :]
-    body = TextBody(rest) if header.byte_order is None else BinaryBody(rest, header.byte_order)
+    order, elements, size = _read_header(data)
+    body = _Body(data[size:], order)
     vertices, normals, colors = np.zeros((0, 3)), None, None
     faces = np.zeros((0, 3), np.int64)
     left_out: list[str] = []
-    for element in header.elements:
+    for element in elements:
         if element.name == "vertex":
             require_room(element.count, 0)
             table = body.scalars(element)
@@ -317,11 +228,12 @@ def read_ply(data: memoryview) -> Geometry:
             faces = np.concatenate([faces, body.triangles(element, _index_property(element))])
         elif element.name == "tristrips":
             require_room(0, element.count)
-            faces = np.concatenate([faces, *(_strip(order) for order in body.lists(element, _index_property(element)))])
+            name = _index_property(element)
+            faces = np.concatenate([faces, *(_strip(_whole(row[name])) for row in body.rows(element))])
         elif element.count > _MAX_ROWS:
             raise malformed(f"the PLY file claims {element.count} rows of {element.name[:40]}")
         else:
-            body.skip(element)
+            body.scalars(element)
             left_out.append(f"elements {element.name[:40]}")
     if body.flat_faces and len(faces) == 0:
         raise malformed("no face of the PLY file has three corners")
@@ -330,7 +242,7 @@ def read_ply(data: memoryview) -> Geometry:
     return Geometry(vertices, faces, normals, colors, tuple(left_out))
 
 
-def _colors(table: dict[str, Float64Array], element: Element) -> Float64Array | None:
+def _colors(table: dict[str, Float64Array], element: _Element) -> Float64Array | None:
     """Of the vertices, in [0, 1]: whole numbers are shares of the largest of their type."""
     types = {p.name: p.type for p in element.properties}
     for names in _COLOR_NAMES:
@@ -341,7 +253,7 @@ def _colors(table: dict[str, Float64Array], element: Element) -> Float64Array | 
     return None
 
 
-def _strip(order: npt.NDArray[Any]) -> Int64Array:
+def _strip(order: Int64Array) -> Int64Array:
     require_room(0, len(order))
     return strips(order)
 
@@ -352,7 +264,7 @@ def _columns(table: dict[str, Float64Array], names: tuple[str, ...]) -> Float64A
     return np.stack([table[name] for name in names], axis=1)
 
 
-def _index_property(element: Element) -> str:
+def _index_property(element: _Element) -> str:
     found = [p.name for p in element.properties if p.count_type is not None and p.name in _INDEX_NAMES]
     if len(found) != 1:
         raise malformed("PLY faces or strips without one list of vertex indices")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,11 @@ def unpack_lzf(packed: memoryview, size: int) -> memoryview:
                     at += 1
                 back = ((control & 31) << 8 | source[at]) + 1
                 at += 1
-                _copy(made, back, length + 2)
+                start = len(made) - back
+                if start < 0:
+                    raise _faulty()
+                piece = bytes(made[start : start + length + 2])  # it may reach into what is appended
+                made += (piece * ((length + 2) // len(piece) + 1))[: length + 2]
             if len(made) > size:
                 raise _faulty()
     except IndexError as error:
@@ -46,15 +50,6 @@ def unpack_lzf(packed: memoryview, size: int) -> memoryview:
     if len(made) != size:
         raise _faulty()
     return memoryview(bytes(made))
-
-
-def _copy(made: bytearray, back: int, length: int) -> None:
-    """Append ``length`` bytes from so far back; they may reach into what is appended."""
-    start = len(made) - back
-    if start < 0:
-        raise _faulty()
-    piece = bytes(made[start : start + length])
-    made += (piece * (length // len(piece) + 1))[:length]
 
 
 def _faulty() -> Exception:
@@ -78,6 +73,7 @@ _MAX_HEADER, _MAX_FIELDS, _MAX_COLUMNS = 1 << 14, 64, 1 << 10
 _TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
     (sign.upper(), size): f"<{sign}{size}" for sign in ("i", "u") for size in (1, 2, 4, 8)
 }
+_FORMS = frozenset({"ascii", "binary", "binary_compressed"})
 _PLACES, _NORMALS = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
 
 
@@ -92,8 +88,8 @@ class _Header:
     size: int
 
     @property
-    def row_bytes(self) -> int:
-        return sum(self.types[name].itemsize * count for name, count in self.counts.items())
+    def row(self) -> np.dtype[np.void]:
+        return np.dtype([(name, self.types[name], (count,)) for name, count in self.counts.items()])
 
 
 def read_pcd(data: memoryview) -> Geometry:
@@ -101,12 +97,16 @@ def read_pcd(data: memoryview) -> Geometry:
     header = _header(data)
     require_room(header.points, 0)
     body = data[header.size :]
-    if header.data == "ascii":
-        table = _from_text(header, body)
-    elif header.data == "binary":
-        table = _from_rows(header, body)
-    else:
+    if header.data == "binary_compressed":
         table = _from_columns(header, _unpacked(header, body))
+    else:
+        if header.data == "ascii":  # as if every number were one of float64
+            header = replace(header, types=dict.fromkeys(header.types, np.dtype(np.float64)))
+            body = numbers_of(bytes(body), "PCD").data.cast("B")
+        if header.points * header.row.itemsize > len(body):
+            raise malformed("the PCD file ends within its points")
+        rows = np.frombuffer(body, header.row, header.points) if header.points else np.zeros(0, header.row)
+        table = {name: rows[name][:, 0].astype(np.float64) for name in header.counts}
     normals = np.stack([table[name] for name in _NORMALS], axis=1) if table.keys() >= set(_NORMALS) else None
     return Geometry(np.stack([table[name] for name in _PLACES], axis=1), np.zeros((0, 3), np.int64), normals)
 
@@ -127,9 +127,8 @@ def _header(data: memoryview) -> _Header:
     try:
         types = {name: np.dtype(_TYPES[kind, int(size)]) for name, kind, size in zip(names, kinds, sizes, strict=True)}
         columns = {name: int(count) for name, count in zip(names, counts, strict=True)}
-        points = (
-            int(said["POINTS"][0]) if said.get("POINTS") else math.prod(int(said[k][0]) for k in ("WIDTH", "HEIGHT"))
-        )
+        extents = ("POINTS",) if said.get("POINTS") else ("WIDTH", "HEIGHT")
+        points = math.prod(int(said[key][0]) for key in extents)
     except (KeyError, IndexError, ValueError) as error:
         raise malformed("the PCD header has a line that makes no sense") from error
     if len(names) > _MAX_FIELDS or len(types) != len(names) or not types.keys() >= set(_PLACES):
@@ -137,11 +136,7 @@ def _header(data: memoryview) -> _Header:
     singles = {*_PLACES, *_NORMALS} & types.keys()
     if not 0 <= points < 1 << 40 or not all(1 <= count <= _MAX_COLUMNS for count in columns.values()):
         raise malformed("the PCD header has a count that makes no sense")
-    if any(columns[name] != 1 for name in singles) or said["DATA"][:1] not in (
-        ["ascii"],
-        ["binary"],
-        ["binary_compressed"],
-    ):
+    if any(columns[name] != 1 for name in singles) or " ".join(said["DATA"][:1]) not in _FORMS:
         raise malformed("the PCD header names no known form of its points")
     return _Header(types, columns, points, said["DATA"][0], at)
 
@@ -153,27 +148,9 @@ def _row(said: dict[str, list[str]], key: str, count: int) -> list[str]:
     return row
 
 
-def _from_text(header: _Header, body: memoryview) -> dict[str, Float64Array]:
-    width = sum(header.counts.values())
-    numbers = numbers_of(bytes(body), "PCD")
-    if len(numbers) < header.points * width:
-        raise malformed("the PCD file ends within its points")
-    rows = numbers[: header.points * width].reshape(header.points, width)
-    starts = np.cumsum([0, *header.counts.values()])
-    return {name: rows[:, start] for name, start in zip(header.counts, starts, strict=False)}
-
-
-def _from_rows(header: _Header, body: memoryview) -> dict[str, Float64Array]:
-    row = np.dtype([(name, header.types[name], (count,)) for name, count in header.counts.items()])
-    if header.points * row.itemsize > len(body):
-        raise malformed("the PCD file ends within its points")
-    rows = np.frombuffer(body, row, header.points)
-    return {name: rows[name][:, 0].astype(np.float64) for name in header.counts}
-
-
 def _unpacked(header: _Header, body: memoryview) -> memoryview:
     packed, size = (int.from_bytes(body[at : at + 4], "little") for at in (0, 4))
-    if len(body) < 8 or packed > len(body) - 8 or size != header.points * header.row_bytes:
+    if len(body) < 8 or packed > len(body) - 8 or size != header.points * header.row.itemsize:
         raise malformed("the PCD file's compressed points have another size than the header says")
     return unpack_lzf(body[8 : 8 + packed], size)
 

@@ -40,7 +40,8 @@ def observed_by_weights(
     free = np.zeros(int(counts.prod()), np.int32)
     surface = np.zeros(free.size, np.bool_)
     cells = np.zeros(free.size, np.int32)
-    for middles, states in _cells(description, tensors):
+    each = _cells_of_blocks if "blocks" in tensors else _cells_of_grid
+    for middles, states in each(description, tensors):
         within = ((middles > low) & (middles < high)).all(axis=1)
         index = np.minimum(np.floor((middles[within] - low) / voxel).astype(np.int64), counts - 1)
         flat = np.ravel_multi_index(tuple(index.T), tuple(counts))
@@ -77,10 +78,6 @@ def _voxel(extent: npt.NDArray[np.float64], least: float) -> float:
     while math.prod(math.ceil(length / voxel) for length in np.maximum(extent, voxel)) > _MOST_VOXELS:
         voxel *= 1.1
     return voxel
-
-
-def _cells(description: Mapping[str, Any], tensors: Mapping[str, StoredArray]) -> Iterator[Cells]:
-    return _cells_of_blocks(description, tensors) if "blocks" in tensors else _cells_of_grid(description, tensors)
 
 
 def _cells_of_grid(description: Mapping[str, Any], tensors: Mapping[str, StoredArray]) -> Iterator[Cells]:

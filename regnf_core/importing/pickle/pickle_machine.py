@@ -41,9 +41,6 @@ class PickleStream:
         self.position += count
         return self._data[start : self.position]
 
-    def byte(self) -> int:
-        return self.take(1)[0]
-
     def unsigned(self, size: int) -> int:
         """An unsigned integer of ``size`` bytes."""
         return int.from_bytes(self.take(size), "little")
@@ -80,18 +77,14 @@ class PickleStream:
 
 # What the pickle reader makes of a file: plain values, descriptions of tensors, and inert stand-ins for all else.
 
-DTYPES: dict[str, str] = {
+DTYPES = {
     "FloatStorage": "float32",
     "DoubleStorage": "float64",
     "HalfStorage": "float16",
     "BFloat16Storage": "bfloat16",
-    "LongStorage": "int64",
-    "IntStorage": "int32",
-    "ShortStorage": "int16",
-    "CharStorage": "int8",
-    "ByteStorage": "uint8",
-    "BoolStorage": "bool",
 }
+DTYPES |= {"LongStorage": "int64", "IntStorage": "int32", "ShortStorage": "int16", "CharStorage": "int8"}
+DTYPES |= {"ByteStorage": "uint8", "BoolStorage": "bool"}
 """torch's storage classes and the element type of each. Others (complex, quantized) are read but never materialized."""
 
 
@@ -182,8 +175,7 @@ def storage_of(identifier: object) -> StorageRef | Placeholder:
     """
     match identifier:
         case ("storage", GlobalRef() as kind, str() as key, str() as device, int() as count, *view) if not any(view):
-            known = kind.module in ("torch", "torch.storage")
-            if not known:
+            if kind.module not in ("torch", "torch.storage"):
                 return Placeholder(kind.full_name)
             if not _STORAGE_KEY.fullmatch(key) or not 0 <= count < _MAX_EXTENT or len(device) > _MAX_SCALAR_TEXT:
                 raise pickle_error("a storage's key, device or size is malformed")
@@ -228,10 +220,6 @@ def _mapping(function: GlobalRef, args: tuple[Any, ...]) -> Any:
     return Placeholder(function.full_name)
 
 
-def _default_mapping(function: GlobalRef, args: tuple[Any, ...]) -> Any:
-    return _mapping(function, args[1:])
-
-
 def _sequence(function: GlobalRef, args: tuple[Any, ...]) -> Any:
     """A list, tuple or set of the given items; kept in the container they came in, which is enough here."""
     if not args:
@@ -241,14 +229,12 @@ def _sequence(function: GlobalRef, args: tuple[Any, ...]) -> Any:
     return Placeholder(function.full_name)
 
 
-def _is_latin(text: str) -> bool:
-    return all(char < "\u0100" for char in text)
-
-
 def _encode(function: GlobalRef, args: tuple[Any, ...]) -> Any:
     """_codecs.encode(text, "latin1"): how protocol 2 spells the few bytes of a scalar."""
     match args:
-        case (str() as text, "latin1" | "latin-1") if len(text) <= _MAX_SCALAR_TEXT and _is_latin(text):
+        case (str() as text, "latin1" | "latin-1") if (
+            len(text) <= _MAX_SCALAR_TEXT and max(text, default="") < "\u0100"
+        ):
             return text.encode("latin-1")
     return Placeholder(function.full_name)
 
@@ -309,7 +295,7 @@ HANDLERS: dict[tuple[str, str], Handler] = {
     ("torch", "Size"): _sequence,
     ("collections", "OrderedDict"): _mapping,
     ("collections", "Counter"): _mapping,
-    ("collections", "defaultdict"): _default_mapping,
+    ("collections", "defaultdict"): lambda function, args: _mapping(function, args[1:]),
     **{(module, "dict"): _mapping for module in _BUILTINS},
     **{(module, name): _sequence for module in _BUILTINS for name in ("list", "tuple", "set", "frozenset")},
     ("_codecs", "encode"): _encode,
@@ -350,14 +336,10 @@ class PickleMachine:
         """Spend ``work`` of the opcode budget."""
         self.budget -= work
         if self.budget < 0:
-            raise pickle_error(f"the pickle asks for too much work{self._held()}", "PICKLE_TOO_COMPLEX")
-
-    def _held(self) -> str:
-        """What object the pickle is about, for whoever does not know why so large a file is refused."""
-        named = next((value.full_name for value in self.stack if isinstance(value, Placeholder)), None)
-        return (
-            "" if named is None else f"; it holds an object of {named[:120]}: save plain tensors, or give a mesh of it"
-        )
+            # Whoever does not know why so large a file is refused is told what object it is about.
+            named = next((value.full_name for value in self.stack if isinstance(value, Placeholder)), None)
+            held = f"; it holds an object of {named[:120]}: save plain tensors, or give a mesh of it" if named else ""
+            raise pickle_error(f"the pickle asks for too much work{held}", "PICKLE_TOO_COMPLEX")
 
     def finish(self) -> Any:
         """The one value on the stack."""
@@ -419,10 +401,6 @@ class PickleMachine:
         elif not isinstance(target, Placeholder):
             raise pickle_error("items for something that is not a list")
 
-    def append(self) -> None:
-        item = self.pop()
-        self.extend([item])
-
     def set_items(self, items: list[Any]) -> None:
         target = self.top()
         if len(items) % 2:
@@ -434,11 +412,8 @@ class PickleMachine:
         elif not isinstance(target, Placeholder):
             raise pickle_error("keys for something that is not a dictionary")
 
-    def set_item(self) -> None:
-        value, key = self.pop(), self.pop()
-        self.set_items([key, value])
-
-    def dict_of(self, items: list[Any]) -> None:
+    def new_dict(self) -> None:
+        items = self.pop_to_mark()
         self.push({})
         self.set_items(items)
 
@@ -450,10 +425,6 @@ class PickleMachine:
                 raise pickle_error("a global's name is not plain text")
         self.push(GlobalRef(module, name))
 
-    def stack_global(self) -> None:
-        name, module = self.pop(), self.pop()
-        self.name_global(module, name)
-
     def reduce(self) -> None:
         args, function = self.pop(), self.pop()
         if isinstance(args, tuple):
@@ -462,8 +433,7 @@ class PickleMachine:
 
     def new_object_with_keywords(self) -> None:
         keywords, args, kind = self.pop(), self.pop(), self.pop()
-        known = isinstance(kind, (GlobalRef, Placeholder)) and isinstance(args, tuple) and isinstance(keywords, dict)
-        if not known:
+        if not (isinstance(kind, GlobalRef | Placeholder) and isinstance(args, tuple) and isinstance(keywords, dict)):
             raise pickle_error("an object of something that is not a class")
         self.push(Placeholder(kind.full_name))
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import pickle
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.importing.pickle.pickle_machine import (
@@ -36,26 +35,23 @@ def read_pickle(data: memoryview, limits: PickleLimits | None = None) -> Any:
     return value
 
 
-@dataclass(frozen=True)
-class LeadingPickle:
-    """A pickle with something behind it: its value, its length in bytes, and the storages it names, by their key."""
+def read_leading_pickle(data: memoryview, limits: PickleLimits) -> tuple[Any, int, dict[str, StorageRef]]:
+    """The value of the pickle that ``data`` begins with, the pickle's length, and the storages it names, by their key.
 
-    value: Any
-    length: int
-    storages: dict[str, StorageRef]
-
-
-def read_leading_pickle(data: memoryview, limits: PickleLimits | None = None) -> LeadingPickle:
-    """The pickle that ``data`` begins with. Raises what :func:`read_pickle` raises, but for what lies behind it."""
-    machine = PickleMachine(data, limits or PickleLimits())
+    Raises what :func:`read_pickle` raises, but for what lies behind it.
+    """
+    machine = PickleMachine(data, limits)
     value = _run(machine)
-    return LeadingPickle(value, machine.stream.position, machine.storages)
+    return value, machine.stream.position, machine.storages
 
 
 def _run(machine: PickleMachine) -> Any:
     """Run the program to its STOP. Returns the one value that is left."""
     stream = machine.stream
-    _read_protocol(stream)
+    if stream.remaining < 2 or stream.unsigned(1) != pickle.PROTO[0]:
+        raise pickle_error("the pickle names no protocol", "PICKLE_PROTOCOL")
+    if not 2 <= (version := stream.unsigned(1)) <= 5:
+        raise pickle_error(f"pickle protocol {version}", "PICKLE_PROTOCOL")
     while True:
         start = stream.position
         opcode = stream.take(1).tobytes()
@@ -72,14 +68,6 @@ def _run(machine: PickleMachine) -> Any:
             raise pickle_error("values nested too deeply", "PICKLE_TOO_DEEP")
 
 
-def _read_protocol(stream: PickleStream) -> None:
-    if stream.remaining < 2 or stream.byte() != pickle.PROTO[0]:
-        raise pickle_error("the pickle names no protocol", "PICKLE_PROTOCOL")
-    version = stream.byte()
-    if not 2 <= version <= 5:
-        raise pickle_error(f"pickle protocol {version}", "PICKLE_PROTOCOL")
-
-
 _Action = Callable[[PickleMachine], object]
 
 
@@ -88,20 +76,15 @@ def _pushing(read: Callable[[PickleStream], Any]) -> _Action:
     return lambda machine: machine.push(read(machine.stream))
 
 
-def _constant(make: Callable[[], Any]) -> _Action:
-    """An opcode that pushes a new value."""
-    return lambda machine: machine.push(make())
-
-
 _ACTIONS: dict[bytes, _Action] = {
     pickle.FRAME: PickleMachine.frame,
     pickle.MARK: PickleMachine.mark,
     pickle.POP: PickleMachine.pop,
     pickle.POP_MARK: PickleMachine.pop_to_mark,
     pickle.DUP: lambda m: m.push(m.top()),
-    pickle.NONE: _constant(lambda: None),
-    pickle.NEWTRUE: _constant(lambda: True),
-    pickle.NEWFALSE: _constant(lambda: False),
+    pickle.NONE: lambda m: m.push(None),
+    pickle.NEWTRUE: lambda m: m.push(True),
+    pickle.NEWFALSE: lambda m: m.push(False),
     pickle.BININT: _pushing(lambda s: s.integer(4)),
     pickle.BININT1: _pushing(lambda s: s.unsigned(1)),
     pickle.BININT2: _pushing(lambda s: s.unsigned(2)),
@@ -115,21 +98,21 @@ _ACTIONS: dict[bytes, _Action] = {
     pickle.BINBYTES: _pushing(lambda s: s.blob(4)),
     pickle.BINBYTES8: _pushing(lambda s: s.blob(8)),
     pickle.BYTEARRAY8: _pushing(lambda s: s.blob(8)),
-    pickle.EMPTY_LIST: _constant(list),
-    pickle.EMPTY_TUPLE: _constant(tuple),
-    pickle.EMPTY_DICT: _constant(dict),
-    pickle.EMPTY_SET: _constant(list),
+    pickle.EMPTY_LIST: lambda m: m.push([]),
+    pickle.EMPTY_TUPLE: lambda m: m.push(()),
+    pickle.EMPTY_DICT: lambda m: m.push({}),
+    pickle.EMPTY_SET: lambda m: m.push([]),
     pickle.TUPLE: lambda m: m.push(tuple(m.pop_to_mark())),
     pickle.TUPLE1: lambda m: m.tuple_of(1),
     pickle.TUPLE2: lambda m: m.tuple_of(2),
     pickle.TUPLE3: lambda m: m.tuple_of(3),
     pickle.LIST: lambda m: m.push(m.pop_to_mark()),
     pickle.FROZENSET: lambda m: m.push(tuple(m.pop_to_mark())),
-    pickle.DICT: lambda m: m.dict_of(m.pop_to_mark()),
-    pickle.APPEND: PickleMachine.append,
+    pickle.DICT: PickleMachine.new_dict,
+    pickle.APPEND: lambda m: m.extend([m.pop()]),
     pickle.APPENDS: lambda m: m.extend(m.pop_to_mark()),
     pickle.ADDITEMS: lambda m: m.extend(m.pop_to_mark()),
-    pickle.SETITEM: PickleMachine.set_item,
+    pickle.SETITEM: lambda m: m.set_items([m.pop(), m.pop()][::-1]),
     pickle.SETITEMS: lambda m: m.set_items(m.pop_to_mark()),
     pickle.BINPUT: lambda m: m.put(m.stream.unsigned(1)),
     pickle.LONG_BINPUT: lambda m: m.put(m.stream.unsigned(4)),
@@ -137,7 +120,7 @@ _ACTIONS: dict[bytes, _Action] = {
     pickle.BINGET: lambda m: m.get(m.stream.unsigned(1)),
     pickle.LONG_BINGET: lambda m: m.get(m.stream.unsigned(4)),
     pickle.GLOBAL: lambda m: m.name_global(m.stream.line(), m.stream.line()),
-    pickle.STACK_GLOBAL: PickleMachine.stack_global,
+    pickle.STACK_GLOBAL: lambda m: m.name_global(*[m.pop(), m.pop()][::-1]),
     pickle.REDUCE: PickleMachine.reduce,
     pickle.NEWOBJ: PickleMachine.reduce,
     pickle.NEWOBJ_EX: PickleMachine.new_object_with_keywords,

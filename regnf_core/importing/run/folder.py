@@ -5,13 +5,13 @@ Nothing is parsed here. Names decide, as in an archive; links that lead out of t
 
 from __future__ import annotations
 
+import itertools
 import os
 import stat
 import tarfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,6 +21,8 @@ from regnf_core.importing.run.opened import MAX_FILES, MAX_SETTINGS_BYTES, choos
 _MAX_FILES, _MAX_DEPTH = 50_000, 12
 _LEVELS = 4
 """How many folders above a lone checkpoint may be its run's."""
+_NEAR = (".", "config", "recording", ".hydra", "LatentCodes")
+"""Subfolders in which trainers keep settings."""
 _SKIPPED = frozenset({".git", "__pycache__", "wandb", "node_modules", ".venv"})
 
 
@@ -51,13 +53,10 @@ def settings_beside(checkpoint: Path) -> tuple[Path, ...]:
     path = checkpoint.resolve(strict=True)
     places = _places_of(path)
     top = places[-1]
-    names = [str(path.relative_to(top))]
-    for folder in places:
-        for found in _known_near(folder):
-            if _stays_in(found, top):
-                names.append(str(found.relative_to(top)))
-    chosen = choose_settings(sorted(set(names)), names[0])
-    return tuple(top / name for name in chosen)
+    known = (found for folder in places for near in _NEAR for found in _files_in(folder / near))
+    names = {str(found.relative_to(top)) for found in known if _stays_in(found, top)}
+    own = str(path.relative_to(top))
+    return tuple(top / name for name in choose_settings(sorted(names | {own}), own))
 
 
 def _places_of(checkpoint: Path) -> list[Path]:
@@ -67,7 +66,10 @@ def _places_of(checkpoint: Path) -> list[Path]:
     """
     own, *above = list(checkpoint.parents)[:_LEVELS]
     shared = {Path.home(), *Path.home().parents}
-    return [own, *takewhile(lambda folder: folder not in shared and not folder.stat().st_mode & stat.S_IWOTH, above)]
+    return [
+        own,
+        *itertools.takewhile(lambda folder: folder not in shared and not folder.stat().st_mode & stat.S_IWOTH, above),
+    ]
 
 
 def pack_settings(run: Run, into: Path) -> Path:
@@ -108,13 +110,10 @@ def _names_below(root: Path) -> Iterator[str]:
                     yield Path(entry.path).relative_to(root).as_posix()
 
 
-def _known_near(folder: Path) -> Iterator[Path]:
-    """Files in ``folder`` and in those of its subfolders in which trainers keep settings."""
-    for name in (".", "config", "recording", ".hydra", "LatentCodes"):
-        near = folder / name
-        if near.is_dir():
-            with os.scandir(near) as entries:
-                yield from (folder / name / entry.name for entry, _ in zip(entries, range(_MAX_FILES), strict=False))
+def _files_in(folder: Path) -> Iterator[Path]:
+    if folder.is_dir():
+        with os.scandir(folder) as entries:
+            yield from (folder / entry.name for entry in itertools.islice(entries, _MAX_FILES))
 
 
 def _stays_in(path: Path, root: Path) -> bool:
@@ -160,7 +159,7 @@ def packed_cameras(path: Path) -> Iterator[Path]:
 def _texts(folder: Path) -> list[Path]:
     """Its plain files that end in .txt, by name."""
     with os.scandir(folder) as entries:
-        few = (entry for entry, _ in zip(entries, range(_MOST_LOOKED_AT), strict=False))
+        few = itertools.islice(entries, _MOST_LOOKED_AT)
         found = sorted(Path(entry.path) for entry in few if entry.name.lower().endswith(".txt") and entry.is_file())
     if len(found) > _MOST_FILES or sum(text.stat().st_size for text in found) > _MOST_BYTES:
         message = f"{folder} holds more than {_MOST_FILES} texts, or more than {_MOST_BYTES} bytes of them"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import re
-import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -23,22 +22,17 @@ _TIERS = (
     (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz"),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
-_OTHER_FOLDERS = frozenset(
-    {
-        "optimizerparameters",
-        "schedulerparameters",
-        "latentcodes",
-        "reconstructions",
-        "normalizationparameters",
-        "sdfsamples",
-        "tensorboard",
-        "wandb",
-        "code",
-        ".git",
-        ".hydra",
-        "__macosx",
-    }
-)
+_TENSORS_ELSEWHERE = "optimizerparameters schedulerparameters latentcodes reconstructions normalizationparameters"
+_OTHER_FOLDERS = {
+    *_TENSORS_ELSEWHERE.split(),
+    "sdfsamples",
+    "tensorboard",
+    "wandb",
+    "code",
+    ".git",
+    ".hydra",
+    "__macosx",
+}
 """Folders in which trainers keep other tensors than the field's, in lower case."""
 _OTHER_FILES = re.compile(
     r"cameras.*\.npz|.*(optimizer|optim|scheduler|opt_state).*|events\.out\..*|\._.*", re.IGNORECASE
@@ -108,24 +102,17 @@ def _candidate(path: PurePosixPath, end: str) -> _Candidate:
 
 # A run in a zip file, read as strictly as a checkpoint's own zip; but folders and deflated members are allowed.
 
-_PIECE = 1 << 20
-
 
 class ZipRun:
-    """The members of one zip file by name. ``most`` caps the bytes of those that are unpacked."""
+    """Members of one zip file by name. ``most`` caps the bytes of those that are unpacked."""
 
-    def __init__(self, data: memoryview, most: int) -> None:
-        members = read_members(data, (STORED, DEFLATED), folders=True)
-        self._data = data
-        self._most = most
+    def __init__(self, data: memoryview, members: list[Member], most: int) -> None:
+        self._data, self._most = data, most
         self._members = {member.name: member for member in members if not member.name.endswith("/")}
         if any(name.count("/") >= MAX_PARTS for name in self._members):
             raise archive_error("a member lies in too many folders", "ARCHIVE_ENTRY_NAME")
-
-    @property
-    def sizes(self) -> dict[str, int]:
+        self.sizes = {name: member.size for name, member in self._members.items()}
         """Each member's size in bytes, as the archive claims it."""
-        return {name: member.size for name, member in self._members.items()}
 
     def take(self, names: Collection[str], folder: Path) -> dict[str, memoryview]:
         """The members of these names. Raises FieldFormatError: ARCHIVE_TOO_LARGE, ARCHIVE_DEFLATE_MALFORMED,
@@ -133,68 +120,21 @@ class ZipRun:
         """
         wanted = [self._members[name] for name in names]
         require_modest(sum(m.size for m in wanted), sum(m.packed_size for m in wanted), self._most)
-        return {member.name: self._content(member, folder) for member in wanted}
-
-    def _content(self, member: Member, folder: Path) -> memoryview:
-        packed = self._data[member.offset : member.offset + member.packed_size]
-        content = packed if member.method == STORED else kept(_inflated(packed, member), member.size, folder)
-        crc32 = 0
-        for start in range(0, len(content), _PIECE):
-            crc32 = zlib.crc32(content[start : start + _PIECE], crc32)
-        if crc32 != member.crc32:
-            raise archive_error(f"the bytes of {member.name} are damaged (CRC)", "ARCHIVE_CRC_MISMATCH")
-        return content
-
-
-def _inflated(packed: memoryview, member: Member) -> Iterator[bytes]:
-    """Piece by piece; never more than the archive claims."""
-    inflater, left, at = zlib.decompressobj(-zlib.MAX_WBITS), member.size, 0
-    faulty = archive_error(f"{member.name} does not inflate to what the archive claims", "ARCHIVE_DEFLATE_MALFORMED")
-    waiting: bytes | memoryview = b""
-    while not inflater.eof:
-        if not waiting:
-            waiting = packed[at : at + _PIECE]
-            at += len(waiting)
-        try:
-            piece = inflater.decompress(waiting, min(_PIECE, left + 1))
-        except zlib.error as error:
-            raise faulty from error
-        if len(piece) > left or (not piece and not waiting):
-            raise faulty
-        waiting = inflater.unconsumed_tail
-        left -= len(piece)
-        yield piece
-    if left or waiting or inflater.unused_data or at != len(packed):
-        raise faulty
+        return {m.name: m.content(self._data, lambda pieces, size: kept(pieces, size, folder)) for m in wanted}
 
 
 # Which files of a run are its trainer's settings: known names at known places round the checkpoint, nearest first.
 
 _LEVELS = 4
 """How many folders above the checkpoint's own may be the run's."""
-RUN_FILES = (
-    "config.yml",
-    "config.yaml",
-    "config.json",
-    "parsed.yaml",
-    "config/parsed.yaml",
-    "config/config.yaml",
-    "recording/*.conf",
-    "*.conf",
-    "specs.json",
-    ".hydra/config.yaml",
-    "run.yaml",
-    "run.yml",
-    "params.yaml",
-    "hparams.yaml",
-    "dataparser_transforms.json",
-    "meta_data.json",
-    "transforms.json",
-    "cameras_sphere.npz",
-)
-"""Below one of the folders from the checkpoint's own upwards."""
 DATA_FILES = ("dataparser_transforms.json", "meta_data.json", "transforms.json", "cameras_sphere.npz")
 """What trainers keep beside the images: taken from anywhere in the run where there is one of the name."""
+RUN_FILES = (
+    *("config.yml", "config.yaml", "config.json", "parsed.yaml", "config/parsed.yaml", "config/config.yaml"),
+    *("recording/*.conf", "*.conf", "specs.json", ".hydra/config.yaml", "run.yaml", "run.yml", "params.yaml"),
+    *("hparams.yaml", *DATA_FILES),
+)
+"""Below one of the folders from the checkpoint's own upwards."""
 MAX_FILES = 32
 
 
@@ -207,7 +147,7 @@ def choose_settings(names: Collection[str], checkpoint: str) -> tuple[str, ...]:
         for pattern in run_patterns(here.stem):
             for name in sorted(known):
                 path = PurePosixPath(name)
-                if path.is_relative_to(folder) and _matches(path.relative_to(folder), pattern):
+                if path.is_relative_to(folder) and _fits(path.relative_to(folder), pattern):
                     chosen.setdefault(_role(path), name)
     for wanted in DATA_FILES:
         found = [name for name in known if PurePosixPath(name).name == wanted]
@@ -224,7 +164,7 @@ def run_patterns(stem: str) -> tuple[str, ...]:
     return (*RUN_FILES, f"LatentCodes/{stem}.pth")
 
 
-def _matches(path: PurePosixPath, pattern: str) -> bool:
+def _fits(path: PurePosixPath, pattern: str) -> bool:
     parts = pattern.split("/")
     return len(parts) == len(path.parts) and all(map(fnmatch.fnmatchcase, path.parts, parts))
 
@@ -263,6 +203,8 @@ class OpenedUpload:
     settings: tuple[SettingsFile, ...] = ()
     siblings: dict[str, memoryview] = field(default_factory=dict)
     """Of a mesh in an archive, the files that it may refer to, by their names seen from its own folder."""
+    members: list[Member] | None = None
+    """Of a checkpoint or arrays in a zip file: what it lists, so that it is read once."""
 
 
 def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
@@ -271,21 +213,23 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     Raises FieldFormatError: AMBIGUOUS_RUN, RUN_WITHOUT_CHECKPOINT, ARCHIVE_NESTED, SETTINGS_TOO_LARGE, FILE_TRUNCATED
     and the ARCHIVE_* reasons of docs/import-gate.md.
     """
-    archive = _opened(data, most)
+    archive, members = _opened(data, most)
     if archive is None:
-        return OpenedUpload(data)
+        return OpenedUpload(data, members=members)
     name = choose_checkpoint(archive.sizes)
     settings = choose_settings(archive.sizes, name)
     _require_few(archive, settings)
     siblings = _siblings(archive, name)
     taken = archive.take({name, *settings, *siblings.values()}, folder)
-    if _opened(taken[name], most) is not None:
+    nested, members = _opened(taken[name], most)
+    if nested is not None:
         raise archive_error(f"{shown_path(name)} is an archive in the archive; give it by itself", "ARCHIVE_NESTED")
     return OpenedUpload(
         taken[name],
         name,
         tuple(SettingsFile(each, taken[each]) for each in settings),
         {seen: taken[each] for seen, each in siblings.items()},
+        members,
     )
 
 
@@ -296,7 +240,7 @@ def open_settings(
 
     Raises as ``open_upload``.
     """
-    archive = None if name.lower().endswith(".npz") else _opened(data, most)
+    archive = None if name.lower().endswith(".npz") else _opened(data, most)[0]
     if archive is None:
         if len(data) > MAX_SETTINGS_BYTES:
             raise _too_large(f"the settings have {len(data)} bytes")
@@ -307,25 +251,23 @@ def open_settings(
     return tuple(SettingsFile(each, content) for each, content in archive.take(archive.sizes, folder).items())
 
 
-def _opened(data: memoryview, most: int) -> ZipRun | TarRun | None:
-    """The archive of a run in ``data``, or None for any other file."""
-    head = bytes(data[:HEAD_BYTES])
-    kind = sniff_format(head)
-    if kind in ("torch-zip", "npz") and _is_run(data, kind):
-        kind = "zip"
-    if kind not in RUN_ARCHIVES:
-        return None
+def _opened(data: memoryview, most: int) -> tuple[ZipRun | TarRun | None, list[Member] | None]:
+    """The archive of a run in ``data``, or None for any other file; and what any sound zip file lists."""
+    kind = sniff_format(bytes(data[:HEAD_BYTES]))
+    if kind in ("torch-zip", "npz"):
+        try:
+            members = read_members(data, (STORED, DEFLATED), folders=True)
+        except FieldFormatError:
+            return None, None
+        return ZipRun(data, members, most) if _is_run(members, kind) else None, members
     if kind == "zip":
-        return ZipRun(data, most)
-    return TarRun(data, None if kind == "tar" else kind, most)
+        return ZipRun(data, members := read_members(data, (STORED, DEFLATED), folders=True), most), members
+    return TarRun(data, None if kind == "tar" else kind, most) if kind in RUN_ARCHIVES else None, None
 
 
-def _is_run(data: memoryview, kind: str) -> bool:
+def _is_run(members: list[Member], kind: str) -> bool:
     """Whether a zip whose first member's name would fit a checkpoint or arrays holds other things too."""
-    try:
-        names = [member.name for member in read_members(data, (STORED, DEFLATED), folders=True)]
-    except FieldFormatError:
-        return False
+    names = [member.name for member in members]
     if kind == "npz":
         return any("/" in name or not name.endswith(".npy") for name in names)
     below = [name.partition("/")[2] for name in names]

@@ -31,6 +31,11 @@ class Facts:
         name = self._name(end)
         return None if name is None else tuple(self.tensors[name].shape)
 
+    def weight(self, layer: str) -> tuple[int, ...] | None:
+        """The shape of a linear layer's weights, normalized or not; None where it is no matrix."""
+        shape = self.shape(f"{layer}.weight_v") or self.shape(f"{layer}.weight")
+        return shape if shape is not None and len(shape) == 2 else None
+
     def few(self, end: str, most: int = 64) -> list[float] | None:
         """The numbers of the one tensor whose keys end so, if it is small and sound."""
         name = self._name(end)
@@ -101,7 +106,13 @@ def inverse_of(rows: Sequence[Sequence[float]], scale: float) -> Rows | None:
     forward = np.eye(4)
     forward[:3] = np.array(rows, dtype=np.float64)
     forward[:3] *= scale
-    return _inverse(forward) if is_similarity(forward) else None
+    if not is_similarity(forward):
+        return None
+    # Exact of a similarity, whatever the rounding of a general inverse.
+    back = np.eye(4)
+    back[:3, :3] = forward[:3, :3].T / np.cbrt(np.linalg.det(forward[:3, :3])) ** 2
+    back[:3, 3] = -back[:3, :3] @ forward[:3, 3]
+    return _rows(back)
 
 
 def is_similarity(rows: Sequence[Sequence[float]] | np.ndarray) -> bool:
@@ -121,16 +132,6 @@ def after_scaling(rows: Sequence[Sequence[float]], factor: float) -> Rows:
     matrix = np.array(rows, dtype=np.float64)
     matrix[:3, :3] *= factor
     return _rows(matrix)
-
-
-def _inverse(matrix: np.ndarray) -> Rows:
-    """Of a similarity; exactly one too, whatever the rounding of a general inverse."""
-    linear = matrix[:3, :3]
-    scale = np.cbrt(np.linalg.det(linear))
-    back = np.eye(4)
-    back[:3, :3] = linear.T / scale**2
-    back[:3, 3] = -back[:3, :3] @ matrix[:3, 3]
-    return _rows(back)
 
 
 def _rows(matrix: np.ndarray) -> Rows:

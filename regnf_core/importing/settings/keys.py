@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,9 +65,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-_SHOWN = 60
-
-
 @dataclass(frozen=True)
 class Keys:
     """A part of one settings file. Paths have dots between keys; absent keys and nulls are None."""
@@ -82,12 +81,9 @@ class Keys:
             here = plain(here.get(part)) if isinstance(here, dict) else None
         return here
 
-    def tag(self, path: str = "") -> str:
-        """What the value at ``path`` would be an object of, or ''."""
-        parent, _, last = path.rpartition(".")
-        holder = self.find(parent) if last else None
-        value = holder.get(last) if isinstance(holder, dict) else None if last else self.tree
-        return value.tag if isinstance(value, Tagged) else ""
+    def tag(self) -> str:
+        """What this part would be an object of, or ''."""
+        return self.tree.tag if isinstance(self.tree, Tagged) else ""
 
     def below(self, path: str) -> Keys:
         """The part at ``path``."""
@@ -100,11 +96,7 @@ class Keys:
     def number(self, path: str) -> float | None:
         """A finite number. Raises FieldFormatError (SETTINGS_MALFORMED) for anything else."""
         value = self.find(path)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
-            raise self.fault(path, "a number")
-        return float(value)
+        return None if value is None else self._finite(path, value)
 
     def whole(self, path: str) -> int | None:
         """A whole number, also one written as 16.0. Raises FieldFormatError (SETTINGS_MALFORMED)."""
@@ -136,28 +128,26 @@ class Keys:
             return None
         if not isinstance(values, list) or len(values) > most:
             raise self.fault(path, f"a list of at most {most} numbers")
-        here = Keys(self.file, dict(enumerate(values)), f"{self.at}{path}.")
-        return [here._element(index, plain(value)) for index, value in enumerate(values)]
+        return [self._finite(f"{path}.{index}", plain(value)) for index, value in enumerate(values)]
 
-    def wholes(self, path: str, most: int = 64) -> list[int] | None:
+    def wholes(self, path: str) -> list[int] | None:
         """A list of whole numbers. Raises FieldFormatError (SETTINGS_MALFORMED)."""
-        values = self.numbers(path, most)
-        if values is None:
-            return None
-        if any(value != int(value) for value in values):
+        values = self.numbers(path)
+        if values is not None and any(value != int(value) for value in values):
             raise self.fault(path, "a list of whole numbers")
-        return [int(value) for value in values]
+        return None if values is None else [int(value) for value in values]
 
     def matrix(self, path: str, rows: int, columns: int) -> list[list[float]] | None:
         """Rows of finite numbers. Raises FieldFormatError (SETTINGS_MALFORMED)."""
         values = self.find(path)
         if values is None:
             return None
-        if not isinstance(values, list) or len(values) != rows:
-            raise self.fault(path, f"{rows} rows of {columns} numbers")
-        here = Keys(self.file, {str(index): value for index, value in enumerate(values)}, f"{self.at}{path}.")
-        found = [here.numbers(str(index)) or [] for index in range(rows)]
-        if any(len(row) != columns for row in found):
+        lines = (
+            {str(i): row for i, row in enumerate(values)} if isinstance(values, list) and len(values) == rows else {}
+        )
+        below = Keys(self.file, lines, f"{self.at}{path}.")
+        found = [below.numbers(line) or [] for line in lines]
+        if len(found) != rows or any(len(row) != columns for row in found):
             raise self.fault(path, f"{rows} rows of {columns} numbers")
         return found
 
@@ -165,9 +155,9 @@ class Keys:
         """The error for a value of another type than ``expected``."""
         return malformed(f"{self.file}: {self.at}{path} is not {expected}")
 
-    def _element(self, index: int, value: Any) -> float:
+    def _finite(self, path: str, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < math.inf:
-            raise self.fault(str(index), "a number")
+            raise self.fault(path, "a number")
         return float(value)
 
 
@@ -193,20 +183,8 @@ def read_json(name: str, data: bytes | memoryview) -> Any:
 
 def _depth(text: str) -> int:
     """How deep brackets nest, those within texts left out."""
-    depth = deepest = 0
-    in_text = escaped = False
-    for character in text:
-        if in_text:
-            in_text = escaped or character != '"'
-            escaped = character == "\\" and not escaped
-        elif character == '"':
-            in_text = True
-        elif character in "[{":
-            depth += 1
-            deepest = max(deepest, depth)
-        elif character in "]}":
-            depth -= 1
-    return deepest
+    brackets = re.sub(r"[^\[\]{}]+", "", re.sub(r'"(?:[^"\\]|\\.)*"?', "", text, flags=re.DOTALL))
+    return max(itertools.accumulate(1 if bracket in "[{" else -1 for bracket in brackets))
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +33,21 @@ class Said:
             self.values[entry] = value
             self.note(keys, key)
 
+    def take(self, keys: Keys, read: Callable[[Keys, str], Any], entries: Mapping[str, str]) -> None:
+        """Entries of the description by the keys that they are read from."""
+        for entry, key in entries.items():
+            self.put(entry, read(keys, key), keys, key)
+
+    def choose(self, entry: str, keys: Keys, key: str, values: tuple[Any, Any]) -> None:
+        """``entry`` is the first of the values where ``key`` is true, the second where it is false."""
+        flag = keys.flag(key)
+        self.put(entry, None if flag is None else values[not flag], keys, key)
+
+    def expect(self, keys: Keys, key: str, *known: str) -> None:
+        """Refuse any other text at ``key``. Raises FieldFormatError: SETTINGS_MALFORMED, FAMILY_NOT_SUPPORTED."""
+        if keys.text(key) not in (None, "", *known):
+            self.refuse(keys, key)
+
     def note(self, keys: Keys, key: str) -> None:
         """``key`` of the file counted. A long value is not repeated."""
         value = keys.find(key)
@@ -41,17 +56,15 @@ class Said:
         if (line := f"{key.rpartition('.')[2]} {text}") not in used:
             used.append(line)
 
-    def agree(self, keys: Keys, key: str, found: int | Sequence[int] | None) -> None:
-        """Raise FieldFormatError (SETTINGS_CONTRADICT_TENSORS) if ``key`` says other whole numbers than the tensors.
+    def agree(self, keys: Keys, key: str, found: int | None) -> None:
+        """Raise FieldFormatError (SETTINGS_CONTRADICT_TENSORS) if ``key`` says another whole number than the tensors.
 
         None on either side says nothing.
         """
-        said: int | list[int] | None = None
-        if found is not None:
-            said = keys.whole(key) if isinstance(found, int) else keys.wholes(key)
+        said = None if found is None else keys.whole(key)
         if said is None or found is None:
             return
-        if said != (found if isinstance(found, int) else list(found)):
+        if said != found:
             raise contradiction(f"{keys.file}: {keys.at}{key}", said, found)
         self.note(keys, key)
 

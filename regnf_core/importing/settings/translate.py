@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
-from types import ModuleType
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
@@ -18,17 +17,7 @@ from regnf_core.importing.settings.documents import read_documents
 from regnf_core.importing.settings.facts import Facts
 from regnf_core.importing.settings.keys import Keys, malformed
 from regnf_core.importing.settings.said import Said
-from regnf_core.importing.settings.trainers import (
-    deepsdf,
-    fusion,
-    implicit_network,
-    instant_nsr_pl,
-    neuralangelo,
-    neus,
-    pin_slam,
-    sdf_field,
-    sines,
-)
+from regnf_core.importing.settings.trainers import hash_grids, layers
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.library_entries import shown_path
@@ -44,20 +33,6 @@ def latent_code(file: SettingsFile, index: int) -> tuple[list[float], int]:
     Raises FieldFormatError: SETTINGS_MALFORMED, INVALID_DESCRIPTION for an index beyond them, and what the readers of
     torch.save's files raise.
     """
-    stored, source = _stored(file)
-    value = stored if isinstance(stored, TensorRef) else lookup(_mapping(file, stored), "weight")
-    codes = source.array("latent_codes", value)
-    if codes.ndim == 3 and codes.shape[1] == 1:
-        codes = codes[:, 0]
-    if codes.ndim != 2 or not 1 <= codes.shape[1] <= _MAX_CODE or not len(codes):
-        raise _malformed(file, f"latent_codes of the shape {codes.shape}")
-    if index >= len(codes):
-        message = f"description.latent_index: {index}, but {file.name} has {len(codes)} codes, counted from 0"
-        raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
-    return [float(number) for number in codes[index]], len(codes)
-
-
-def _stored(file: SettingsFile) -> tuple[object, TensorSource]:
     kind = sniff_format(bytes(file.data[:HEAD_BYTES]))
     if kind == "torch-zip":
         archive = read_archive(file.data)
@@ -66,18 +41,19 @@ def _stored(file: SettingsFile) -> tuple[object, TensorSource]:
         values, legacy = read_legacy(file.data)
         source = TensorSource(legacy, MAX_SETTINGS_BYTES)
     else:
-        raise _malformed(file, "no file of torch.save")
-    return _mapping(file, values).get("latent_codes"), source
-
-
-def _mapping(file: SettingsFile, value: object) -> dict[object, object]:
-    if not isinstance(value, dict):
-        raise _malformed(file, "no latent_codes")
-    return value
-
-
-def _malformed(file: SettingsFile, what: str) -> FieldFormatError:
-    return FieldFormatError(f"{shown_path(file.name)}: {what}", reason="SETTINGS_MALFORMED")
+        raise malformed(f"{shown_path(file.name)}: no file of torch.save")
+    stored = values.get("latent_codes") if isinstance(values, dict) else None
+    if not isinstance(stored, (dict, TensorRef)):
+        raise malformed(f"{shown_path(file.name)}: no latent_codes")
+    codes = source.array("latent_codes", lookup(stored, "weight") if isinstance(stored, dict) else stored)
+    if codes.ndim == 3 and codes.shape[1] == 1:
+        codes = codes[:, 0]
+    if codes.ndim != 2 or not 1 <= codes.shape[1] <= _MAX_CODE or not len(codes):
+        raise malformed(f"{shown_path(file.name)}: latent_codes of the shape {codes.shape}")
+    if index >= len(codes):
+        message = f"description.latent_index: {index}, but {file.name} has {len(codes)} codes, counted from 0"
+        raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
+    return [float(number) for number in codes[index]], len(codes)
 
 
 _MAX_WHY = 400
@@ -87,22 +63,27 @@ _PARTS = ("hash", "positional_encoding", "color")
 
 @dataclass(frozen=True)
 class Trainer:
-    """What one module knows."""
+    """knows: whether a file is one of its · translate: says what the file's keys mean."""
 
-    name: Callable[[Keys], str]
-    module: ModuleType
+    name: str
+    knows: Callable[[Keys], bool]
+    translate: Callable[[Keys, Said], None]
+
+
+def _has(path: str, beside: str = "") -> Callable[[Keys], bool]:
+    return lambda keys: isinstance(keys.find(path), dict) and (not beside or keys.has(beside))
 
 
 TRAINERS = (
-    Trainer(sdf_field.trainer_of, sdf_field),
-    Trainer(lambda _: "instant-nsr-pl", instant_nsr_pl),
-    Trainer(lambda _: "Neuralangelo", neuralangelo),
-    Trainer(lambda _: "NeuS", neus),
-    Trainer(lambda _: "IDR, VolSDF or MonoSDF", implicit_network),
-    Trainer(lambda _: "DeepSDF", deepsdf),
-    Trainer(lambda _: "PIN-SLAM", pin_slam),
-    Trainer(lambda _: "a network of sines", sines),
-    Trainer(lambda _: "a map of truncated distances", fusion),
+    Trainer("nerfstudio", hash_grids.is_nerfstudio, hash_grids.studio),
+    Trainer("sdfstudio", hash_grids.is_studio, hash_grids.studio),
+    Trainer("instant-nsr-pl", _has(hash_grids.NSR_ENCODING), hash_grids.instant_nsr_pl),
+    Trainer("Neuralangelo", _has(hash_grids.ANGELO_ENCODING), hash_grids.neuralangelo),
+    Trainer("NeuS", _has(layers.NEUS_NETWORK), layers.neus),
+    Trainer("DeepSDF", _has(layers.DEEPSDF_NETWORK, "CodeLength"), layers.deepsdf),
+    Trainer("PIN-SLAM", _has("neuralpoints"), layers.pin_slam),
+    Trainer("a network of sines", layers.names_frequency, layers.sines),
+    Trainer("a map of truncated distances", layers.names_truncation, layers.fusion),
 )
 
 
@@ -137,10 +118,10 @@ def translate_settings(
         return Settings()
     documents = read_documents(files)
     for trainer in TRAINERS:
-        keys = trainer.module.main_file(documents)
+        keys = next(filter(trainer.knows, documents.mappings()), None)
         if keys is not None:
-            said = Said(trainer.name(keys), facts, documents)
-            trainer.module.translate(keys, said)
+            said = Said(trainer.name, facts, documents)
+            trainer.translate(keys, said)
             _choose_code(description, said)
             return _settings(said)
     names = ", ".join(PurePosixPath(file.name).name[:60] for file in files[:6])

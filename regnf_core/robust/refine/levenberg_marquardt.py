@@ -10,12 +10,11 @@ from torch import Tensor
 
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import REFINEMENT, SEARCH
-from regnf_core.robust.constants.model import Stage
+from regnf_core.robust.constants import REFINEMENT, SEARCH, Stage
 from regnf_core.robust.refine.loss import adaptive_width, disagreement, normal_equations, observed_weight, robust_cost
 from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
-from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBound, ScaleBounds
+from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBound
 from regnf_core.robust.working_frame import on_host
 
 
@@ -25,32 +24,24 @@ class Settings:
 
     widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
     are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters;
-    0: the offset stays as it is · normals: whether the loss counts them.
+    0: the offset stays as it is · normals: whether the loss counts them · keeps_scale: no pose's scale changes.
     """
 
     widest: float = 0.0
-    scale: ScaleBound | ScaleBounds = ANY_SCALE
+    scale: ScaleBound = ANY_SCALE
     max_offset: float = REFINEMENT.max_offset
     normals: bool = True
+    keeps_scale: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """One iteration of all poses: T (H,), their residuals and robust costs (H,), and the lower limit of the width."""
+    """Poses T (H,) after an iteration, their residuals and robust costs (H,), and the lower limit of the width."""
 
     T: Sim3
     residuals: Residuals
     costs: Tensor
     width: float
-
-
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """Poses (H,) after the iterations, their robust costs (H,) and the residuals there."""
-
-    T: Sim3
-    costs: Tensor
-    residuals: Residuals
 
 
 _DEFAULTS = Settings()
@@ -63,7 +54,7 @@ def minimize(
     settings: Settings = _DEFAULTS,
     offset: Tensor | None = None,
     on_iteration: Callable[[Iteration], None] | None = None,
-) -> Refined:
+) -> Iteration:
     """Minimize the robust cost of every pose of the batch T (H,), one iteration for each kernel width.
 
     widths: object diameters; falling widths anneal. A step that raises the cost is undone and damped more.
@@ -75,22 +66,27 @@ def minimize(
     now = residuals(surfaces, T, offset)
     weight, start = observed_weight(now), T.scale
     damping = torch.full_like(T.scale, REFINEMENT.damping_start, dtype=torch.float64)
-    costs = torch.zeros_like(now.values[:, 0])
+    done = Iteration(T, now, torch.zeros_like(now.values[:, 0]), 0.0)
     for lowest in widths:
         width = lowest * _rate(T, start, now)
         if settings.widest:
             width = adaptive_width(now, width, max(lowest, settings.widest) / lowest * width)
         step = _step(now, (width, weight), damping, T.scale, settings)
         T_tried = T.perturb(step[:, :7])
-        tried = residuals(surfaces, T_tried, _moved_offset(now, step, settings))
+        most = settings.max_offset
+        offset = None if now.offset is None else (now.offset + step[:, 7]).clamp(-most, most)
+        tried = residuals(surfaces, T_tried, offset)
+        # A kernel is as wide in the scene as before the step: in object units it grows with the pose's scale.
         tried_costs = robust_cost(tried, width * _rate(T_tried, T.scale, now), settings.normals, weight)
         costs = robust_cost(now, width, settings.normals, weight)
-        better = tried_costs < costs
+        better = tried_costs < costs  # False for a step that is not finite: it is undone as well
         T, now = Sim3.where(better, T_tried, T), Residuals.where(better, tried, now)
-        costs, damping = torch.where(better, tried_costs, costs), _next_damping(damping, better)
+        less, more = damping / REFINEMENT.damping_decrease, damping * REFINEMENT.damping_increase
+        damping = torch.where(better, less, more).clamp(*REFINEMENT.damping_range)
+        done = Iteration(T, now, torch.where(better, tried_costs, costs), lowest)
         if on_iteration is not None:
-            on_iteration(Iteration(T, now, costs, lowest))
-    return Refined(T, costs, now)
+            on_iteration(done)
+    return done
 
 
 def _rate(T: Sim3, start: Tensor, r: Residuals) -> Tensor:
@@ -99,24 +95,8 @@ def _rate(T: Sim3, start: Tensor, r: Residuals) -> Tensor:
     return (T.scale / start).to(r.values)[:, None]
 
 
-def _moved_offset(now: Residuals, step: Tensor, settings: Settings) -> Tensor | None:
-    if now.offset is None:
-        return None
-    most, moved = settings.max_offset, now.offset + step[:, 7]
-    return moved.clamp(-most, most)
-
-
-def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
-    less, more = damping / REFINEMENT.damping_decrease, damping * REFINEMENT.damping_increase
-    return torch.where(better, less, more).clamp(*REFINEMENT.damping_range)
-
-
 def _step(
-    r: Residuals,
-    kernel: tuple[Tensor, Tensor | None],
-    damping: Tensor,
-    scale: Tensor,
-    settings: Settings,
+    r: Residuals, kernel: tuple[Tensor, Tensor | None], damping: Tensor, scale: Tensor, settings: Settings
 ) -> Tensor:
     """(H, 7) or, with an offset, (H, 8) steps of (omega, dt, log scale, offset). kernel: its width, and what observed
     object samples weigh."""
@@ -125,19 +105,19 @@ def _step(
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest
     if settings.max_offset == 0.0:
-        extra[:, 7:] += REFINEMENT.fixed_damping
-    step = _solved(H + torch.diag_embed(extra), -b, scale.double(), settings.scale)
+        extra[:, 7:] += REFINEMENT.fixed_damping  # the offset stays where it is
+    step = _solved(H + torch.diag_embed(extra), -b, scale.double(), settings)
     longest = step.abs().amax(-1, keepdim=True)
     limited: Tensor = step * (REFINEMENT.max_step / longest.clamp_min(REFINEMENT.max_step))
     return limited
 
 
-def _solved(A: Tensor, b: Tensor, scale: Tensor, bound: ScaleBound | ScaleBounds) -> Tensor:
-    """(H, K) x with A x = b; where the scale (H,) would leave the bound, it goes up to it and the others follow."""
+def _solved(A: Tensor, b: Tensor, scale: Tensor, settings: Settings) -> Tensor:
+    """(H, K) x with A x = b; where the scale (H,) would leave its bound, it goes up to it and the others follow."""
     step = _solution(A, b)
-    if bound.is_open:
+    if settings.scale.is_open and not settings.keeps_scale:
         return step
-    growth = bound.limited_growth(scale, step[:, 6])
+    growth = torch.zeros_like(scale) if settings.keeps_scale else settings.scale.limited_growth(scale, step[:, 6])
     held, known = A.clone(), b.clone()
     held[:, 6], held[:, 6, 6], known[:, 6] = 0.0, 1.0, growth
     return torch.where((growth != step[:, 6])[:, None], _solution(held, known), step)
@@ -184,8 +164,7 @@ def coarse_to_fine(
         parts = []
         for part in torch.split(torch.arange(len(candidates), device=candidates.scores.device), SEARCH.batch):
             some = candidates[part]
-            scale = ScaleBounds.same(some.T) if stage.keeps_scale else context.scale
-            settings = Settings(stage.widest, scale, context.max_offset, stage.normals)
+            settings = Settings(stage.widest, context.scale, context.max_offset, stage.normals, stage.keeps_scale)
             done = refined(few, some, stage, settings, context.on_step)
             parts.append(replace(done, scores=done.scores + context.penalty(done.T)))
         candidates = PoseCandidates.cat(parts)

@@ -1,6 +1,6 @@
 """The refinement's robust loss: kernel widths, cost, normal equations, and the score that ranks poses.
 
-The kernel itself is in regnf_core/robust/residuals.py, the numbers are in regnf_core/robust/constants/model.py.
+The kernel itself is in regnf_core/robust/residuals.py, the numbers are in regnf_core/robust/constants.py.
 """
 
 from __future__ import annotations
@@ -18,12 +18,7 @@ def adaptive_width(r: Residuals, lowest: Tensor | float, widest: Tensor | float)
 
     With a fixed narrow kernel, fields with errors everywhere would be fitted at the few places without errors.
     """
-    size = r.values.abs()
-    if r.shares is None:
-        spread = torch.quantile(size, REFINEMENT.spread_quantile, dim=1, keepdim=True)
-    else:
-        counting = size.masked_fill(r.shares == 0.0, torch.nan)
-        spread = torch.nanquantile(counting, REFINEMENT.spread_quantile, dim=1, keepdim=True)
+    spread = torch.quantile(r.values.abs(), REFINEMENT.spread_quantile, dim=1, keepdim=True)
     return (REFINEMENT.spread_factor * spread).clamp(lowest, widest)  # type: ignore[arg-type]  # two numbers or tensors
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Step(Bundle):
     """One iteration of all poses: T (H,), robust costs (H,), mean |residual| (H,) of the scene's and of the object's
     samples, the kernel width, all in object diameters, and the number of samples of each surface."""
 
@@ -23,36 +24,9 @@ class Step:
     width: float
     samples: int
 
-    def __getitem__(self, index: Tensor | slice) -> Step:
-        return Step(
-            self.T[index],
-            self.costs[index],
-            self.residual_scene[index],
-            self.residual_object[index],
-            self.width,
-            self.samples,
-        )
-
-    def to(self, device: torch.device | str) -> Step:
-        """The same on another device."""
-        costs, scene, obj = (part.to(device) for part in (self.costs, self.residual_scene, self.residual_object))
-        return Step(self.T.on(device), costs, scene, obj, self.width, self.samples)
-
-    @classmethod
-    def cat(cls, parts: Sequence[Step]) -> Step:
-        """The same iteration of several batches."""
-        return cls(
-            Sim3.cat([one.T for one in parts]),
-            torch.cat([one.costs for one in parts]),
-            torch.cat([one.residual_scene for one in parts]),
-            torch.cat([one.residual_object for one in parts]),
-            parts[0].width,
-            parts[0].samples,
-        )
-
 
 @dataclass(frozen=True, eq=False)
-class PoseCandidates:
+class PoseCandidates(Bundle):
     """Poses T (H,), their scores (H,), 0..1, smaller is better, and their history: the iterations of these poses so
     far.
 
@@ -73,16 +47,6 @@ class PoseCandidates:
     def __len__(self) -> int:
         return int(self.scores.numel())
 
-    def __getitem__(self, index: Tensor | slice) -> PoseCandidates:
-        offsets = None if self.offsets is None else self.offsets[index]
-        return PoseCandidates(self.T[index], self.scores[index], offsets, tuple(step[index] for step in self.history))
-
-    def to(self, device: torch.device | str) -> PoseCandidates:
-        """The same on another device."""
-        offsets = None if self.offsets is None else self.offsets.to(device)
-        history = tuple(step.to(device) for step in self.history)
-        return PoseCandidates(self.T.on(device), self.scores.to(device), offsets, history)
-
     def with_copies(self, count: int, spread: Sequence[float], generator: torch.Generator) -> PoseCandidates:
         """These, and ``count`` copies of each, moved at random: ``spread`` is the standard deviation of the rotation
         (radians), the translation and the log scale. Scores are those of the original. Drawn on the CPU."""
@@ -93,14 +57,3 @@ class PoseCandidates:
         steps[: len(self)] = 0.0
         found = self[origins]
         return replace(found, T=found.T.perturb(steps.to(origins.device)))
-
-    @classmethod
-    def cat(cls, parts: Sequence[PoseCandidates]) -> PoseCandidates:
-        """The candidates of several batches with equally long histories, one after the other."""
-        offsets = [one.offsets for one in parts if one.offsets is not None]
-        return cls(
-            Sim3.cat([one.T for one in parts]),
-            torch.cat([one.scores for one in parts]),
-            torch.cat(offsets) if offsets else None,
-            tuple(Step.cat(steps) for steps in zip(*(one.history for one in parts), strict=True)),
-        )

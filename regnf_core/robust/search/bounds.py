@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.exponential_map import matrix_from_quaternion
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions, RobustOptions
@@ -41,40 +42,17 @@ class ScaleBound:
         """The logarithm of the largest scale that is allowed over the smallest."""
         return math.log(self.high / self.low) if self.low > 0.0 else math.inf
 
-    def limited(self, scale: Tensor) -> Tensor:
-        """The nearest scales that are allowed."""
-        return scale.clamp(self.low, self.high)
-
     def limited_growth(self, scale: Tensor, growth: Tensor) -> Tensor:
         """The changes of log ``scale`` (H,), an allowed one, nearest to ``growth`` (H,) that lead to an allowed one."""
-        low, high = (torch.full_like(scale, end) for end in (self.low, self.high))
-        return ScaleBounds(low, high).limited_growth(scale, growth)
+        low, high = (torch.full_like(scale, end).div_(scale).log_() for end in (self.low, self.high))
+        return torch.minimum(torch.maximum(growth, low), high)
 
     def limited_poses(self, T: Sim3) -> Sim3:
         """Poses T (H,) with the nearest allowed scales; the object's center, 0, stays where it is in the scene."""
         if self.is_open:
             return T
-        scale = self.limited(T.scale)
+        scale = T.scale.clamp(self.low, self.high)
         return replace(T, scale=scale, translation=T.translation * (scale / T.scale)[..., None])
-
-
-@dataclass(frozen=True, eq=False)
-class ScaleBounds:
-    """A bound for each pose of a batch: low, high (H,)."""
-
-    low: Tensor
-    high: Tensor
-    is_open = False
-
-    @classmethod
-    def same(cls, T: Sim3) -> ScaleBounds:
-        """Of poses T (H,) that keep their scales."""
-        return cls(T.scale, T.scale)
-
-    def limited_growth(self, scale: Tensor, growth: Tensor) -> Tensor:
-        """As that of :class:`ScaleBound`."""
-        low, high = ((end / scale).log() for end in (self.low, self.high))
-        return torch.minimum(torch.maximum(growth, low), high)
 
 
 ANY_SCALE = ScaleBound()
@@ -86,7 +64,7 @@ SAME_SCALE = ScaleBound(1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class PoseBound:
+class PoseBound(Bundle):
     """Bounds the extent of the posed object by the detection box, and its scale. Working frames: the box's center is 0.
 
     points: (E, 3) outermost points of the object · axes: (3, 3) the box's, columns, scene frame · edges: (3,) of the
@@ -106,21 +84,16 @@ class PoseBound:
         cls, detection: OrientedBox, extremal_points: Tensor, tolerance: float, scale: ScaleBound = ANY_SCALE
     ) -> PoseBound:
         """The bound for an object with these ``extremal_points`` (E, 3), on their device."""
+        axes, edges = detection.rotation.double(), (detection.size / detection.diagonal).double()
         device = extremal_points.device
-        axes, edges = detection.rotation.double().to(device), (detection.size / detection.diagonal).double().to(device)
-        return cls(extremal_points.double(), axes, edges, tolerance, scale)
-
-    def to(self, device: torch.device | str) -> PoseBound:
-        """The same bound for poses on another device."""
-        points, axes, edges = (part.to(device) for part in (self.points, self.axes, self.edges))
-        return replace(self, points=points, axes=axes, edges=edges)
+        return cls(extremal_points.double(), axes.to(device), edges.to(device), tolerance, scale)
 
     def admits(self, T: Sim3) -> Tensor:
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""
         placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
         low, high = placed.amin(-2), placed.amax(-2)
         reach = self.edges / 2 + self.tolerance * self._lengths
-        within = (low >= -reach).all(-1) & (high <= reach).all(-1)
+        within = (low >= -reach).all(-1) & (high <= reach).all(-1)  # the box's center is 0
         size = ((high - low) / self._lengths).amax(-1)
         return within & (size >= SEARCH.min_share_of_detection)
 
@@ -168,7 +141,7 @@ def seed_poses(
     scene_points, object_points = scene_points.double(), object_points.double()
     by_moments = _from_moments(scene_points, object_points, rotations, scales, bound)
     local = scene_points @ box_axes
-    lowest, highest = _extremes(local[None])
+    lowest, highest = local.amin(0, keepdim=True), local.amax(0, keepdim=True)
     low, high = _object_extents(object_points, rotations, box_axes)
     by_points = _from_extents(rotations, box_axes, (low, high), (lowest, highest))
     by_box = _from_extents(rotations, box_axes, (low, high), (-box_size[None] / 2, box_size[None] / 2))
@@ -178,8 +151,8 @@ def seed_poses(
 def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:
     """A single pose and perturbed copies of it (H,): by about 10 degrees, 5 % of the object's size, 10 % of the
     scale. Drawn on the CPU, on the pose's device."""
-    turn, shift, growth = SEARCH.warm_start_spread
-    count = SEARCH.warm_start_copies
+    turn, shift, growth = SEARCH.start_spread
+    count = SEARCH.start_copies
     spread = torch.tensor([turn] * 3 + [shift] * 3 + [growth], dtype=torch.float64)
     steps = torch.randn(count + 1, 7, generator=generator, dtype=torch.float64) * spread
     steps[0] = 0.0
@@ -190,8 +163,9 @@ def _from_moments(
     scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor, bound: ScaleBound
 ) -> Sim3:
     scene_center, object_center = scene_points.mean(0), object_points.mean(0)
-    ratio = _radius(object_points, object_center) / _radius(scene_points, scene_center)
-    tried = bound.limited(ratio * scales.double())
+    ratio = _radius(object_points - object_center) / _radius(scene_points - scene_center)
+    tried = (ratio * scales.double()).clamp(bound.low, bound.high)
+    # Factors that the bound holds back are the same scale: each is tried once.
     tried = tried if bound.is_open else tried.new_tensor(sorted(set(tried.tolist())))
     s = tried[:, None].expand(-1, rotations.shape[0]).reshape(-1)
     R = rotations.repeat(len(tried), 1, 1)
@@ -213,26 +187,14 @@ def _from_extents(
 def _object_extents(object_points: Tensor, rotations: Tensor, box_axes: Tensor) -> tuple[Tensor, Tensor]:
     """Lowest and highest coordinates (K, 3) of the object along the box's axes, for every rotation."""
     parts = -(-len(rotations) * len(object_points) // _POINTS_AT_ONCE)
-    rows = object_points.T.contiguous()
+    rows = object_points.T.contiguous()  # long rows: the lowest and the highest along one are found at once
     turns = (rotations @ box_axes).mT  # (K, 3, 3)
-    found = [_row_extremes(part.bmm(rows.expand(len(part), -1, -1))) for part in turns.tensor_split(max(1, parts))]
-    low, high = (torch.cat(ends) for ends in zip(*found, strict=True))
-    return low, high
+    found = [part.bmm(rows.expand(len(part), -1, -1)).aminmax(dim=2) for part in turns.tensor_split(max(1, parts))]
+    return torch.cat([ends.min for ends in found]), torch.cat([ends.max for ends in found])
 
 
-def _extremes(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Lowest and highest coordinates (K, 3) of point sets (K, N, 3)."""
-    return points.amin(1), points.amax(1)
-
-
-def _row_extremes(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Lowest and highest numbers (K, 3) of rows (K, 3, N)."""
-    low, high = rows.aminmax(dim=2)
-    return low, high
-
-
-def _radius(points: Tensor, center: Tensor) -> Tensor:
-    return (points - center).square().sum(-1).mean().sqrt()
+def _radius(offsets: Tensor) -> Tensor:
+    return offsets.square().sum(-1).mean().sqrt()
 
 
 # Evenly spread rotations: super-Fibonacci spirals over SO(3) (Alexa 2022), or turns about one axis.

@@ -6,12 +6,12 @@ to compare thousands of poses; the fields themselves decide afterwards.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import FEATURES, SEARCH
@@ -21,82 +21,45 @@ from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions,
 _CELLS = SEARCH.grid_cells
 
 
-class DistanceGrid:
-    """Distance and gradient near oriented surface points (N, 3), in their frame.
-
-    The grid covers the points' box grown by ``margin`` on every side. Beyond it, the distance to the grid is added.
-    """
-
-    def __init__(self, points: Tensor, normals: Tensor, spacing: float, margin: float) -> None:
-        low, high = points.amin(0) - margin, points.amax(0) + margin
-        edge = (high - low) / _CELLS
-        axes = [low[k] + (torch.arange(_CELLS, device=points.device) + 0.5) * edge[k] for k in range(3)]
-        centers = torch.cartesian_prod(*axes)
-        value, gradient = nearest_sample_distance(points, normals, spacing, centers)
-        at_zero = value - (gradient * centers).sum(-1)  # each cell holds a plane: at_zero + gradient . point
-        planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)
-        self.cells = GridCells(planes, *(corner[:, None] for corner in (low, high, edge)))
-
-    @property
-    def low(self) -> Tensor:
-        """(3,) lowest corner."""
-        return self.cells.low[:, 0]
-
-    @property
-    def high(self) -> Tensor:
-        """(3,) highest corner."""
-        return self.cells.high[:, 0]
-
-    @property
-    def edge(self) -> Tensor:
-        """(3,) edges of a cell."""
-        return self.cells.edge[:, 0]
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance (M,) and gradient (M, 3): the nearest cell's, carried on to the point."""
-        value, gradient = self.cells.look_up(points.T.contiguous())
-        return value, gradient.T
-
-    def to(self, device: torch.device | str) -> DistanceGrid:
-        """The same grid on another device."""
-        moved = copy(self)
-        moved.cells = self.cells.to(device)
-        return moved
-
-
 @dataclass(frozen=True, eq=False)
-class GridCells:
-    """The cells of a grid, or of several, one after the other. planes: (4 V,), one plane a cell · low, high, edge of a
-    cell: (3, 1), or (3, M) where each point has a grid of its own · first: (M,) int32, the number of that grid's first
-    cell; None: there is one grid."""
+class DistanceGrid(Bundle):
+    """Distance and gradient near a surface, in its frame: each cell holds a plane. Beyond the grid, the distance to it
+    is added.
+
+    planes: (4 V,), at_zero + gradient . point, z fastest · low, high, edge of a cell: (3, 1).
+    """
 
     planes: Tensor
     low: Tensor
     high: Tensor
     edge: Tensor
-    first: Tensor | None = None
 
-    def look_up(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance (M,) and gradient (3, M) at places (3, M)."""
+    @classmethod
+    def of(cls, points: Tensor, normals: Tensor, spacing: float, margin: float) -> DistanceGrid:
+        """Of oriented surface points (N, 3); it covers their box grown by ``margin`` on every side."""
+        low, high = points.amin(0) - margin, points.amax(0) + margin
+        edge = (high - low) / _CELLS
+        axes = [low[k] + (torch.arange(_CELLS, device=points.device) + 0.5) * edge[k] for k in range(3)]
+        centers = torch.cartesian_prod(*axes)
+        value, gradient = nearest_sample_distance(points, normals, spacing, centers)
+        at_zero = value - (gradient * centers).sum(-1)
+        planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)
+        return cls(planes, *(corner[:, None] for corner in (low, high, edge)))
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance (M,) and gradient (M, 3) at points (M, 3): the nearest cell's, carried on to the point."""
+        places = points.T.contiguous()
         inside = torch.minimum(torch.maximum(places, self.low), self.high)
         cell = ((inside - self.low) / self.edge).int().clamp_(0, _CELLS - 1)
-        index = cell[0].mul_(_CELLS).add_(cell[1]).mul_(_CELLS).add_(cell[2])
-        if self.first is not None:
-            index.add_(self.first)
-        index.mul_(4)
+        # Planes are four numbers each, one after the other: the index moves on by one from number to number.
+        index = cell[0].mul_(_CELLS).add_(cell[1]).mul_(_CELLS).add_(cell[2]).mul_(4)
         value = self.planes.index_select(0, index)
         gradient = torch.empty_like(places)
         for k in range(3):
             torch.index_select(self.planes, 0, index.add_(1), out=gradient[k])
             value.addcmul_(gradient[k], inside[k])
         _go_on(value, gradient, places - inside)
-        return value, gradient
-
-    def to(self, device: torch.device | str) -> GridCells:
-        """The same on another device."""
-        first = None if self.first is None else self.first.to(device)
-        planes, low, high, edge = (part.to(device) for part in (self.planes, self.low, self.high, self.edge))
-        return GridCells(planes, low, high, edge, first)
+        return value, gradient.T
 
 
 def _go_on(value: Tensor, gradient: Tensor, beyond: Tensor) -> None:
@@ -124,7 +87,7 @@ def _away(beyond: Tensor) -> tuple[Tensor, Tensor]:
 
 def distance_grid(samples: Samples, spacing: float) -> DistanceGrid:
     """The grid around a surface's samples, ``spacing`` apart, in their working frame."""
-    return DistanceGrid(samples.on_surface(), samples.normals, spacing, SEARCH.grid_margin)
+    return DistanceGrid.of(samples.on_surface(), samples.normals, spacing, SEARCH.grid_margin)
 
 
 def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, queries: Tensor) -> tuple[Tensor, Tensor]:
@@ -137,6 +100,7 @@ def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, que
     n = normals[nearest]
     height = (offset * n).sum(-1)
     sign = torch.where(height >= 0, 1.0, -1.0)
+    # Between samples the nearest one is farther than the surface, and its tangent plane is not.
     close = far < SEARCH.tangent_spacings * spacing
     value = torch.where(close, height, sign * far)
     gradient = torch.where(close[:, None], n, sign[:, None] * offset / far.clamp_min(1e-9)[:, None])
@@ -161,18 +125,14 @@ def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
 
     Deterministic for a seed, whatever the number of threads and the samples' device. Loads open3d.
     """
-    scene, obj = scene.to("cpu"), obj.to("cpu")
-    found: list[Sim3] = []
+    scene, obj = scene.on("cpu"), obj.on("cpu")
     to_scene, to_object = _normalizing(scene), _normalizing(obj)
     with without_warnings():
         source, target = _described(scene, to_scene), _described(obj, to_object)
         if min(len(source), len(target)) < FEATURES.min_points:
             return Sim3.cat([])
-        for draw in range(count):
-            T = _similarity(match(source, target, _MATCHING, seed * 1009 + draw))
-            if T is not None:
-                found.append(to_object.inverse() @ T @ to_scene)
-    return Sim3.cat(found)
+        drawn = [_similarity(match(source, target, _MATCHING, seed * 1009 + draw)) for draw in range(count)]
+    return Sim3.cat([to_object.inverse() @ T @ to_scene for T in drawn if T is not None])
 
 
 def _normalizing(samples: Samples) -> Sim3:

@@ -143,11 +143,8 @@ class ProbabilityModel:
 
     def against(self, features: dict[str, Tensor]) -> dict[str, Tensor]:
         """What each feature speaks against the poses, (H,), in logits: 0 where it is at its best, else negative."""
-        return {term.feature: _worst_if_nan(term, features[term.feature].double()) for term in self.terms}
-
-
-def _worst_if_nan(term: Term, x: Tensor) -> Tensor:
-    return torch.where(x.isnan(), term.values.min(), term(x.nan_to_num(0.0)))
+        given = [(term, features[term.feature].double()) for term in self.terms]
+        return {term.feature: torch.where(x.isnan(), term.values.min(), term(x.nan_to_num(0.0))) for term, x in given}
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import COVARIANCE
@@ -31,7 +32,7 @@ _TINY = COVARIANCE.regularization
 
 
 @dataclass(frozen=True, eq=False)
-class _Inliers:
+class _Inliers(Bundle):
     """Samples that agree with the pose. points (N, 3), object diameters · normals (N, 3) · J (N, 7), with the offset
     (N, 8) · residuals (N,) · weights, curvatures (N,)."""
 
@@ -41,9 +42,6 @@ class _Inliers:
     residuals: Tensor
     weights: Tensor
     curvatures: Tensor
-
-    def first(self, count: int) -> _Inliers:
-        return _Inliers(*(values[:count] for values in vars(self).values()))
 
 
 def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
@@ -55,7 +53,7 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     inliers = _inliers(r, width, points)
     scales = 1.0 / inliers.J.square().mean(0).sqrt().clamp_min(_TINY)  # all unknowns in similar units
     inliers = replace(inliers, J=inliers.J * scales)
-    variances = _likely_variances(inliers.first(COVARIANCE.likelihood_samples))  # (lengths, nuggets)
+    variances = _likely_variances(inliers[: COVARIANCE.likelihood_samples])  # (lengths, nuggets)
     curvature = _curvature(inliers)
     if r.offset is not None:
         curvature[7, 7] += offset_prior(r)
@@ -66,6 +64,7 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     squares, turned = (part.float() for part in _squares(inliers))
     for length, smooth in zip(COVARIANCE.lengths, (variances * (1.0 - nuggets)).sum(1), strict=True):
         if smooth > _TINY * variances.sum():
+            # float32 is enough for the kernel's (N, N) entries, which take most of the time
             cov = cov + smooth * (B @ _smooth(squares, turned, length).double() @ B.mT)
     symmetric: Tensor = (cov + cov.mT) / 2.0
     return scales[:7, None] * symmetric * scales[:7]
@@ -134,6 +133,8 @@ def _smooth(squares: Tensor, turned: Tensor, length: Tensor | float) -> Tensor:
 
 def _likely_variances(inliers: _Inliers) -> Tensor:
     """(lengths, nuggets) variances of the errors, each times the restricted likelihood of length and nugget."""
+    # The pose has absorbed part of the errors, up to one number for each unknown: what is left is judged by the
+    # restricted likelihood, that of the residuals' part which no pose changes.
     lengths = torch.tensor(COVARIANCE.lengths, dtype=torch.float64)[:, None, None]
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)[:, None, None]
     alone = torch.eye(len(inliers.points), dtype=torch.float64)
@@ -162,6 +163,7 @@ def with_known_scale(cov: Tensor, log_width: float) -> Tensor:
     """
     if math.isinf(log_width):
         return cov
+    # of an even distribution: its width squared over 12; a Kalman update by that measurement of the last unknown
     column, variance = cov[:, 6:], (log_width / 2.0) ** 2 / 3.0 + _TINY**2
     known: Tensor = cov - column @ column.mT / (column[6] + variance)
     return known

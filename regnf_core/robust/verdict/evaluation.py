@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +19,7 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors, with_known_scale
-from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidence, pose_features
+from regnf_core.robust.verdict.evidence import HeldOut, gather_evidence, pose_features
 
 # The verdict on a pose: whether it is probable enough, and where it is not, what is wrong with it in words.
 #
@@ -32,8 +31,7 @@ from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidenc
 # - the object must stand within the detection, give or take;
 # - little of the object may be left that was seen: of such poses the probability knows nothing;
 # - the scene may have surface within the object's hull that belongs to another, similar object. It fits as well, so
-#   this
-#   is asked for by itself where it is known what was seen. Elsewhere a field may have invented that surface.
+#   this is asked for by itself where it is known what was seen. Elsewhere a field may have invented that surface.
 
 
 @dataclass(frozen=True)
@@ -70,9 +68,8 @@ class _Limit:
         value, limit = f"{self.value:.3g}", f"{self.limit:.3g}"
         if value == limit:  # 0.6996 is not "0.7, at least 0.7"
             value, limit = str(self.value), str(self.limit)
-        return f"{self.name} {value}, " + (
-            f"at most {limit} is allowed" if self.upper else f"at least {limit} is needed"
-        )
+        rule = f"at most {limit} is allowed" if self.upper else f"at least {limit} is needed"
+        return f"{self.name} {value}, {rule}"
 
 
 def evaluate_pose(
@@ -83,15 +80,25 @@ def evaluate_pose(
     probability: that the pose or one of its rivals is right, 0..1.
     Written so that a number that is not finite can only lead to a rejection.
     """
-    evidence, features = held_out.evidence, {name: float(one[index]) for name, one in held_out.features.items()}
-    occluded = float(evidence.occluded[index])
+    told, hidden = held_out.of(index), float(held_out.features["hidden"][index])
     limits = [
-        _Limit("TOO_LITTLE_SURFACE", "occluded share", occluded, options.max_occluded_share, upper=True),
-        _Limit("TOO_LITTLE_SURFACE", "hidden share", features["hidden"], VERDICT.max_hidden, upper=True),
-        *_of_a_similar_object(evidence, index, features),
-        *_of_the_shares(evidence, index, options, probability),
-        _Limit("LOW_PROBABILITY", "probability", probability, options.min_probability),
+        _Limit("TOO_LITTLE_SURFACE", "occluded share", told["occluded_share_object"], options.max_occluded_share, True),
+        _Limit("TOO_LITTLE_SURFACE", "hidden share", hidden, VERDICT.max_hidden, True),
     ]
+    if held_out.evidence.partial or hidden > VERDICT.mostly_hidden:
+        allowed = VERDICT.unexplained + VERDICT.unexplained_per_noise * told["residual_rms"]
+        unexplained = told["unexplained_share_scene"]
+        limits.append(_Limit("SURFACE_UNEXPLAINED", "unexplained share", unexplained, allowed, True))
+    if options.share_limits_below >= 1.0 or not probability >= options.share_limits_below:
+        free, enough = told["free_space_violations"], options.min_inlier_share
+        explained = told["explained_share_scene"]
+        limits += [
+            _Limit("FREE_SPACE_VIOLATED", "share in free space", free, options.max_free_space_violations, True),
+            _Limit("LOW_OVERLAP", "object inliers", told["inlier_share_object"], enough),
+            _Limit("LOW_OVERLAP", "scene inliers", told["inlier_share_scene"], enough),
+            _Limit("SCENE_UNEXPLAINED", "explained share", explained, options.min_explained_share),
+        ]
+    limits.append(_Limit("LOW_PROBABILITY", "probability", probability, options.min_probability))
     margin = min(one.slack for one in limits)
     if not bool(held_out.admitted[index]):
         return PoseVerdict("rejected", "OUTSIDE_DETECTION", -1.0)
@@ -103,60 +110,30 @@ def evaluate_pose(
     return PoseVerdict("registered", "SURFACES_AGREE", margin)
 
 
-def _of_a_similar_object(evidence: Evidence, index: int, features: dict[str, float]) -> Iterable[_Limit]:
-    if not (evidence.partial or features["hidden"] > VERDICT.mostly_hidden):
-        return
-    allowed = VERDICT.unexplained + VERDICT.unexplained_per_noise * float(evidence.residual_rms[index])
-    yield _Limit("SURFACE_UNEXPLAINED", "unexplained share", features["unexplained"], allowed, upper=True)
-
-
-def _of_the_shares(evidence: Evidence, index: int, options: RobustOptions, probability: float) -> Iterable[_Limit]:
-    """None where the pose is probable enough without."""
-    if options.share_limits_below < 1.0 and probability >= options.share_limits_below:
-        return
-    free, enough = float(evidence.violations[index]), options.min_inlier_share
-    yield _Limit("FREE_SPACE_VIOLATED", "share in free space", free, options.max_free_space_violations, upper=True)
-    yield _Limit("LOW_OVERLAP", "object inliers", float(evidence.share_object[index]), enough)
-    yield _Limit("LOW_OVERLAP", "scene inliers", float(evidence.share_scene[index]), enough)
-    explained = float(evidence.share_explained[index])
-    yield _Limit("SCENE_UNEXPLAINED", "explained share", explained, options.min_explained_share)
-
-
-# The poses that a registration has looked at to the end, with what speaks for and against each: for people to look
-# at.
-#
+# The poses that a registration has looked at to the end, with what speaks for and against each: for people to look at.
 # Nothing is evaluated for it: the held-out samples tell it that the verdict rests on.
 
 _MOST = 6
 
 
 def considered_poses(
-    problem: RegistrationProblem,
-    candidates: PoseCandidates,
-    held_out: HeldOut,
-    answer: Answer,
-    options: RobustOptions,
+    problem: RegistrationProblem, candidates: PoseCandidates, held_out: HeldOut, answer: Answer, options: RobustOptions
 ) -> Considered:
     """The best of the candidates that differ, the likeliest first."""
-    points, evidence = problem.model.extremal_points, held_out.evidence
+    points = problem.model.extremal_points
     ranked = distinct(candidates.T, answer.demerits, points, VERDICT.rivals_min_distance, len(candidates))
-    numbers = ranked[:_MOST].tolist()
+    chosen = ranked[:_MOST]
     poses = []
-    for number in numbers:
+    for number in chosen.tolist():
         likely = float(answer.probability[number])
         found = evaluate_pose(held_out, number, 0, options, likely)
-        metrics = {**held_out.of(number), "probability": likely}
         T = problem.in_field_frames(candidates.T[number])
+        metrics = {**held_out.of(number), "probability": likely}
         poses.append(ConsideredPose(T, found.reason, metrics, found.broken))
-    chosen = torch.tensor(numbers)
-    scene, obj = problem.held_out.scene_samples, problem.held_out.object_samples
-    return Considered(
-        poses,
-        problem.view.frame.out_of(scene.points),
-        problem.model.frame.out_of(obj.points),
-        evidence.scene_signs[chosen],
-        evidence.object_signs[chosen],
-    )
+    scene = problem.view.frame.out_of(problem.held_out.scene_samples.points)
+    obj = problem.model.frame.out_of(problem.held_out.object_samples.points)
+    signs = held_out.evidence.scene_signs[chosen], held_out.evidence.object_signs[chosen]
+    return Considered(poses, scene, obj, *signs)
 
 
 # How one pose differs from another, in words: '180 degrees about z'.
@@ -175,14 +152,12 @@ def relation(T_other: Sim3, T_best: Sim3, free_axis: Tensor | None = None) -> st
     words = []
     if angle > math.radians(RELATION.min_angle_deg):
         x, y, z = (omega / angle).tolist()
-        names = {name: value for name, value in zip("xyz", (x, y, z), strict=True) if abs(value) >= _NEARLY}
         degrees = round(math.degrees(angle))
-        if names:
-            (name, value), *_ = names.items()
-            sign = "-" if value < 0 and degrees != 180 else ""
-            words.append(f"{sign}{degrees} degrees about {name}")
-        else:
-            words.append(f"{degrees} degrees about ({x:.2f}, {y:.2f}, {z:.2f})")
+        said = f"{degrees} degrees about ({x:.2f}, {y:.2f}, {z:.2f})"
+        for name, value in zip("xyz", (x, y, z), strict=True):
+            if abs(value) >= _NEARLY:
+                said = f"{'-' if value < 0 and degrees != 180 else ''}{degrees} degrees about {name}"
+        words.append(said)
         if free_axis is not None and abs(float(omega @ free_axis)) >= _NEARLY * angle:
             words.append("as any turn about this axis")
     if abs(factor - 1.0) > RELATION.min_scale_change:
@@ -192,47 +167,35 @@ def relation(T_other: Sim3, T_best: Sim3, free_axis: Tensor | None = None) -> st
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The best candidate by the held-out samples and what is known of it, on the CPU. winner: its number among the
-    candidates."""
+    """The best candidate by the held-out samples and what is known of it, on the CPU.
+
+    held_out: of all candidates · winner: its number among the candidates · T: T_object_scene, in the fields' own frames
+    · demerit: what the best candidates of several objects are compared by, as those of one object are.
+    """
 
     found: PoseVerdict
     candidates: PoseCandidates
     held_out: HeldOut
-    """Of all candidates."""
     winner: int
     T: Sim3
-    """T_object_scene, in the fields' own frames."""
     metrics: dict[str, float]
     alternatives: list[Alternative]
     considered: Considered
-
     demerit: float
-    """What the best candidates of several objects are compared by, as those of one object are."""
-
-    @property
-    def verdict(self) -> Verdict:
-        return self.found.verdict
-
-    @property
-    def reason(self) -> str:
-        return self.found.reason
 
     @property
     def doubtful(self) -> bool:
         """Whether a further attempt is worth its time: it may find a better pose, or one that speaks against this."""
-        return self.verdict == "rejected" or self.metrics["probability"] < VERDICT.doubtful
+        return self.found.verdict == "rejected" or self.metrics["probability"] < VERDICT.doubtful
 
     @property
     def rank(self) -> tuple[bool, float]:
         """Smaller is better: rejections last, then the larger demerit."""
-        return self.verdict == "rejected", self.demerit
+        return self.found.verdict == "rejected", self.demerit
 
 
 def evaluate_candidates(
-    problem: RegistrationProblem,
-    candidates: PoseCandidates,
-    options: RegistrationOptions,
-    known: HeldOut | None = None,
+    problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions, known: HeldOut | None = None
 ) -> Evaluation:
     """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
 
@@ -242,8 +205,9 @@ def evaluate_candidates(
     first = 0 if known is None else len(known.admitted)
     asked = held_out_of(problem, candidates[first:], options)
     held_out = asked if known is None else HeldOut.cat([known, asked])
-    problem, candidates = problem.to("cpu"), candidates.to("cpu")
-    answer = choose(problem, candidates, held_out.features, held_out.evidence.scores, options.robust.rival_margin)
+    problem, candidates = problem.on("cpu"), candidates.on("cpu")
+    scores = held_out.evidence.numbers["score"]
+    answer = choose(problem, candidates, held_out.features, scores, options.robust.rival_margin)
     winner, likely = answer.winner, float(answer.probability[answer.winner])
     found = evaluate_pose(held_out, winner, len(answer.rivals), options.robust, likely)
     T = problem.in_field_frames(candidates.T[winner])
@@ -276,21 +240,18 @@ def held_out_of(problem: RegistrationProblem, candidates: PoseCandidates, option
     assert candidates.offsets is not None, "candidates refined on the fields have offsets"
     T, offsets = candidates.T, candidates.offsets
     r = residuals(problem.held_out, T, offsets)
-    evidence = gather_evidence(r, offsets, options.robust).to("cpu")
+    evidence = gather_evidence(r, offsets, options.robust).on("cpu")
     features = {name: one.cpu() for name, one in pose_features(problem, T, r, offsets).items()}
     problem.held_out.require_finite()
-    return HeldOut(evidence, features, problem.bound.to("cpu").admits(T.on("cpu")))
+    return HeldOut(evidence, features, problem.bound.on("cpu").admits(T.on("cpu")))
 
 
 def _alternatives(
     problem: RegistrationProblem, candidates: PoseCandidates, answer: Answer, T_best: Sim3
 ) -> list[Alternative]:
     axis = problem.model.symmetry.axis
-    alternatives = []
-    for number in answer.rivals:
-        T = problem.in_field_frames(candidates.T[number])
-        alternatives.append(Alternative(T, float(answer.scores[number]), relation(T, T_best, axis)))
-    return alternatives
+    poses = [(number, problem.in_field_frames(candidates.T[number])) for number in answer.rivals]
+    return [Alternative(T, float(answer.scores[number]), relation(T, T_best, axis)) for number, T in poses]
 
 
 def pose_covariance(problem: RegistrationProblem, evaluation: Evaluation) -> Tensor:
@@ -298,8 +259,8 @@ def pose_covariance(problem: RegistrationProblem, evaluation: Evaluation) -> Ten
     candidates, best = evaluation.candidates, torch.tensor([evaluation.winner])
     T, device = candidates.T[evaluation.winner], problem.fit.scene_samples.points.device
     offset = None if candidates.offsets is None or problem.view.max_offset == 0.0 else candidates.offsets[best]
-    r = residuals(problem.fit, candidates.T[best].on(device), None if offset is None else offset.to(device)).to("cpu")
-    fit = problem.fit.to("cpu")
+    r = residuals(problem.fit, candidates.T[best].on(device), None if offset is None else offset.to(device)).on("cpu")
+    fit = problem.fit.on("cpu")
     A, B = fit.scene_samples, fit.object_samples
     places = torch.cat([T.apply(A.points.double()), B.points.double()])
     last = REFINEMENT.last_stages[-1]

@@ -7,13 +7,13 @@ matter instead, the part may be occluded (fields are solid behind what was obser
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.bundle import Bundle
+from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import EVIDENCE
@@ -24,65 +24,22 @@ from regnf_core.surface.result_clouds import newton_step
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What the held-out samples tell of the poses (H,): shares 0..1, lengths in object diameters."""
+class Evidence(Bundle):
+    """What the held-out samples tell of H poses: shares 0..1, lengths in object diameters.
 
-    scores: Tensor
-    share_object: Tensor
-    """Object samples that the scene confirms, of those that are not occluded."""
-    share_scene: Tensor
-    """Scene samples near the object that it explains."""
-    share_explained: Tensor
-    """Scene samples, near or not, that the object explains."""
-    occluded: Tensor
-    """Object samples within the scene's matter, or at places that were not observed."""
-    violations: Tensor
-    """Object samples in the scene's free space, of those that are not occluded."""
-    residual_rms: Tensor
-    """Root mean square of the inliers' residuals."""
-    coarse: Tensor
-    """Coarse agreement: the share of samples, the smaller one of both directions, that agree at twice the inlier
-    distance, whatever the normals, minus the share in free space."""
-    offsets: Tensor
-    """How much farther out the scene's surface lies than the object's."""
+    numbers: each (H,), by the names that results carry; docs/reference/metrics.md says what they are · scene_signs:
+    (H, N) and object_signs: (H, M) uint8, see :class:`regnf_core.document.Considered` · partial: part of the scene is
+    known not to have been observed; that part is left out, the rest was measured.
+    """
+
+    numbers: dict[str, Tensor]
     scene_signs: Tensor
-    """(H, N) uint8, see :class:`regnf_core.document.Considered`."""
     object_signs: Tensor
-    """(H, M) uint8, likewise."""
     partial: bool = False
-    """Part of the scene is known not to have been observed. That part is left out; the rest was measured."""
-
-    def to(self, device: torch.device | str) -> Evidence:
-        """The same on another device."""
-        return Evidence(**{name: one.to(device) for name, one in self._tensors().items()}, partial=self.partial)
-
-    @classmethod
-    def cat(cls, parts: Sequence[Evidence]) -> Evidence:
-        """The evidence on the poses of several batches, all on the same samples."""
-        rows = [one._tensors() for one in parts]
-        joined = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
-        return cls(**joined, partial=parts[0].partial)
-
-    def _tensors(self) -> dict[str, Any]:
-        return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "partial"}
-
-    def of(self, index: int) -> dict[str, float]:
-        """The numbers of one pose, by the names that results carry."""
-        return {
-            "score": float(self.scores[index]),
-            "inlier_share_object": float(self.share_object[index]),
-            "inlier_share_scene": float(self.share_scene[index]),
-            "explained_share_scene": float(self.share_explained[index]),
-            "occluded_share_object": float(self.occluded[index]),
-            "free_space_violations": float(self.violations[index]),
-            "residual_rms": float(self.residual_rms[index]),
-            "coarse_agreement": float(self.coarse[index]),
-            "surface_offset": float(self.offsets[index]),
-        }
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOut(Bundle):
     """What the held-out samples tell of H poses, on the CPU: all that a verdict is made of, asked of the fields once.
 
     features: each (H,), by its name, see `pose_features` · admitted: (H,) bool, which of the poses the detection
@@ -93,18 +50,10 @@ class HeldOut:
     features: dict[str, Tensor]
     admitted: Tensor
 
-    @classmethod
-    def cat(cls, parts: Sequence[HeldOut]) -> HeldOut:
-        """Of several batches of poses, all on the same samples, one after the other."""
-        return cls(
-            Evidence.cat([one.evidence for one in parts]),
-            {name: torch.cat([one.features[name] for one in parts]) for name in parts[0].features},
-            torch.cat([one.admitted for one in parts]),
-        )
-
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
-        return {**self.evidence.of(index), "unexplained_share_scene": float(self.features["unexplained"][index])}
+        told = self.evidence.numbers | {"unexplained_share_scene": self.features["unexplained"]}
+        return {name: float(values[index]) for name, values in told.items()}
 
 
 def gather_evidence(r: Residuals, offsets: Tensor, options: RobustOptions) -> Evidence:
@@ -113,6 +62,7 @@ def gather_evidence(r: Residuals, offsets: Tensor, options: RobustOptions) -> Ev
     to_scene = r.object_to_scene
     inlier = (r.values.abs() <= limit) & (r.cosines >= EVIDENCE.min_inlier_cosine)
     observed = torch.ones_like(to_scene, dtype=torch.bool) if r.unobserved is None else ~r.unobserved[:, n:]
+    # Within the scene's matter, or where nobody looked, an object sample is hidden: fields are solid behind surfaces.
     occluded = (~observed | (to_scene < -limit)) & ~inlier[:, n:]
     visible = (~occluded).sum(1).clamp_min(1)
     near = r.scene_to_object.abs() <= EVIDENCE.near
@@ -120,20 +70,20 @@ def gather_evidence(r: Residuals, offsets: Tensor, options: RobustOptions) -> Ev
         near &= ~r.unobserved[:, :n]
     free = (to_scene > limit) & observed
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
-    return Evidence(
-        scores=disagreement(r, EVIDENCE.score_width),
-        share_object=inlier[:, n:].sum(1) / visible,
-        share_scene=inlier[:, :n].sum(1) / near.sum(1).clamp_min(1),
-        share_explained=inlier[:, :n].float().mean(1),
-        occluded=occluded.float().mean(1),
-        violations=free.sum(1) / visible,
-        residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
-        coarse=_coarse(r, near, observed, EVIDENCE.coarse_distance * limit),
-        offsets=offsets,
-        scene_signs=_signs((~inlier[:, :n] & near, 1), (~inlier[:, :n] & ~near, 2)),
-        object_signs=_signs((~inlier[:, n:], 3), (occluded, 2), (free, 1)),
-        partial=r.unobserved is not None,
-    )
+    numbers = {
+        "score": disagreement(r, EVIDENCE.score_width),
+        "inlier_share_object": inlier[:, n:].sum(1) / visible,
+        "inlier_share_scene": inlier[:, :n].sum(1) / near.sum(1).clamp_min(1),
+        "explained_share_scene": inlier[:, :n].float().mean(1),
+        "occluded_share_object": occluded.float().mean(1),
+        "free_space_violations": free.sum(1) / visible,
+        "residual_rms": (squares / inlier.sum(1).clamp_min(1)).sqrt(),
+        "coarse_agreement": _coarse(r, near, observed, EVIDENCE.coarse_distance * limit),
+        "surface_offset": offsets,
+    }
+    scene_signs = _signs((~inlier[:, :n] & near, 1), (~inlier[:, :n] & ~near, 2))
+    object_signs = _signs((~inlier[:, n:], 3), (occluded, 2), (free, 1))
+    return Evidence(numbers, scene_signs, object_signs, r.unobserved is not None)
 
 
 def _signs(*marked: tuple[Tensor, int]) -> Tensor:
@@ -145,10 +95,8 @@ def _signs(*marked: tuple[Tensor, int]) -> Tensor:
 
 
 def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> Tensor:
-    """``coarse`` of the evidence, (H,).
-
-    near: (H, N) scene samples near the object · observed: (H, M) object samples at places that were observed.
-    """
+    """(H,): the share of samples, the smaller one of both directions, that agree at this distance, whatever the
+    normals, minus the share in free space. near: (H, N) scene samples · observed: (H, M) object samples."""
     to_scene = r.object_to_scene
     explained = r.scene_to_object.abs() <= distance
     of_near = explained.sum(1) / near.sum(1).clamp_min(1)
@@ -285,10 +233,17 @@ def pose_features(problem: RegistrationProblem, T: Sim3, r: Residuals, offsets: 
     r: of the held-out samples under these poses · offsets: (H,) of the surfaces, as the residuals have them.
     """
     groups = _groups(r)
-    found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _normals(r, groups) | _spread(r, groups)
-    found |= _coverage(problem, T, groups) | {"offset": offsets.abs()}
+    found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _spread(r, groups)
+    A, B, n = problem.held_out.scene_samples.points, problem.held_out.object_samples.points, r.scene_count
+    found |= coverage(problem.model.extremal_points, B, T.to(A).apply(A), groups.confirmed, groups.near)
     stiffness = _stiffness(problem, T, r, groups)
-    found |= {"stiffness": stiffness[:, 0], "second_stiffness": stiffness[:, 1]}
+    found |= {
+        "normals_agree_scene": _mean(r.cosines[:, :n], groups.scene_agrees),
+        "normals_agree_object": _mean(r.cosines[:, n:], groups.object_agrees),
+        "stiffness": stiffness[:, 0],
+        "second_stiffness": stiffness[:, 1],
+        "offset": offsets.abs(),
+    }
     return {name: found[name].double() for name in SPEAKS_FOR}
 
 
@@ -340,21 +295,6 @@ def _conflict(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Grou
     }
 
 
-def _coverage(problem: RegistrationProblem, T: Sim3, groups: _Groups) -> dict[str, Tensor]:
-    """Shares of the patches about the object's outermost points that are confirmed, and that scene surface is near."""
-    A, B = problem.held_out.scene_samples.points, problem.held_out.object_samples.points
-    return coverage(problem.model.extremal_points, B, T.to(A).apply(A), groups.confirmed, groups.near)
-
-
-def _normals(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
-    """Mean cosines between the normals where the surfaces agree."""
-    n = r.scene_count
-    return {
-        "normals_agree_scene": _mean(r.cosines[:, :n], groups.scene_agrees),
-        "normals_agree_object": _mean(r.cosines[:, n:], groups.object_agrees),
-    }
-
-
 def _spread(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
     """Root mean square of the residuals where the surfaces agree, and how long the tail of all that was seen is."""
     agree = torch.cat([groups.scene_agrees, groups.object_agrees], 1)
@@ -378,7 +318,7 @@ def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Gro
     H = 0.5 * (J * weights.double()[..., None]).mT @ J
     points = problem.held_out.object_samples.points.double()
     eye = torch.eye(7, dtype=points.dtype, device=points.device)
-    motion = torch.cat([_cross_matrix(points).mT, eye[:3, :3].expand(m, 3, 3), points[..., None]], -1)
+    motion = torch.cat([skew(points).mT, eye[:3, :3].expand(m, 3, 3), points[..., None]], -1)
     G = (motion.mT @ motion).mean(0)
     inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * eye))
     least: Tensor = torch.linalg.eigvalsh(inverse @ H @ inverse.mT)[:, :2]
@@ -392,13 +332,6 @@ def _about_origin(J: Tensor, t: Tensor) -> Tensor:
     turn = J[..., :3] + torch.linalg.cross(t.expand_as(shift), shift)
     growth = J[..., 6:] + (t * shift).sum(-1, keepdim=True)
     return torch.cat([turn, shift, growth], -1)
-
-
-def _cross_matrix(v: Tensor) -> Tensor:
-    """(..., 3, 3): what gives the cross product v x w when applied to w."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape, 3)
 
 
 def _share(part: Tensor, whole: Tensor, of_nothing: float = 0.0) -> Tensor:

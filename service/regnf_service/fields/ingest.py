@@ -10,11 +10,10 @@ from regnf_core.field_source import Role, assumed_role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
-from regnf_service.library import check_budget
-from regnf_service.problem import CLOSE, RETRY_LATER, Problem
+from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
-from regnf_state.records import CAMERAS, ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
+from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
 from regnf_state.room import delete_upload, original_key, settings_key
 
 
@@ -73,9 +72,6 @@ def function_of(description: UploadDescription) -> dict[str, Any]:
     return {name: value for name, value in description.non_default().items() if name != "label"}
 
 
-_OF_ROOM = frozenset({"QUOTA_FIELDS", "QUOTA_STORED_BYTES"})
-
-
 def check_room(services: Services, caller: str, sha256: str) -> int | None:
     """Refuse an upload before it comes if the caller has no room for one more field. Raises Problem.
 
@@ -84,11 +80,11 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
     known = held_field(services, caller, sha256)
     if known is not None:
         return room_for_bytes(services, caller, known)
-    check_workers(services, caller, CLOSE)
+    check_workers(services, caller)
     most = services.quota.fields
     while most is not None and services.records.stored(caller)[0] >= most:
         if not services.originals.free(caller):
-            raise Problem("QUOTA_FIELDS", headers=CLOSE)
+            raise Problem("QUOTA_STORED", "You have the maximum number of fields. Delete some.")
     return room_for_bytes(services, caller)
 
 
@@ -125,12 +121,12 @@ def _known(services: Services, reference: str) -> FieldRecord | None:
         return None
 
 
-def check_workers(services: Services, caller: str, headers: Mapping[str, str] | None = None) -> None:
-    """Refuse an import that the workers have no time for. Raises Problem QUOTA_IMPORTS, QUOTA_WORKER_SECONDS."""
-    check_budget(services, caller, headers)
+def check_workers(services: Services, caller: str) -> None:
+    """Refuse an import that the workers have no time for. Raises Problem QUOTA_ACTIVE_JOBS."""
     most = services.quota.imports
     if most is not None and services.records.importing(caller) >= most:
-        raise Problem("QUOTA_IMPORTS", headers={**(headers or {}), **RETRY_LATER})
+        detail = f"{most} of your imports wait or run. Wait for one to end."
+        raise Problem("QUOTA_ACTIVE_JOBS", detail, headers=RETRY_LATER)
 
 
 @dataclass(frozen=True)
@@ -146,8 +142,8 @@ async def store_upload(
 ) -> StoredUpload:
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
-    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_IMPORTS,
-    QUOTA_WORKER_SECONDS, and QuotaError.
+    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_ACTIVE_JOBS,
+    and QuotaError.
     """
     beside = beside or Beside()
     reference = reference_of(caller, received.sha256)
@@ -195,7 +191,8 @@ def _field(services: Services, reference: str, upload: Upload, received: Receive
     error = services.records.known_rejection(field)
     if error is None:
         return field
-    return replace(field, state="rejected", error=services.originals.keep_with(error, rejected=True))
+    until = services.originals.kept_until(error["reason"])
+    return replace(field, state="rejected", error=error, original_until=until)
 
 
 def _record(services: Services, field: FieldRecord, beside: Beside) -> StoredUpload:
@@ -222,10 +219,9 @@ def _create(services: Services, field: FieldRecord) -> tuple[FieldRecord, bool]:
         try:
             return services.records.create_field(field, quota)
         except QuotaError as error:
-            if error.reason in _OF_ROOM and services.originals.free(field.owner):
+            if error.reason == "QUOTA_STORED" and services.originals.free(field.owner):
                 continue
             delete_upload(services.blobs, field)
             if field.state != "rejected":
                 raise
-            error_alone = {name: value for name, value in (field.error or {}).items() if name != ORIGINAL_UNTIL}
-            return services.records.create_field(replace(field, error=error_alone))
+            return services.records.create_field(replace(field, original_until=None))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_service.concurrency import Claim, in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, keep_held, store_upload
-from regnf_service.fields.uploads import Received, Upload, closing, open_upload
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.fields.uploads import Upload
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.pieces import MOST_PIECES
 
@@ -34,39 +31,21 @@ class PieceUpload(Upload):
     """One piece. Only the file's beginning shows whether it can be a field."""
 
     def __init__(self, services: Services, claim: Claim, piece: PieceRange) -> None:
-        super().__init__(services.blobs, piece.length, claim)
+        super().__init__(services, claim, piece.length)
         self._recognized = piece.first != 0 or piece.length < HEAD_BYTES
 
 
-async def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange) -> None:
-    """Refuse a piece before it comes. Raises Problem UPLOAD_OFFSET_MISMATCH, INVALID_HEADER, TOO_MANY_PIECES."""
-    found = await in_thread(services.pieces.find, caller, sha256)
+def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange) -> None:
+    """Refuse a piece before it comes. Blocking. Raises Problem UPLOAD_NOT_FINISHED, INVALID_HEADER, TOO_MANY_PIECES."""
+    found = services.pieces.find(caller, sha256)
     if piece.first is None:
         return
     if piece.first != found.offset:
-        raise _at("UPLOAD_OFFSET_MISMATCH", found.offset)
+        raise _not_finished(found.offset)
     if found.total not in (0, piece.total):
-        raise Problem("INVALID_HEADER", f"The earlier pieces are of a file of {found.total} bytes.", headers=CLOSE)
+        raise Problem("INVALID_HEADER", f"The earlier pieces are of a file of {found.total} bytes.")
     if found.pieces >= MOST_PIECES:
-        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.", headers=CLOSE)
-
-
-@asynccontextmanager
-async def open_piece(services: Services, claim: Claim, piece: PieceRange) -> AsyncIterator[PieceUpload]:
-    """Takes one piece's bytes into the blob store."""
-    upload = PieceUpload(services, claim, piece)
-    async with closing(upload):
-        yield upload
-
-
-async def keep_piece(
-    services: Services, caller: str, sha256: str, piece: PieceRange, upload: Upload, received: Received
-) -> None:
-    """Store a piece that has arrived whole. Raises Problem UPLOAD_INCOMPLETE."""
-    if received.bytes != piece.length or piece.first is None:
-        raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.", headers=CLOSE)
-    await in_thread(services.pieces.make_room, caller, sha256, piece.first + received.bytes)
-    await upload.commit(services.pieces.key(caller, sha256, piece.first, piece.total))
+        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.")
 
 
 async def finish_pieces(services: Services, caller: str, sha256: str, beside: Beside | None = None) -> StoredUpload:
@@ -89,18 +68,18 @@ async def finish_pieces(services: Services, caller: str, sha256: str, beside: Be
 async def _assembled(services: Services, caller: str, sha256: str, beside: Beside | None) -> StoredUpload:
     found = await in_thread(services.pieces.find, caller, sha256)
     if not found.total or found.offset != found.total:
-        raise _at("UPLOAD_NOT_FINISHED", found.offset)
+        raise _not_finished(found.offset)
     room = await in_thread(check_room, services, caller, sha256)
     if room is not None:
         room += found.bytes  # the field takes their place
     with services.under_way.claim(caller, room, found.total) as claim:
-        async with open_upload(services, claim) as upload:
+        async with Upload(services, claim) as upload:
             blocks = services.pieces.blocks(caller, sha256)
             try:
                 while (block := await in_thread(next, blocks, b"")) != b"":
                     await upload.feed(block)
             except FileNotFoundError as error:  # they were deleted in between
-                raise _at("UPLOAD_NOT_FINISHED", 0) from error
+                raise _not_finished(0) from error
             received = await upload.finish()
             if received.sha256 != sha256:
                 await in_thread(services.pieces.drop, caller, sha256)
@@ -108,17 +87,5 @@ async def _assembled(services: Services, caller: str, sha256: str, beside: Besid
             return await store_upload(services, caller, upload, received, beside)
 
 
-async def arrived(services: Services, caller: str, sha256: str) -> int:
-    """How many bytes of an upload have arrived."""
-    return (await in_thread(services.pieces.find, caller, sha256)).offset
-
-
-async def held(services: Services, caller: str, sha256: str) -> StoredUpload | None:
-    """The field, if the caller has it already: then no piece is needed."""
-    known = await in_thread(held_field, services, caller, sha256)
-    return None if known is None else StoredUpload(known, created=False)
-
-
-def _at(reason: str, offset: int) -> Problem:
-    extra: dict[str, Any] = {"offset": offset}
-    return Problem(reason, extra=extra, headers={"Upload-Offset": str(offset), **CLOSE})
+def _not_finished(offset: int) -> Problem:
+    return Problem("UPLOAD_NOT_FINISHED", extra={"offset": offset}, headers={"Upload-Offset": str(offset)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
@@ -16,7 +15,7 @@ from regnf_state.room import original_key, settings_key
 def redescribe(services: Services, caller: str, known: FieldRecord, said: UploadDescription, label: str | None) -> bool:
     """Have the field imported as another function, or change its label alone. Whether it is imported.
 
-    Raises Problem FIELD_VALIDATING, FIELD_IN_USE, FIELD_BYTES_GONE, QUOTA_IMPORTS, QUOTA_WORKER_SECONDS, CONFLICT, and
+    Raises Problem FIELD_VALIDATING, FIELD_IN_USE, FIELD_BYTES_GONE, QUOTA_ACTIVE_JOBS, CONFLICT, and
     RecordsFullError.
     """
     function = function_of(said) | {
@@ -78,19 +77,13 @@ def _require_bytes_of(services: Services, field: FieldRecord) -> None:
 
 # The mesh and the picture of a field: a worker makes them when it has time, first those that somebody asks for.
 
-_AGAIN = {"Retry-After": "1"}
 
-
-def missing_view(services: Services, record: FieldRecord, reason: str) -> Problem:
-    """What is to be said of a view that is not there: ``reason``. Blocking.
+def missing_view(services: Services, record: FieldRecord) -> Problem:
+    """What is to be said of a picture or mesh that is not there. Blocking.
 
     With Retry-After while a worker is to make it, which it does sooner for this call.
     """
-    if record.state != "ready":
-        return Problem(reason)
-    if record.views is None:  # imported by an earlier release
-        with suppress(StaleAttemptError):
-            services.records.update_field(record.sha256, attempt=record.attempt, views="pending")
-    elif record.views == "pending":
-        services.records.draw_next(record.sha256)
-    return Problem(reason, headers=_AGAIN if record.views in (None, "pending") else None)
+    if record.views != "pending":
+        return Problem("FIELD_VIEW_NOT_FOUND")
+    services.records.draw_next(record.sha256)
+    return Problem("FIELD_VIEW_NOT_FOUND", headers={"Retry-After": "1"})

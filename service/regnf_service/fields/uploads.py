@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import AsyncIterator
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Self
 
 import anyio
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_service.concurrency import UPLOADS, Claim
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.blobs.base import BlobStore, BlobWriter
+from regnf_state.blobs.base import BlobWriter
 
 _BLOCK_BYTES = 1 << 20
 SETTINGS_BYTES = 64 << 20
 """The latent codes of a thousand shapes are the largest of settings."""
 _NAME_LENGTH = 100
+_NO_BYTES_HINT = "Check the path of the file: `curl --data-binary @room.ckpt` sends one."
 
 
 @dataclass(frozen=True)
@@ -35,22 +36,31 @@ class Received:
 
 
 class Upload:
-    """Takes an upload's bytes in order. Use ``open_upload``; ``commit`` gives the bytes their name."""
+    """Takes an upload's bytes in order; ``commit`` gives them their name. What has none when the context ends goes."""
 
     format: str | None = None
     """What the bytes seem to be, once enough of them have come."""
 
-    def __init__(self, blobs: BlobStore, limit: int, claim: Claim) -> None:
-        self._blobs = blobs
+    def __init__(self, services: Services, claim: Claim, limit: int | None = None) -> None:
+        self._blobs = services.blobs
         self._opened = ExitStack()
         self._writer: BlobWriter | None = None
         """From the first block on: an upload that never sends as much costs the store nothing."""
-        self._limit = limit
+        self._limit = services.settings.max_upload_bytes if limit is None else limit
         self._claim = claim
         self._hash = hashlib.sha256()
         self._bytes = 0
         self._pending = bytearray()
         self._recognized = False
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        # also when the request is cancelled: what was written must go
+        with anyio.CancelScope(shield=True):
+            if self._writer is not None:
+                await UPLOADS.run(self._opened.close)
 
     def begin(self, filename: str) -> None:
         """A part of a form has come. A field's name promises nothing."""
@@ -58,10 +68,10 @@ class Upload:
     async def feed(self, data: bytes | bytearray) -> None:
         """Take the next bytes.
 
-        Raises Problem UPLOAD_TOO_LARGE, QUOTA_STORED_BYTES, FIELD_NOT_RECOGNIZED as soon as the bytes show it.
+        Raises Problem UPLOAD_TOO_LARGE, QUOTA_STORED, FIELD_NOT_RECOGNIZED as soon as the bytes show it.
         """
         if self._bytes + len(self._pending) + len(data) > self._limit:
-            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.", headers=CLOSE)
+            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.")
         self._claim.arrive(len(data))
         self._pending += data
         if not self._recognized and len(self._pending) >= HEAD_BYTES:
@@ -70,9 +80,9 @@ class Upload:
             await self._flush()
 
     async def finish(self) -> Received:
-        """Write what is left. Raises Problem UPLOAD_EMPTY, FIELD_NOT_RECOGNIZED."""
+        """Write what is left. Raises Problem UPLOAD_INCOMPLETE, FIELD_NOT_RECOGNIZED."""
         if not self._bytes and not self._pending:
-            raise Problem("UPLOAD_EMPTY")
+            raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.", hint=_NO_BYTES_HINT)
         if not self._recognized:
             self._recognize()
         await self._flush()
@@ -84,17 +94,12 @@ class Upload:
         await UPLOADS.run(self._writer.commit, key)
         self._claim.end()
 
-    async def close(self) -> None:
-        """What has no name goes."""
-        if self._writer is not None:
-            await UPLOADS.run(self._opened.close)
-
     def _recognize(self) -> None:
         head = bytes(self._pending[:HEAD_BYTES])
         self.format = sniff_format(head)
         if self.format is None:
             _, sentence = explain_refusal(head)
-            raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.", headers=CLOSE)
+            raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.")
         self._recognized = True
 
     async def _flush(self) -> None:
@@ -110,10 +115,14 @@ class Upload:
 
 
 class SettingsUpload(Upload):
-    """A trainer's settings that come with a field: of any format, under a name that says something."""
+    """A trainer's settings that come with a field, and count as one upload with it: of any format, under a name that
+    says something."""
 
     filename = "settings"
     came = False
+
+    def __init__(self, services: Services, claim: Claim) -> None:
+        super().__init__(services, claim, settings_limit(services))
 
     def begin(self, filename: str) -> None:
         """The part has come."""
@@ -121,7 +130,7 @@ class SettingsUpload(Upload):
         self.filename = plain_name(filename) or self.filename
 
     async def received(self) -> ReceivedSettings | None:
-        """What came; None where nothing did. Raises Problem UPLOAD_EMPTY."""
+        """What came; None where nothing did. Raises Problem UPLOAD_INCOMPLETE."""
         return ReceivedSettings(self.filename, self, await self.finish()) if self.came else None
 
     def _recognize(self) -> None:
@@ -143,33 +152,6 @@ def plain_name(filename: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]", "_", name)[-_NAME_LENGTH:].lstrip(".")
 
 
-@asynccontextmanager
-async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]:
-    """A new upload into the blob store, within the settings' limits."""
-    upload = Upload(services.blobs, services.settings.max_upload_bytes, claim)
-    async with closing(upload):
-        yield upload
-
-
-@asynccontextmanager
-async def open_settings(services: Services, claim: Claim) -> AsyncIterator[SettingsUpload]:
-    """The settings that may come with an upload, which counts as one with them."""
-    upload = SettingsUpload(services.blobs, settings_limit(services), claim)
-    async with closing(upload):
-        yield upload
-
-
 def settings_limit(services: Services) -> int:
     """The most bytes of settings."""
     return min(SETTINGS_BYTES, services.settings.max_upload_bytes)
-
-
-@asynccontextmanager
-async def closing(upload: Upload) -> AsyncIterator[None]:
-    """What got no name within the context goes at its end."""
-    try:
-        yield
-    finally:
-        # also when the request is cancelled: what was written must go
-        with anyio.CancelScope(shield=True):
-            await upload.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import hashlib
 import json
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from regnf_core.texts import TextError, TextStream
@@ -16,7 +16,7 @@ from regnf_service.http.schemas.batches import BatchPair
 from regnf_service.http.schemas.library import MAX_SELECTED, LibraryFilter, LibraryReference, LibrarySelection
 from regnf_service.http.schemas.reading import read_model
 from regnf_service.http.schemas.registrations import RegisterRequest
-from regnf_service.problem import CLOSE, MAX_ERRORS, Problem
+from regnf_service.problem import MAX_ERRORS, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import sha256_of
 from regnf_state.record_store import LOOKED_AT, LibraryEntry, Position
@@ -84,7 +84,7 @@ async def lines_of(chunks: AsyncIterator[bytes]) -> AsyncIterator[list[TextLine]
         if lines := reader.feed(text.feed(b"", final=True)) + reader.finish():
             yield lines
     except TextError as error:
-        raise Problem("MALFORMED_JSON", f"The body is {error}.", hint="Save it as UTF-8.", headers=CLOSE) from error
+        raise Problem("MALFORMED_JSON", f"The body is {error}.", hint="Save it as UTF-8.") from error
 
 
 # A registration request whose fields are named, by their digests or as entries of the caller's library.
@@ -184,23 +184,7 @@ def asked_by_reference(library: Library, spec: RegisterRequest) -> tuple[Registr
 
 
 _ID_DIGITS = 32
-_LINES_AT_ONCE = 50
-_BYTES_AT_ONCE = 64 * 1024
 Read = tuple[Line, TextLine, BatchPair | None]
-
-
-def portions(lines: Iterable[TextLine]) -> Iterator[list[TextLine]]:
-    """A few at a time, so that other callers' requests are read in between."""
-    few: list[TextLine] = []
-    size = 0
-    for line in lines:
-        few.append(line)
-        size += len(line.text or b"")
-        if len(few) == _LINES_AT_ONCE or size >= _BYTES_AT_ONCE:
-            yield few
-            few, size = [], 0
-    if few:
-        yield few
 
 
 class Intake:
@@ -216,12 +200,12 @@ class Intake:
         self._identity = hashlib.sha256(f"batch {ENGINE_REVISION} {caller}\n".encode())
 
     def read(self, texts: Sequence[TextLine]) -> list[Read]:
-        """These lines as requests; with an error those that are none. Raises Problem TOO_MANY_PAIRS."""
+        """These lines as requests; with an error those that are none. Raises Problem REQUEST_TOO_LARGE."""
         most = self._services.settings.max_batch_pairs
         self._count += len(texts)
         if self._count > most:
             extra = {"fitting_lines": most}
-            raise Problem("TOO_MANY_PAIRS", f"A batch has at most {most} lines.", headers=CLOSE, extra=extra)
+            raise Problem("REQUEST_TOO_LARGE", f"A batch has at most {most} lines.", extra=extra)
         return [self._read(text) for text in texts]
 
     def take(self, read: Sequence[Read]) -> None:

@@ -1,30 +1,24 @@
-"""Reading a request's body ourselves: counted, timed, and never more than was allowed."""
+"""Reading a request's body ourselves: counted, and never more than was allowed."""
 
 from __future__ import annotations
 
-import asyncio
 import email.message
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack
 from typing import Annotated, Protocol, TypeVar
 
 from fastapi import Depends, Query
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
-from starlette.types import Message
 
 from regnf_service.concurrency import LOOKS, PARSING, in_thread, pause
-from regnf_service.fields.ingest import StoredUpload, check_room
-from regnf_service.fields.piecewise import PieceRange, arrived, check_piece, finish_pieces, held, keep_piece, open_piece
 from regnf_service.http.middleware import fair_key
 from regnf_service.http.schemas.reading import read_model
 from regnf_service.http.strict_json import MOST_VALUES
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.settings import Settings
 
 # What routes are given: the services, and the small readings of a request that several of them share.
 #
@@ -57,62 +51,20 @@ LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return 
 PageTokenQuery = Annotated[str | None, Query(max_length=200, description="`next_page_token` of the page before.")]
 
 
-# How fast a client sends a body, and the time that it has for it.
-
-
-class Pace:
-    """Of one body. Only time spent waiting for the client counts."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._stall_s = settings.upload_stall_s
-        self._bytes_per_s = settings.min_bytes_per_s
-        self._received = 0
-        self._waited = 0.0
-        self._since: float | None = None
-        self._limit: asyncio.Timeout | None = None
-        self._is_cut = False
-
-    def behind_s(self) -> float:
-        """By how much the body is later than the slowest that is taken for long; negative: earlier."""
-        waiting = 0.0 if self._since is None else time.monotonic() - self._since
-        return self._waited + waiting - self._received / self._bytes_per_s
-
-    def cut(self) -> None:
-        """End it as if it had stalled."""
-        self._is_cut = True
-        if self._limit is not None and not self._limit.expired():
-            self._limit.reschedule(asyncio.get_running_loop().time())
-
-    async def next(self, request: Request) -> Message:
-        """What comes next. Raises Problem REQUEST_STALLED when nothing comes for long, or too little."""
-        left = 0.0 if self._is_cut else min(self._stall_s, max(0.0, self._stall_s - self.behind_s()))
-        self._since = time.monotonic()
-        try:
-            async with asyncio.timeout(left) as self._limit:
-                message = await request.receive()
-        except TimeoutError as error:
-            raise Problem("REQUEST_STALLED", headers=CLOSE) from error
-        finally:
-            self._waited += time.monotonic() - self._since
-            self._since = self._limit = None
-        self._received += len(message.get("body", b""))
-        return message
-
-
 def declared_length(request: Request, besides: int = 0) -> int | None:
     """The Content-Length less what may come ``besides`` files, None for a chunked body. Raises INVALID_HEADER."""
     text = request.headers.get("content-length")
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and len(text) <= 19):
-        raise Problem("INVALID_HEADER", "Content-Length is not a number of bytes.", headers=CLOSE)
+        raise Problem("INVALID_HEADER", "Content-Length is not a number of bytes.")
     return max(0, int(text) - besides)
 
 
 def refuse_encoding(request: Request) -> None:
     """Compressed bodies are not taken: their size would be a guess. Raises Problem UNSUPPORTED_MEDIA_TYPE."""
     if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send the body without Content-Encoding.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send the body without Content-Encoding.")
 
 
 def media_type(request: Request) -> str:
@@ -120,30 +72,30 @@ def media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def chunks(request: Request, limit: int, pace: Pace, too_large: str = "UPLOAD_TOO_LARGE") -> AsyncIterator[bytes]:
+async def chunks(request: Request, limit: int, too_large: str = "UPLOAD_TOO_LARGE") -> AsyncIterator[bytes]:
     """The body as it arrives, at most ``limit`` bytes of it.
 
-    Raises Problem: ``too_large`` by header or by count, REQUEST_STALLED when its ``pace`` is too slow,
-    UPLOAD_INCOMPLETE when the client leaves or the count is not what it declared.
+    Raises Problem: ``too_large`` by header or by count, UPLOAD_INCOMPLETE when the client leaves or the count is not
+    what it declared. How slowly a body may come is for the proxy in front to say.
     """
     declared = declared_length(request)
     if declared is not None and declared > limit:
-        raise Problem(too_large, f"At most {limit} bytes are taken.", headers=CLOSE)
+        raise Problem(too_large, f"At most {limit} bytes are taken.")
     received = 0
     more = True
     while more:
-        message = await pace.next(request)
+        message = await request.receive()
         if message["type"] == "http.disconnect":
-            raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
+            raise Problem("UPLOAD_INCOMPLETE")
         data: bytes = message.get("body", b"")
         received += len(data)
         if received > limit:
-            raise Problem(too_large, f"At most {limit} bytes are taken.", headers=CLOSE)
+            raise Problem(too_large, f"At most {limit} bytes are taken.")
         if data:
             yield data
         more = message.get("more_body", False)
     if declared is not None and received != declared:
-        raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
+        raise Problem("UPLOAD_INCOMPLETE")
 
 
 # Reading JSON bodies: large ones beside the event loop, so that other requests go on meanwhile.
@@ -159,15 +111,14 @@ async def read_json(
     """The body of a request as ``model``.
 
     A large one counts among its caller's uploads until it is read: what a caller has in memory is bounded by their
-    number. Raises Problem as ``read_model`` and ``body.chunks``, REQUEST_TOO_LARGE, TOO_MANY_UPLOADS.
+    number. Raises Problem as ``read_model`` and ``body.chunks``, REQUEST_TOO_LARGE, TOO_MANY_REQUESTS_AT_ONCE.
     """
     refuse_encoding(request)
-    pace = Pace(services.settings)
     text = bytearray()
-    async with AsyncExitStack() as place:
-        async for data in chunks(request, services.settings.max_request_bytes, pace, "REQUEST_TOO_LARGE"):
+    with ExitStack() as place:
+        async for data in chunks(request, services.settings.max_request_bytes, "REQUEST_TOO_LARGE"):
             if len(text) <= _SMALL_BYTES < len(text) + len(data):
-                await place.enter_async_context(services.uploads.held(fair_key(request.scope, caller), pace))
+                place.enter_context(services.uploads.held(fair_key(request.scope, caller)))
             text += data
         return await read_text(model, bytes(text), most_values)
 
@@ -177,60 +128,6 @@ async def read_text(model: type[_Model], text: bytes, most_values: int = MOST_VA
     if len(text) <= _SMALL_BYTES:
         return read_model(model, text, _REASON, most_values, what)
     return await PARSING.run(read_model, model, text, _REASON, most_values, what)
-
-
-# One request of an upload in pieces: the piece is read and kept, and the field made once all are here.
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One piece of a caller's upload. digest: of the piece, where it was announced · complete: whether the last piece
-    makes the field."""
-
-    caller: str
-    sha256: str
-    range: PieceRange
-    digest: str | None
-    complete: bool
-
-
-async def receive_piece(request: Request, services: Services, piece: Piece, pace: Pace) -> StoredUpload | int:
-    """The field, once all pieces are here; before that how many bytes have arrived.
-
-    Raises Problem: what ``check_room``, ``check_piece``, ``keep_piece`` and ``finish_pieces`` raise, DIGEST_MISMATCH.
-    """
-    room = await in_thread(check_room, services, piece.caller, piece.sha256)
-    known = await held(services, piece.caller, piece.sha256)
-    if known is None:
-        await check_piece(services, piece.caller, piece.sha256, piece.range)
-    await _receive(request, services, piece, room, pace, keep=known is None)
-    if known is not None:
-        return known
-    offset = await arrived(services, piece.caller, piece.sha256)
-    if piece.complete and offset == piece.range.total:
-        return await finish_pieces(services, piece.caller, piece.sha256)
-    return offset
-
-
-async def _receive(
-    request: Request, services: Services, piece: Piece, room: int | None, pace: Pace, keep: bool
-) -> None:
-    """Read the body to its end, and keep it if it is a piece that is wanted."""
-    refuse_encoding(request)
-    data = chunks(request, piece.range.length, pace, too_large="INVALID_HEADER")  # more than Content-Range says
-    if piece.range.first is None:
-        async for _ in data:
-            pass
-        return
-    with services.under_way.claim(piece.caller, room, piece.range.length) as claim:
-        async with open_piece(services, claim, piece.range) as upload:
-            async for block in data:
-                await upload.feed(block)
-            received = await upload.finish()
-            if piece.digest not in (None, received.sha256):
-                raise Problem("DIGEST_MISMATCH")
-            if keep:
-                await keep_piece(services, piece.caller, piece.sha256, piece.range, upload, received)
 
 
 # Holding an answer back until there is news, without holding a thread.
@@ -283,8 +180,6 @@ class Sink(Protocol):
 
 
 class _Part:
-    """One part: its name, and its text if it is no file."""
-
     def __init__(self) -> None:
         self.headers: dict[str, str] = {}
         self.name = ""
@@ -361,7 +256,7 @@ def boundary_of(request: Request) -> str:
     """The boundary that the Content-Type announces. Raises Problem MALFORMED_MULTIPART."""
     boundary = _parameter(request.headers.get("content-type", ""), "boundary")
     if not boundary or not boundary.isascii() or len(boundary) > 70:
-        raise Problem("MALFORMED_MULTIPART", "The Content-Type names no usable boundary.", headers=CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "The Content-Type names no usable boundary.")
     return boundary
 
 
@@ -376,7 +271,7 @@ async def read_parts(
     A file part that came appears in the answer too, empty. Looking for boundaries takes long where there is nearly one
     in every line, so it is done in a thread, a piece at a time.
 
-    Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, REQUEST_TOO_LARGE, and what the sinks raise.
+    Raises Problem: MALFORMED_MULTIPART, REQUEST_TOO_LARGE, and what the sinks raise.
     """
     collector = _Collector(boundary)
     parts: dict[str, _Part] = {}
@@ -384,7 +279,7 @@ async def read_parts(
         try:
             events = await PARSING.run(collector.feed, data)
         except FormParserError as error:
-            raise Problem("MALFORMED_MULTIPART", headers=CLOSE) from error
+            raise Problem("MALFORMED_MULTIPART") from error
         for part, content in events:
             if content is None:
                 _admit(part, parts, files, texts)
@@ -393,17 +288,17 @@ async def read_parts(
             else:
                 _add_text(part, content, texts[part.name])
     if not collector.ended:
-        raise Problem("MALFORMED_MULTIPART", "The body ends before its closing boundary.", headers=CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "The body ends before its closing boundary.")
     return {name: bytes(part.text) for name, part in parts.items()}
 
 
 def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], texts: Mapping[str, int]) -> None:
     if part.name not in files and part.name not in texts:
-        raise Problem("UNKNOWN_PART", f"Known parts: {', '.join([*files, *texts])}.", headers=CLOSE)
+        raise Problem("MALFORMED_MULTIPART", f"Known parts: {', '.join([*files, *texts])}.")
     if part.name in parts:
-        raise Problem("MALFORMED_MULTIPART", "Two parts bear the same name.", headers=CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "Two parts bear the same name.")
     if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):
-        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.", headers=CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.")
     parts[part.name] = part
     if part.name in files:
         files[part.name].begin(part.filename)
@@ -411,5 +306,5 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
 
 def _add_text(part: _Part, content: bytearray, limit: int) -> None:
     if len(part.text) + len(content) > limit:
-        raise Problem("REQUEST_TOO_LARGE", f"The part {part.name} takes at most {limit} bytes.", headers=CLOSE)
+        raise Problem("REQUEST_TOO_LARGE", f"The part {part.name} takes at most {limit} bytes.")
     part.text += content

@@ -26,7 +26,6 @@ Where tokens are configured every call but `/healthz`, `/static`, `/docs` and a 
 `Authorization: Bearer`, and is refused with 401 `UNAUTHENTICATED` otherwise. A token names a caller; another caller's
 fields and jobs are 404.
 A service that limits calls answers 429 `RATE_LIMITED` with `Retry-After` at any address that needs a token,
-429 `TOO_MANY_WRITES` to a caller that posts, changes or deletes faster than it allows,
 and any service 429 `TOO_MANY_REQUESTS_AT_ONCE` to a caller that has too many requests in progress.
 
 Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.

@@ -18,12 +18,11 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from regnf_service.http.problems import problem_response
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_state.settings import Settings
 
 _NAME = r"[a-z0-9_](?:[a-z0-9_-]{0,62})(?:\.[a-z0-9_](?:[a-z0-9_-]{0,62}))*"
 _AUTHORITY = re.compile(rf"(?P<host>{_NAME}|\[[0-9a-f:.]{{2,45}}\])(?::(?P<port>[0-9]{{1,5}}))?")
-_ENTRY = re.compile(rf"(?P<wild>\*\.)?(?P<host>{_NAME}|\[[0-9a-f:.]{{2,45}}\])(?::(?P<port>[0-9]{{1,5}}))?")
 _ORIGIN = re.compile(r"(?P<scheme>https?)://(?P<authority>[^/?#@\s]+)")
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 _LARGEST_PORT = 65535
@@ -48,15 +47,13 @@ class Authority:
 def parse_authority(text: str) -> Authority | None:
     """What a `Host` header says; None for whatever is not exactly a host with or without a port."""
     match = _AUTHORITY.fullmatch(text.lower()) if len(text) <= _LONGEST and text.isascii() else None
-    return _authority(match) if match is not None else None
-
-
-def _authority(match: re.Match[str]) -> Authority | None:
-    host, port = match["host"], None if match["port"] is None else int(match["port"])
-    if port is not None and not 0 < port <= _LARGEST_PORT:
+    if match is None:
         return None
+    host, port = match["host"], None if match["port"] is None else int(match["port"])
     address = address_of(host.strip("[]"))
-    if host.startswith("[") and (address is None or ":" not in host):
+    if (port is not None and not 0 < port <= _LARGEST_PORT) or (
+        host.startswith("[") and (address is None or ":" not in host)
+    ):
         return None
     return Authority(host if address is None else str(address), port)
 
@@ -91,11 +88,10 @@ class AllowedHosts:
         self._exact: set[Authority] = set()
         self._domains: set[tuple[str, int | None]] = set()
         for entry in listed - {ANY}:
-            match = _ENTRY.fullmatch(entry)
-            found = _authority(match) if match is not None else None
-            if match is None or found is None:
+            found = parse_authority(entry.removeprefix("*."))
+            if found is None:
                 raise HostsError("REGNF_ALLOWED_HOSTS: an entry names no host; write `name`, `name:port` or `*.domain`")
-            if match["wild"]:
+            if entry.startswith("*."):
                 self._domains.add((f".{found.host}", found.port))
             else:
                 self._exact.add(found)
@@ -207,14 +203,17 @@ class OriginGate:
 
     def _refusal(self, scope: Scope) -> Problem | None:
         headers = Headers(scope=scope)
+        if "transfer-encoding" in headers and "content-length" in headers:
+            # a proxy in front may see the body's end at another place than this server
+            return Problem("INVALID_HEADER", "The body has two lengths.", headers={"Connection": "close"})
         given = headers.getlist("host")
         host = parse_authority(given[0]) if len(given) == 1 and scope["path"].startswith("/") else None
         arrived_on = (scope.get("server") or ("",))[0] or ""
         if host is None or not self._hosts.knows(host, arrived_on):
-            return Problem("HOST_NOT_ALLOWED", headers=CLOSE)
+            return Problem("HOST_NOT_ALLOWED")
         if self._is_named(headers) or _is_visit(scope, headers) or not _is_foreign(headers, host):
             return None
-        return Problem("ORIGIN_NOT_ALLOWED", headers=CLOSE)
+        return Problem("ORIGIN_NOT_ALLOWED")
 
     def _is_named(self, headers: Headers) -> bool:
         """Whether the page behind the request is of a site that the operator has named (``origins``)."""

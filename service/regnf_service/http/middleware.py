@@ -3,84 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-import heapq
 import ipaddress
 import logging
-import math
 import re
 import time
 import uuid
-from collections import OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from itertools import count
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from regnf_service.concurrency import Slots, whose
-from regnf_service.http.connections import site_of
 from regnf_service.http.problems import OPEN_PATHS, problem_response, secure
 from regnf_service.http.query import is_home_page
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
-
-# Buckets of tokens in the memory of one process: how often each of many may do something.
-
-_MOST = 4096
-
-
-class Buckets:
-    """A bucket of ``burst`` for each, which fills by ``per_s``. For one thread.
-
-    No more than a few thousand are kept. Then the one goes that was asked longest ago: its next is full.
-    """
-
-    def __init__(self, per_s: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self._per_s = per_s
-        self._burst = burst
-        self._clock = clock
-        self._held: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        """What is left in the bucket, and when that was so; the one that was asked longest ago comes first."""
-
-    def __len__(self) -> int:
-        return len(self._held)
-
-    def take(self, who: str) -> float:
-        """Take one out: 0.0, or nothing was taken and these seconds pass until there is one."""
-        now = self._clock()
-        left, at = self._held.pop(who, (self._burst, now))
-        left = min(self._burst, left + (now - at) * self._per_s)
-        wait_s = 0.0 if left >= 1 else (1 - left) / self._per_s
-        self._held[who] = (left if wait_s else left - 1, now)
-        if len(self._held) > _MOST:
-            self._held.popitem(last=False)
-        return wait_s
-
-
-# How many wrong tokens an address may send: a bucket for each in memory, and no more buckets than a few thousand.
-#
-# A right token is always taken, whatever else its address has sent: behind a proxy all callers share one, and a
-# guesser must not lock them out. Hence this does not keep guesses from being looked at. It answers them with 429 and
-# ends their connections. That tokens cannot be guessed is due to their length.
-
-_BURST = 20.0
-_PER_S = 0.2
-
-
-class WrongTokens:
-    """For one process."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._sites = Buckets(_PER_S, _BURST, clock)
-        self.count = 0
-
-    def wait_s(self, scope: Scope) -> int:
-        """Count a wrong token of this request: 0, or the seconds that its sender should wait."""
-        self.count += 1
-        return math.ceil(self._sites.take(site_of((scope.get("client") or ("",))[0])))
-
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -91,10 +31,14 @@ _NO_TOKENS = "Beyond loopback this service answers with tokens only, and none is
 
 
 class RequestContext:
-    """Gives each request its id, the caller's own if it is well formed, and writes it on every answer."""
+    """Gives each request its id, the caller's own if it is well formed, and writes it on every answer.
 
-    def __init__(self, app: ASGIApp) -> None:
+    ``count`` is told of each: its scope, status, seconds until the answer began, and bytes of its body.
+    """
+
+    def __init__(self, app: ASGIApp, count: Callable[[Scope, int, float, int], None]) -> None:
         self._app = app
+        self._count = count
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -103,12 +47,19 @@ class RequestContext:
         given = Headers(scope=scope).get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         scope.setdefault("state", {})["request_id"] = request_id
-        began, status = time.perf_counter(), 500
+        began, status, received = time.perf_counter(), 500, 0
+        answered: float | None = None
+
+        async def receive_counted() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            return message
 
         async def send_marked(message: Message) -> None:
-            nonlocal status
+            nonlocal status, answered
             if message["type"] == "http.response.start":
-                status = message["status"]
+                status, answered = message["status"], time.perf_counter()
                 headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = request_id
                 secure(headers)
@@ -116,9 +67,11 @@ class RequestContext:
 
         with log_context(request_id=request_id):
             try:
-                await self._app(scope, receive, send_marked)
+                await self._app(scope, receive_counted, send_marked)
             finally:
-                _log_access(scope, status, time.perf_counter() - began)
+                ended = time.perf_counter()
+                self._count(scope, status, (answered or ended) - began, received)
+                _log_access(scope, status, ended - began)
 
 
 def _log_access(scope: Scope, status: int, seconds: float) -> None:
@@ -152,7 +105,6 @@ def is_open(scope: Scope) -> bool:
 
 
 def _came_from_outside(scope: Scope) -> bool:
-    """Whether the connection arrived on an address that other machines reach. Names and Unix sockets are not such."""
     try:
         address = ipaddress.ip_address((scope.get("server") or ("",))[0] or "")
     except ValueError:
@@ -172,7 +124,6 @@ class TokenGate:
         self._app = app
         self._needs_token = needs_token
         self._allow_unauthenticated = allow_unauthenticated
-        self._wrong = WrongTokens()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -185,27 +136,20 @@ class TokenGate:
         else:
             known = self._allow_unauthenticated or not _came_from_outside(scope)
         scope["state"]["caller"] = caller
-        problem = None if known or is_open(scope) else self._refusal(scope)
         with log_context(caller=caller):
-            if problem is not None:
-                await problem_response(problem, scope)(scope, receive, send)
-            else:
+            if known or is_open(scope):
                 await self._app(scope, receive, send)
-
-    def _refusal(self, scope: Scope) -> Problem:
-        if self._needs_token and "authorization" in Headers(scope=scope) and (wait := self._wrong.wait_s(scope)):
-            return Problem("TOO_MANY_WRONG_TOKENS", headers={"Retry-After": str(wait)} | CLOSE)
-        return Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)
+            else:
+                problem = Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)
+                await problem_response(problem, scope)(scope, receive, send)
 
 
 # In which order requests begin when more come in than can be answered at once, and how many of a caller go on.
 #
-# A few begin in each turn of the event loop. Callers take turns. Of one caller the connection goes first that was
-# answered longest ago: who asks now and then is not behind connections that ask without a pause, or are made anew.
+# A few begin in each turn of the event loop, and callers take turns.
 
 AT_ONCE = 4
 """In one turn of the event loop: a turn in which thousands of slow clients are read takes milliseconds."""
-_Waiting = list[tuple[float, int, asyncio.Future[None]]]
 
 
 def fair_key(scope: Scope, caller: str) -> str:
@@ -213,33 +157,32 @@ def fair_key(scope: Scope, caller: str) -> str:
 
     A caller's name has no space in it, so that no caller is taken for an address.
     """
-    return caller if caller != ANONYMOUS else f"{ANONYMOUS} {site_of((scope.get('client') or ('',))[0])}"
+    return caller if caller != ANONYMOUS else f"{ANONYMOUS} {(scope.get('client') or ('',))[0]}"
 
 
 class Turns:
     """For one event loop."""
 
     def __init__(self) -> None:
-        self._waiting: OrderedDict[str, _Waiting] = OrderedDict()
-        self._numbers = count()
+        self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
         self._is_taken = False
 
-    async def come(self, who: str, quiet_since: float) -> None:
-        """Return when it is the turn of a connection of ``who`` that has been quiet since that time."""
+    async def come(self, who: str) -> None:
+        """Return when it is the turn of ``who``."""
         loop = asyncio.get_running_loop()
         if not self._is_taken:
             self._is_taken = True
             loop.call_soon(self._next)
             return
         turn = loop.create_future()
-        heapq.heappush(self._waiting.setdefault(who, []), (quiet_since, next(self._numbers), turn))
+        self._waiting.setdefault(who, deque()).append(turn)
         await turn
 
     def _next(self) -> None:
         begun = 0
         while self._waiting and begun < AT_ONCE:
             who, waiting = self._waiting.popitem(last=False)
-            _, _, turn = heapq.heappop(waiting)
+            turn = waiting.popleft()
             if waiting:
                 self._waiting[who] = waiting
             if not turn.done():
@@ -264,48 +207,85 @@ class TurnGate:
             state = scope.setdefault("state", {})
             owner = caller_of(self._callers, Headers(scope=scope).get("authorization", ""))
             state["owner"] = owner
-            connection = state.get("connection")  # the server's own; another server tells nothing
-            quiet_since = asyncio.get_running_loop().time() if connection is None else connection.quiet_since
             who = fair_key(scope, owner or ANONYMOUS)
             whose.set(who)
-            await self._turns.come(who, quiet_since)
+            await self._turns.come(who)
         await self._app(scope, receive, send)
 
 
+_BLOCK_BYTES = 64 * 1024
+"""Of an answer, that is handed to the connection at once."""
+_MOST_UNREAD = 16 * 1024 * 1024
+"""Bytes of answers of one caller that wait to be read, blocks aside that the connections have already."""
+
+
 class RequestGate:
-    """Refuses the requests of a caller that has ``slots`` of them in progress, before any of them waits for a thread.
+    """Refuses the requests of a caller that has ``slots`` of them in progress, before any of them waits for a thread,
+    and the answers to a caller that leaves very many unread. What is answered is sent in blocks: the server takes the
+    next one when its client has read enough, so a connection holds no more than a block or two.
 
-    Each uses a connection that cannot be closed for others.
-
-    Where no token is asked for, an address counts as a caller. What needs no token elsewhere is not counted.
+    Where no token is asked for, an address counts as a caller. The slots are not for what needs no token elsewhere.
     """
 
     def __init__(self, app: ASGIApp, slots: Slots) -> None:
         self._app = app
         self._slots = slots
+        self._unread: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or is_open(scope):
+        if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         who = fair_key(scope, scope["state"]["caller"])
-        try:
-            self._slots.take(who)
-        except Problem as problem:
-            await problem_response(problem, scope)(scope, receive, send)
-            return
-        held = [who]
+        held: list[str] = []
+        if not is_open(scope):
+            try:
+                self._slots.take(who)
+            except Problem as problem:
+                await problem_response(problem, scope)(scope, receive, send)
+                return
+            held.append(who)
+        refused = False
 
         def free() -> None:
             while held:
                 self._slots.free(held.pop())
 
-        async def send_last(message: Message) -> None:
+        async def send_in_blocks(message: Message) -> None:
+            nonlocal refused
+            if message["type"] == "http.response.start" and self._unread[who] > _MOST_UNREAD:
+                refused = True
+                detail = "Too much of what was answered waits to be read. Read it, then repeat."
+                problem = Problem("TOO_MANY_REQUESTS_AT_ONCE", detail, headers=RETRY_LATER)
+                await problem_response(problem, scope)(scope, receive, send)
+            if refused:
+                return
             if message["type"] == "http.response.body" and not message.get("more_body", False):
                 free()  # whether its client reads the answer is not the caller's next request's concern
-            await send(message)
+            if message.get("body"):
+                await self._send_body(who, message, send)
+            else:
+                await send(message)
 
         try:
-            await self._app(scope, receive, send_last)
+            await self._app(scope, receive, send_in_blocks)
         finally:
             free()
+
+    async def _send_body(self, who: str, message: Message, send: Send) -> None:
+        body: bytes = message["body"]
+        left = len(body)
+        self._unread[who] += left
+        try:
+            for begin in range(0, len(body), _BLOCK_BYTES):
+                block = body[begin : begin + _BLOCK_BYTES]
+                more = message.get("more_body", False) or len(block) < left
+                await send({"type": message["type"], "body": block, "more_body": more})
+                self._unread[who] -= len(block)
+                left -= len(block)
+                if left:
+                    await asyncio.sleep(0)  # so that a connection that is lost is noticed before the next block
+        finally:
+            self._unread[who] -= left
+            if not self._unread[who]:
+                del self._unread[who]

@@ -71,6 +71,7 @@ SECURITY_HEADERS = {**_FIXED, **_UNLESS_SAID}
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
+_RECORDS_FULL = "The record store keeps its last room for what goes on. Delete jobs, or retry later."
 _STATUS_REASONS = {401: "UNAUTHENTICATED", 404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: "REQUEST_TOO_LARGE"}
 
 
@@ -90,18 +91,16 @@ def problem_of(error: Exception) -> Problem:
             return Problem(error.reason, headers=RETRY_LATER if REASONS[error.reason].status == 429 else None)
         case NameTakenError():
             return Problem(error.reason)
-        case RecordsFullError():
-            return Problem(error.reason, headers=RETRY_LATER)
+        case RecordsFullError() | OutOfMemoryError():
+            return Problem("STORAGE_FULL", _RECORDS_FULL, headers=RETRY_LATER)
         case UnreadableRecordError():
             return Problem(error.reason, headers={"Retry-After": "60"})
         case RecordError():
             return Problem("CONFLICT")
         case RegnfError():
             return Problem(error.reason if error.reason in REASONS else "INVALID_REQUEST", str(error), hint=error.hint)
-        case OutOfMemoryError():
-            return Problem("RECORDS_FULL", headers=RETRY_LATER)
         case RedisError():
-            return Problem("STORE_UNAVAILABLE", headers=RETRY_LATER)
+            return Problem("STORAGE_UNAVAILABLE", "The record store does not answer. Retry later.", headers=RETRY_LATER)
         case StorageFullError():
             return Problem("STORAGE_FULL", headers=RETRY_LATER)
         case FileNotFoundError():  # the store answers: what was there a moment ago has been deleted
@@ -127,6 +126,8 @@ def problem_response(problem: Problem, scope: Mapping[str, Any]) -> JSONResponse
     headers = SECURITY_HEADERS | problem.headers  # an internal error is answered outside of the middleware
     if request_id is not None:
         headers["X-Request-ID"] = request_id
+    if any(name == b"expect" for name, _ in scope.get("headers", ())):
+        headers["Connection"] = "close"  # nobody knows whether the body still comes
     instance = json_instance(scope.get("path", ""))
     return JSONResponse(
         problem.document(instance, request_id), status_code=problem.status, headers=headers, media_type=MEDIA_TYPE
@@ -147,7 +148,7 @@ async def _answer(request: Request, error: Exception) -> JSONResponse:
         logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error, extra=told)
     elif problem.reason.startswith("QUOTA_"):
         request.app.state.metrics.quota_refusals.labels(problem.reason).inc()
-    elif problem.reason == "STORE_UNAVAILABLE":
+    elif isinstance(error, RedisError) and problem.status == 503:
         request.app.state.metrics.redis_errors.inc()
     if problem.reason != "INTERNAL" and problem.status >= 500:
         logger.warning("%s request_id=%s: %s", problem.reason, request_id, type(error).__name__)

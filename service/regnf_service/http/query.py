@@ -14,7 +14,7 @@ from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import Scope
 
-from regnf_service.problem import CLOSE, Problem, json_pointer
+from regnf_service.problem import Problem, json_pointer
 from regnf_state.record_store import Position
 
 _MOST_PARAMETERS = 32
@@ -23,7 +23,7 @@ _MOST_PARAMETERS = 32
 async def refuse_unknown_parameters(request: Request) -> None:
     """Raises Problem INVALID_QUERY for parameters that the route does not take, or takes once and was given twice."""
     if request.scope["query_string"].count(b"&") >= _MOST_PARAMETERS:
-        raise Problem("INVALID_QUERY", f"At most {_MOST_PARAMETERS} parameters are taken.", headers=CLOSE)
+        raise Problem("INVALID_QUERY", f"At most {_MOST_PARAMETERS} parameters are taken.")
     route = request.scope["route"]
     if not request.query_params or not isinstance(route, APIRoute):
         return
@@ -36,9 +36,7 @@ async def refuse_unknown_parameters(request: Request) -> None:
         if name not in known or count > 1
     ]
     if errors:
-        raise Problem(
-            "INVALID_QUERY", errors=errors, headers=CLOSE if request.method in ("POST", "PUT", "PATCH") else None
-        )
+        raise Problem("INVALID_QUERY", errors=errors)
 
 
 # Page tokens: where the look for the page before ended. They carry no secret and open nothing, so none is signed.

@@ -20,7 +20,7 @@ from starlette.types import Receive, Scope, Send
 
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.piecewise import PieceRange
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_state.blobs.base import BlobStore
 from regnf_state.records import FieldRecord
 
@@ -84,65 +84,29 @@ IfNoneMatchDep = Annotated[IfNoneMatch, Depends(_of_request)]
 _ONE_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
-@dataclass(frozen=True)
-class ByteRange:
-    """``length`` bytes from ``start`` on."""
-
-    start: int
-    length: int
+RangeHeader = Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")]
+IfRangeHeader = Annotated[str | None, Header(description="The ETag that the range belongs to.")]
 
 
-def parse_range(header: str | None, size: int) -> ByteRange | None:
-    """The range asked for, None for the whole: no header, a malformed one, or more ranges than one.
+def parse_range(header: str | None, size: int) -> range | None:
+    """The places of the bytes asked for, None for all: no header, a malformed one, or more ranges than one.
 
     Raises Problem RANGE_NOT_SATISFIABLE.
     """
     match = _ONE_RANGE.fullmatch(header.strip()) if header else None
-    if match is None or match.group(1) == match.group(2) == "":
+    if match is None or match[1] == match[2] == "" or (match[1] and match[2] and int(match[2]) < int(match[1])):
         return None
-    first, last = match.groups()
-    if first == "":
-        start, end = max(0, size - int(last)), size
-        satisfiable = int(last) > 0 and size > 0
-    else:
-        start = int(first)
-        end = min(int(last) + 1, size) if last else size
-        if last and int(last) < start:
-            return None
-        satisfiable = start < size
-    if not satisfiable:
+    start = int(match[1]) if match[1] else max(0, size - int(match[2]))
+    end = min(int(match[2]) + 1, size) if match[1] and match[2] else size
+    if start >= end:
         raise Problem("RANGE_NOT_SATISFIABLE", headers={"Content-Range": f"bytes */{size}"})
-    return ByteRange(start, end - start)
-
-
-@dataclass(frozen=True)
-class RangeHeaders:
-    """What a request says of the part that it wants. value: the header Range · if_range: the ETag that it belongs
-    to."""
-
-    value: str | None
-    if_range: str | None
-
-    def part(self, size: int, etag: str) -> ByteRange | None:
-        """The part of ``size`` bytes; None: all of them. Raises Problem."""
-        return parse_range(self.value, size) if self.if_range in (None, etag) else None
-
-
-async def range_headers(
-    range_: Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")] = None,
-    if_range: Annotated[str | None, Header(description="The ETag that the range belongs to.")] = None,
-) -> RangeHeaders:
-    """For a route's signature, by ``RangeDep``."""
-    return RangeHeaders(range_, if_range)
-
-
-RangeDep = Annotated[RangeHeaders, Depends(range_headers)]
+    return range(start, end)
 
 
 class _FileAnswer(StreamingResponse):
     """Closes its file, however it ends."""
 
-    def __init__(self, file: BinaryIO, part: ByteRange, block_bytes: int, **said: Any) -> None:
+    def __init__(self, file: BinaryIO, part: range, block_bytes: int, **said: Any) -> None:
         super().__init__(_blocks(file, part, block_bytes), **said)
         self._file = file
 
@@ -160,17 +124,17 @@ async def file_answer(
     media_type: str,
     headers: Mapping[str, str],
     held: IfNoneMatch,
-    part: ByteRange | None = None,
+    part: range | None = None,
 ) -> Response:
     """The bytes of a blob, or a part of them; 304 where the client holds those with the ETag of ``headers``.
 
     At no time is more of it held than a block. Raises FileNotFoundError.
     """
     file, size = await in_thread(_opened, blobs, key)
-    chosen = part or ByteRange(0, size)
-    said = {**headers, "Content-Length": str(chosen.length)}
+    chosen = range(size) if part is None else part
+    said = {**headers, "Content-Length": str(len(chosen))}
     if part is not None:
-        said["Content-Range"] = f"bytes {part.start}-{part.start + part.length - 1}/{size}"
+        said["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
     status = 200 if part is None else 206
     if request.method == "HEAD" or held.matches(headers.get("ETag", "")):
         file.close()
@@ -183,9 +147,9 @@ def _opened(blobs: BlobStore, key: str) -> tuple[BinaryIO, int]:
     return file, file.seek(0, os.SEEK_END)
 
 
-async def _blocks(file: BinaryIO, part: ByteRange, block_bytes: int) -> AsyncIterator[bytes]:
+async def _blocks(file: BinaryIO, part: range, block_bytes: int) -> AsyncIterator[bytes]:
     """The part's bytes, each block read in a thread when the one before it is on its way."""
-    left = part.length
+    left = len(part)
     await in_thread(file.seek, part.start)
     while left and (block := await in_thread(file.read, min(left, block_bytes))):
         left -= len(block)
@@ -199,23 +163,23 @@ _RANGE = re.compile(r"bytes (?:([0-9]{1,15})-([0-9]{1,15})|\*)/([0-9]{1,15})", r
 
 
 def content_range(header: str | None, limit: int) -> PieceRange | None:
-    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_EMPTY."""
+    """What the header says; None without one. Raises Problem INVALID_HEADER, UPLOAD_TOO_LARGE, UPLOAD_INCOMPLETE."""
     if header is None:
         return None
     match = _RANGE.fullmatch(header.strip())
     if match is None:
         detail = "Content-Range is not `bytes first-last/total` or `bytes */total`."
-        raise Problem("INVALID_HEADER", detail, headers=CLOSE)
+        raise Problem("INVALID_HEADER", detail)
     first, last, total = (None if text is None else int(text) for text in match.groups())
     assert total is not None
     if total > limit:
-        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.", headers=CLOSE)
+        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.")
     if total == 0:
-        raise Problem("UPLOAD_EMPTY", headers=CLOSE)
+        raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.")
     if first is None or last is None:
         return PieceRange(None, None, total)
     if not first <= last < total:
-        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.", headers=CLOSE)
+        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.")
     return PieceRange(first, last + 1, total)
 
 
@@ -240,7 +204,7 @@ def announced_digest(header: str | None) -> str | None:
     for member in header.split(","):
         match = _MEMBER.fullmatch(member)
         if match is None:
-            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.", headers=CLOSE)
+            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.")
         if match.group(1) == "sha-256":
             return _decoded(match.group(2))
     return None
@@ -252,5 +216,5 @@ def _decoded(text: str) -> str:
     except binascii.Error:
         value = b""
     if len(value) != 32:
-        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.", headers=CLOSE)
+        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.")
     return value.hex()

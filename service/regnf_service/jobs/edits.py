@@ -81,7 +81,7 @@ def plain_edits(
     """The edits, plain values, as the engine takes them: with object and transform instead of a ``job``.
 
     Raises Problem, pointing at the edit: JOB_NOT_FOUND, JOB_EXPIRED, JOB_NOT_READY, JOB_DISMISSED, JOB_FAILED,
-    EDIT_INVALID, EDIT_POSE_REJECTED.
+    EDIT_INVALID.
     """
     found: dict[str, dict[str, Any]] = {}
     plain = []
@@ -96,13 +96,13 @@ def plain_edits(
 
 
 def _named(services: Services, caller: str, scene: str, job_id: str, pointer: str) -> dict[str, Any]:
-    """What a registration found, as the members of an edit."""
     try:
         record = find_job(services, job_id, caller)
         _require_of_scene(record, reference_of(caller, scene))
         result = result_of(services, manifest_of(services, record))
         if result.get("verdict") == "rejected":
-            raise Problem("EDIT_POSE_REJECTED")
+            hint = "To use it all the same, give `object` and `T_object_scene` instead of `job`."
+            raise Problem("EDIT_INVALID", "The registration rejected its pose.", hint=hint)
         return _members(record, result)
     except Problem as problem:
         fault = {"pointer": pointer, "detail": problem.detail}

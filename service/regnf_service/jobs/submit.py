@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.cost import Cost, Term, estimate
@@ -16,11 +14,10 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.rendering import request as rendering_cost
 from regnf_core.rendering.request import RENDERER_REVISION, RenderRequest
 from regnf_core.version import ENGINE_REVISION
-from regnf_service.library import check_budget
 from regnf_service.problem import Problem, json_pointer
 from regnf_service.services import Services
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
-from regnf_state.records import FieldRecord, JobRecord, RecordError, UnreadableRecordError
+from regnf_state.records import FieldRecord, JobRecord, RecordError
 from regnf_state.registration_request import JobRequest, RenderingRequest, estimated_cost, kind_of
 from regnf_state.settings import Settings
 
@@ -33,18 +30,6 @@ _SECONDS_ARE_WITHIN = 10.0
 _GIB = 1 << 30
 
 
-@dataclass(frozen=True)
-class _Refusals:
-    """How requests of a kind are refused. within: where in the body their options are."""
-
-    reason: str
-    within: tuple[str, ...] = ()
-
-
-_OF_REGISTRATIONS = _Refusals("OPTIONS_TOO_COSTLY", ("options",))
-_OF_RENDERINGS = _Refusals("RENDER_TOO_LARGE")
-
-
 def check_cost(settings: Settings, request: JobRequest) -> None:
     """Raises Problem OPTIONS_TOO_COSTLY, or RENDER_TOO_LARGE for a rendering.
 
@@ -53,21 +38,21 @@ def check_cost(settings: Settings, request: JobRequest) -> None:
     cost = estimated_cost(request)
     if isinstance(request, RenderingRequest):
         _check_files(settings, request)
-        _check(settings, cost, rendering_cost.estimate(RenderRequest()), _OF_RENDERINGS)
+        _check(settings, cost, rendering_cost.estimate(RenderRequest()), "RENDER_TOO_LARGE")
     else:
         usual = estimate(RegistrationOptions(preset=request.options.preset), max(1, len(request.objects)))
-        _check(settings, cost, usual, _OF_REGISTRATIONS)
+        _check(settings, cost, usual, "OPTIONS_TOO_COSTLY")
 
 
-def _check(settings: Settings, cost: Cost, usual: Cost, refusals: _Refusals) -> None:
+def _check(settings: Settings, cost: Cost, usual: Cost, reason: str) -> None:
     memory = max(settings.job_memory_bytes or DEFAULT_MEMORY_BYTES, usual.memory_bytes)
     if cost.memory_bytes > memory:
         estimated, limit = f"{cost.memory_bytes / _GIB:.1f} GiB of memory", f"{memory / _GIB:.1f} GiB"
-        raise _refusal(cost.largest("memory_bytes"), estimated, limit, refusals)
+        raise _refusal(cost.largest("memory_bytes"), estimated, limit, reason)
     seconds = max(settings.job_timeout_s, usual.seconds)
     least = cost.seconds / _SECONDS_ARE_WITHIN
     if least > seconds:
-        raise _refusal(cost.largest("seconds"), f"at least {least:,.0f} s", f"{seconds:,.0f} s", refusals)
+        raise _refusal(cost.largest("seconds"), f"at least {least:,.0f} s", f"{seconds:,.0f} s", reason)
 
 
 def _check_files(settings: Settings, request: RenderingRequest) -> None:
@@ -76,19 +61,15 @@ def _check_files(settings: Settings, request: RenderingRequest) -> None:
         detail = f"The files may take {files / _GIB:.1f} GiB; the limit is {limit / _GIB:.1f} GiB."
         fault = {"pointer": "/outputs", "detail": detail}
         hint = "Ask for fewer or smaller frames, or for fewer outputs."
-        raise Problem(_OF_RENDERINGS.reason, detail, errors=[fault], hint=hint)
+        raise Problem("RENDER_TOO_LARGE", detail, errors=[fault], hint=hint)
 
 
-def _refusal(term: Term, estimated: str, limit: str, refusals: _Refusals) -> Problem:
+def _refusal(term: Term, estimated: str, limit: str, reason: str) -> Problem:
     detail = f"The job is estimated to take {estimated}; the limit is {limit}. Most of it is for {_count(term)}."
-    errors = [
-        {
-            "pointer": json_pointer((*refusals.within, *option)),
-            "detail": f"{_count(term)}: {estimated}, limit {limit}",
-        }
-        for option in term.options
-    ]
-    return Problem(refusals.reason, detail, errors=errors)
+    within = ("options",) if reason == "OPTIONS_TOO_COSTLY" else ()
+    fault = f"{_count(term)}: {estimated}, limit {limit}"
+    errors = [{"pointer": json_pointer((*within, *option)), "detail": fault} for option in term.options]
+    return Problem(reason, detail, errors=errors)
 
 
 def _count(term: Term) -> str:
@@ -203,7 +184,6 @@ def check_fields(
 
 
 def _boxes(request: JobRequest) -> dict[str, Detection]:
-    """The boxes in the scene that a request names, by where it does."""
     if not isinstance(request, RenderingRequest):
         return {"/detection": request.detection}
     named = {f"/edits/{n}/detection": getattr(one, "detection", None) for n, one in enumerate(request.rendering.edits)}
@@ -226,7 +206,6 @@ def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
 
 
 def _bounds(found: FieldRecord | None) -> Bounds | None:
-    """Lowest and highest corner of a ready field, as its import reported them."""
     match found.report.get("bounds") if found is not None else None:
         case [[_, _, _] as lower, [_, _, _] as upper]:
             return lower, upper
@@ -248,7 +227,7 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
     A job that exists tells the request's webhook of its end too; one that has finished, at once.
-    Raises Problem IDEMPOTENCY_KEY_REUSED, QUOTA_WORKER_SECONDS, QueueFullError, QuotaError, RecordsFullError.
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
     job_id = future_job_id(services, caller, asked)
@@ -258,7 +237,6 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
         existing = _earlier_answer(services, digest(key), job_id, request)
         if existing is not None:
             return existing
-    _require_budget(services, caller, job_id)
     (started,) = start(services, caller, [(job_id, asked)])
     if isinstance(started, RecordError):
         raise started
@@ -292,15 +270,6 @@ def start(
     return started
 
 
-def _require_budget(services: Services, caller: str, job_id: str) -> None:
-    """What exists already costs nothing more. Raises Problem QUOTA_WORKER_SECONDS."""
-    with suppress(UnreadableRecordError):
-        known = services.records.get_job(job_id)
-        if known is not None and known.status not in ("failed", "dismissed"):
-            return
-    check_budget(services, caller)
-
-
 def _earlier_answer(services: Services, key: str, job_id: str, request: JobRequest) -> JobRecord | None:
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
     asked = digest(request.values())  # of all of it: another webhook is another request
@@ -321,7 +290,6 @@ def _earlier_answer(services: Services, key: str, job_id: str, request: JobReque
 
 
 def _inputs(request: JobRequest) -> dict[str, Any]:
-    """What the job's document shows of the request."""
     values = request.values()
     if isinstance(request, RenderingRequest):
         return {

@@ -89,14 +89,8 @@ class Kept:
     modified: float = 0.0
 
 
-@dataclass(frozen=True)
-class Removed:
-    """What one round took away."""
-
-    fields: tuple[str, ...] = ()
-    jobs: tuple[str, ...] = ()
-    orphans: tuple[str, ...] = ()
-    temporary: int = 0
+Removed = dict[str, list[str]]
+"""What one round took away: ids of `fields` and `jobs`, and folders that belonged to no record, `orphans`."""
 
 
 class Housekeeper:
@@ -116,7 +110,7 @@ class Housekeeper:
     def run_if_due(self, term: Term) -> Removed:
         """A round, if the last one is an hour ago."""
         if not self._redis.set(_DONE_KEY, term.number, nx=True, ex=_EVERY_S):
-            return Removed()
+            return {}
         return self.run(term)
 
     def tidy_records(self, term: Term) -> int:
@@ -126,19 +120,20 @@ class Housekeeper:
     def run(self, term: Term) -> Removed:
         """One round. Raises LeaseLostError, RedisError, OSError."""
         if not self._records.generation.is_current():
-            return Removed()  # records that Redis has lost must not look unused
+            return {}  # records that Redis has lost must not look unused
         now = self._records.now()
-        temporary = self._blobs.sweep(_ORPHANED_AFTER_S) + self._pieces.expire(now)
+        self._blobs.sweep(_ORPHANED_AFTER_S)
+        self._pieces.expire(now)
         self._batches.expire(now - self._retention_s, term.confirm)
         folders = self._folders()
         self._forget_expired(term)
-        orphans = tuple(self._drop_orphans(term, folders))
-        fields = self._unused_fields()
-        dropped = [
-            field.sha256 for used, field in fields if self._is_old(used, field, now) and self._drop_field(term, field)
-        ]
-        more_jobs, more_fields = ([], []) if self._cap is None else self._drop_beyond_cap(term, self._cap, now)
-        return Removed((*dropped, *more_fields), tuple(more_jobs), orphans, temporary)
+        removed = {"orphans": list(self._drop_orphans(term, folders)), "fields": list[str](), "jobs": list[str]()}
+        for used, field in self._unused_fields():
+            if self._is_old(used, field, now) and self._drop_field(term, field):
+                removed["fields"].append(field.sha256)
+        if self._cap is not None:
+            self._drop_beyond_cap(term, self._cap, now, removed)
+        return {kind: names for kind, names in removed.items() if names}
 
     def _is_old(self, used: float, field: FieldRecord, now: float) -> bool:
         if field.state == "rejected":
@@ -146,7 +141,6 @@ class Housekeeper:
         return self._keep_unused_s is not None and used + self._keep_unused_s <= now
 
     def _folders(self) -> dict[str, Kept]:
-        """Everything below jobs/ and fields/, by folder."""
         found: dict[str, Kept] = defaultdict(Kept)
         for top in ("jobs", "fields"):
             for entry in self._blobs.entries(top):
@@ -223,15 +217,13 @@ class Housekeeper:
         logger.info("field %s is deleted: it was not used for a long time", field.sha256)
         return True
 
-    def _drop_beyond_cap(self, term: Term, cap: int, now: float) -> tuple[list[str], list[str]]:
+    def _drop_beyond_cap(self, term: Term, cap: int, now: float, removed: Removed) -> None:
         """Finished jobs, unused fields, batches and unfinished uploads, oldest first, until the rest is within the
         cap."""
-        jobs: list[str] = []
-        fields: list[str] = []
         sizes = self._sizes()
         total = sizes.total()
         if total <= cap:
-            return jobs, fields
+            return
         candidates: list[tuple[float, str, Any]] = [
             *((job.finished or 0.0, f"jobs/{job.id}", job) for job in self._finished_jobs()),
             *((used, f"fields/{field.sha256}", field) for used, field in self._unused_fields()),
@@ -244,15 +236,14 @@ class Housekeeper:
             if isinstance(record, FieldRecord):
                 if not self._drop_field(term, record):
                     continue
-                fields.append(record.sha256)
+                removed["fields"].append(record.sha256)
             else:
                 term.confirm()
                 if record is not None:
                     self._records.delete_job(record.id)
-                    jobs.append(record.id)
+                    removed["jobs"].append(record.id)
                 if folder.startswith("batches/"):  # one blob; its jobs stay
                     self._blobs.delete(folder)
                 else:
                     self._blobs.delete_prefix(folder)
             total -= sizes[folder]
-        return jobs, fields

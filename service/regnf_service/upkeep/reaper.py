@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from redis import Redis
@@ -73,17 +73,9 @@ _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Reaped:
-    """What one round did: ids by action."""
-
-    requeued: tuple[str, ...] = ()
-    failed: tuple[str, ...] = ()
-    dismissed: tuple[str, ...] = ()
-    enqueued: tuple[str, ...] = ()
-    expired: tuple[str, ...] = ()
-    recalled: tuple[str, ...] = ()
-    """Jobs and fields whose records were made anew from the journal."""
+Done = dict[str, list[str]]
+"""What one round did: ids by action, which is requeued, failed, dismissed, enqueued, expired or recalled (a record made
+anew from the journal)."""
 
 
 class Reaper:
@@ -110,50 +102,45 @@ class Reaper:
         self._staleness = Staleness(unbroken_s=unbroken, clock=clock)
         self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
 
-    def run_once(self) -> Reaped:
+    def run_once(self) -> Done:
         """One round; nothing when another process leads. Raises RedisError when Redis cannot be reached."""
+        done: Done = defaultdict(list)
         with ExitStack() as stack:
             try:
-                recalled = self._rebuild()
+                # any process that finds Redis emptied rebuilds it: reading the journal takes longer than a term
+                rebuilt = None if self._rebuilder is None else self._rebuilder.run_if_needed()
+                if rebuilt is not None and (recalled := [*rebuilt.jobs, *rebuilt.fields]):
+                    done["recalled"] = recalled
                 term = stack.enter_context(self._lease.held())
             except RedisError:  # no worker could write a heartbeat either
                 self._staleness.forget()
                 raise
-            if term is None:
-                return Reaped(recalled=recalled)
-            actions: dict[str, list[str]] = {name: [] for name in ("requeued", "failed", "dismissed", "enqueued")}
-            try:
-                expired = self._lead(term, actions)
-            except LeaseLostError as error:
-                logger.warning("the round ends early: %s", error)
-                expired = []
-            return Reaped(
-                **{action: tuple(ids) for action, ids in actions.items()}, expired=tuple(expired), recalled=recalled
-            )
+            if term is not None:
+                try:
+                    self._lead(term, done)
+                except LeaseLostError as error:
+                    logger.warning("the round ends early: %s", error)
+        return dict(done)
 
-    def _rebuild(self) -> tuple[str, ...]:
-        """Any process that finds Redis emptied rebuilds it: reading the journal takes longer than a term."""
-        if self._rebuilder is None:
-            return ()
-        rebuilt = self._rebuilder.run_if_needed()
-        return rebuilt.jobs + rebuilt.fields
-
-    def _lead(self, term: Term, actions: dict[str, list[str]]) -> list[str]:
-        """Look after everything; the ids of what has expired. Raises LeaseLostError."""
+    def _lead(self, term: Term, done: Done) -> None:
         now = self._records.now()
         self._staleness.begin_round()
         self._mend_queue()
         for job in self._records.active_jobs():
             term.confirm()
-            _note(actions, job.id, self._look_after_job, job, now)
+            _note(done, job.id, self._look_after_job, job, now)
         for field in self._records.validating_fields():
             term.confirm()
-            _note(actions, field.sha256, self._look_after_import, field, now)
-        expired = self._expire(term)
+            _note(done, field.sha256, self._look_after_import, field, now)
+        term.confirm()
+        if expired := self._records.expire_jobs():
+            done["expired"] += expired
+        if self._blobs is not None:
+            for job_id in expired:
+                self._blobs.delete_prefix(f"jobs/{job_id}")
         if self._housekeeper is not None:
             self._housekeeper.tidy_records(term)
             self._housekeeper.run_if_due(term)
-        return expired
 
     def _mend_queue(self) -> None:
         """Do what a process that died may have left undone: hand out what is next, queue what waited for an import."""
@@ -211,18 +198,8 @@ class Reaper:
             self._blobs.delete_prefix(f"fields/{field.sha256}")
         return "failed"
 
-    def _expire(self, term: Term) -> list[str]:
-        term.confirm()
-        expired = self._records.expire_jobs()
-        if self._blobs is not None:
-            for job_id in expired:
-                self._blobs.delete_prefix(f"jobs/{job_id}")
-        return expired
 
-
-def _note(
-    actions: dict[str, list[str]], name: str, look: Callable[[_Record, float], str | None], record: _Record, now: float
-) -> None:
+def _note(done: Done, name: str, look: Callable[[_Record, float], str | None], record: _Record, now: float) -> None:
     try:
         action = look(record, now)
     except StaleAttemptError:
@@ -233,5 +210,5 @@ def _note(
         logger.exception("%s is left out of this round: an internal error", name)
         return
     if action is not None:
-        actions[action].append(name)
+        done[action].append(name)
         logger.warning("%s: %s", name, action)

@@ -9,10 +9,10 @@ import socket
 import ssl
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import httpcore
 from anyio import CapacityLimiter, to_thread
@@ -20,7 +20,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from regnf_service.times import rfc3339
-from regnf_service.webhooks.targets import AllowList, Secrets, Webhooks, read_secrets, signed_headers
+from regnf_service.webhooks.targets import AllowList, Webhooks, read_secrets, signed_headers
 from regnf_state.records import FINISHED, JobRecord, UnreadableRecordError
 from regnf_state.redis.jobs import RecordStore
 from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
@@ -172,7 +172,7 @@ _GONE = 410
 
 
 class Deliverer:
-    """Call ``claim`` and ``deliver`` again and again, for as many messages at once as like, in many processes.
+    """Sends messages that were claimed of the outbox, as many at once as like, in many processes.
 
     threads: for calls of the stores, which block; None: any.
     """
@@ -180,27 +180,16 @@ class Deliverer:
     def __init__(
         self,
         records: RecordStore,
-        outbox: RedisOutbox,
-        sender: HttpSender,
-        allowed: AllowList,
-        secrets: Secrets,
+        webhooks: Webhooks,
         back_off_s: tuple[float, ...] = BACK_OFF_S,
         threads: CapacityLimiter | None = None,
     ) -> None:
         self._records = records
-        self._outbox = outbox
-        self._sender = sender
-        self._allowed = allowed
-        self._secrets = secrets
+        self._webhooks = webhooks
+        self._outbox = webhooks.outbox
+        self._sender = HttpSender(webhooks.allowed.permits)
         self._back_off_s = back_off_s
         self._threads = threads
-
-    def claim(self, passed_over: Collection[str] = ()) -> Message | None:
-        """A message that is due, None when none is. It comes up again if it is not delivered within a minute.
-
-        passed_over: lines and callers whose messages wait. Raises RedisError.
-        """
-        return self._outbox.claim(passed_over)
 
     async def deliver(self, message: Message) -> None:
         """Send a message and write down how that went. Raises RedisError: the message comes up again."""
@@ -226,8 +215,8 @@ class Deliverer:
 
     async def _send(self, record: JobRecord, place: int, now: float) -> tuple[int | None, str | None]:
         """Status of the answer, or a word for why there was none."""
-        url, keys = record.webhooks[place], self._secrets.get(record.owner)
-        if not keys or not self._allowed.allows(url):
+        url, keys = record.webhooks[place], self._webhooks.secrets.get(record.owner)
+        if not keys or not self._webhooks.allowed.allows(url):
             return None, "WEBHOOK_NOT_ALLOWED"
         body = payload(record)
         headers = signed_headers(keys, message_id(record, place), int(now), body) | {"Content-Type": "application/json"}
@@ -253,7 +242,6 @@ class Deliverer:
 
 
 def _is_about(message: Message, record: JobRecord) -> bool:
-    """Whether the record is at the end that the message tells of."""
     return record.attempt == message.attempt and record.status in FINISHED and message.place < len(record.webhooks)
 
 
@@ -279,6 +267,7 @@ def payload(record: JobRecord) -> bytes:
 
 
 logger = logging.getLogger(__name__)
+_Result = TypeVar("_Result")
 _AT_ONCE, _OF_A_CALLER, _OF_A_LINE = 64, 16, 4
 """Messages under way: of all callers, of one, and of one to one receiver."""
 _STORE_THREADS = 4
@@ -293,25 +282,24 @@ def webhooks_of(settings: Settings, redis: Redis) -> Webhooks:
     return Webhooks(AllowList(settings.webhook_hosts), secrets, RedisOutbox(redis))
 
 
-async def deliver_until_stopped(
-    webhooks: Webhooks, records: RecordStore, redis: Redis, stopping: asyncio.Event
-) -> None:
+async def deliver_until_stopped(webhooks: Webhooks, records: RecordStore, stopping: asyncio.Event) -> None:
     """Send what is due until the service stops; nothing where no host is allowed.
 
     A receiver that does not answer keeps only its own messages of its own caller waiting.
     """
     if not webhooks.allowed:
         return
-    sender, threads = HttpSender(webhooks.allowed.permits), CapacityLimiter(_STORE_THREADS)
-    deliverer = Deliverer(records, RedisOutbox(redis), sender, webhooks.allowed, webhooks.secrets, threads=threads)
+    threads = CapacityLimiter(_STORE_THREADS)
+    deliverer = Deliverer(records, webhooks, threads=threads)
     under_way: dict[asyncio.Task[None], Message] = {}
     stop = asyncio.create_task(stopping.wait())
     while not stopping.is_set():
         message = None
         if len(under_way) < _AT_ONCE:
-            message = await _claimed(deliverer, full(under_way.values()), threads)
+            claim = to_thread.run_sync(webhooks.outbox.claim, full(under_way.values()), limiter=threads)
+            message = await _guarded(claim)
         if message is not None:
-            under_way[asyncio.create_task(_deliver(deliverer, message))] = message
+            under_way[asyncio.create_task(_guarded(deliverer.deliver(message)))] = message
             continue
         done, _ = await asyncio.wait({stop, *under_way}, timeout=_LOOK_EVERY_S, return_when=asyncio.FIRST_COMPLETED)
         under_way = {task: message for task, message in under_way.items() if task not in done}
@@ -332,20 +320,12 @@ def full(under_way: Iterable[Message]) -> list[str]:
     ]
 
 
-async def _claimed(deliverer: Deliverer, passed_over: list[str], threads: CapacityLimiter) -> Message | None:
+async def _guarded(work: Awaitable[_Result]) -> _Result | None:
+    """What the work gives; None where it failed, which is logged: a message that was not sent comes up again."""
     try:
-        return await to_thread.run_sync(deliverer.claim, passed_over, limiter=threads)
+        return await work
     except RedisError as error:
         logger.warning("webhooks wait for Redis: %s", type(error).__name__)
     except Exception:
-        logger.exception("an internal error: no message is taken from the outbox; it is tried again")
+        logger.exception("an internal error: a message of the outbox is tried again")
     return None
-
-
-async def _deliver(deliverer: Deliverer, message: Message) -> None:
-    try:
-        await deliverer.deliver(message)
-    except RedisError as error:
-        logger.warning("webhooks wait for Redis: %s", type(error).__name__)
-    except Exception:
-        logger.exception("an internal error ended the delivery of a message; it comes up again")

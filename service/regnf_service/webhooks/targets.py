@@ -66,8 +66,9 @@ class AllowList:
 
 
 def _entry(entry: str) -> Target:
-    target = target_of(entry if "://" in entry else f"https://{entry}")
-    if target is None or urlsplit(entry if "://" in entry else f"https://{entry}").path:
+    url = entry if "://" in entry else f"https://{entry}"
+    target = target_of(url)
+    if target is None or urlsplit(url).path:
         raise TokensError(f"{entry[:80]!r} is no host for webhooks: host, host:port or http://host:port")
     return target
 

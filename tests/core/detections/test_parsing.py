@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,10 @@ import pytest
 import torch
 
 from regnf_core import OrientedBox
-from regnf_core.detections import parse_detection
+from regnf_core.detections import Detection, parse_detection, require_in_scene
+from regnf_core.detections.bounds import distance
 from regnf_core.errors import InvalidDetectionError
-from regnf_core.rotations import normal_quaternion
+from regnf_core.rotations import Vector, normal_quaternion, rotation_columns
 
 HALF = math.sqrt(0.5)
 QUARTER = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
@@ -152,3 +155,141 @@ def test_one_of_several_is_chosen_by_its_index() -> None:
 
 def test_an_array_is_no_list_of_detections() -> None:
     assert parse_detection(torch.tensor([[0.0, 0, 0], [1, 2, 3]])) == AXIS_ALIGNED
+
+
+# Boxes as plain numbers, by hand-computed cases and a slow reference.
+
+
+CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+ROOM = ((-1.5, -2.0, -0.6), (1.5, 2.0, 2.0))
+
+
+def test_a_quarter_turn_about_z() -> None:
+    columns = rotation_columns((0.0, 0.0, HALF, HALF))
+    expected = ((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    for column, wanted in zip(columns, expected, strict=True):
+        assert column == pytest.approx(wanted)
+
+
+def test_every_multiple_of_a_quaternion_is_one() -> None:
+    q = (0.1, -0.2, 0.3, 0.5)
+    for factor in (1.0, -1.0, 7.5, -1e-3):
+        assert normal_quaternion([factor * value for value in q]) == normal_quaternion(q)
+    assert normal_quaternion((0, 0, -1, 0)) == normal_quaternion((0, 0, 1, 0)) == (0.0, 0.0, 1.0, 0.0)
+    assert normal_quaternion((-1, 0, 0, 0)) == (1.0, 0.0, 0.0, 0.0)
+    assert str(normal_quaternion((-0.0, 0.0, -0.0, 2.0))) == "(0.0, 0.0, 0.0, 1.0)", "no negative zero"
+
+
+@pytest.mark.parametrize(
+    ("center", "size", "xyzw", "overlap"),
+    [
+        ((0, 0, 0), (1, 1, 1), (0, 0, 0, 1), True),
+        ((1.4, 0, 0), (1, 1, 1), (0, 0, 0, 1), True),
+        ((1.6, 0, 0), (1, 1, 1), (0, 0, 0, 1), False),
+        # turned by 45 degrees about z its half width is sqrt(1/2) = 0.707
+        ((1.7, 0, 0), (1, 1, 1), (0, 0, 0.38268343, 0.92387953), True),
+        ((1.71, 0, 0), (1, 1, 1), (0, 0, 0.38268343, 0.92387953), False),
+        # its flat side faces the corner (1, 1): only its own axis separates
+        ((1.3, 1.3, 0), (1, 1, 1), (0, 0, 0.38268343, 0.92387953), True),
+        ((1.4, 1.4, 0), (1, 1, 1), (0, 0, 0.38268343, 0.92387953), False),
+        ((0, 0, 0), (100, 100, 100), (0, 0, 0, 1), True),
+        ((0, 0, 0), (1e-9, 1e-9, 1e-9), (0, 0, 0, 1), True),
+    ],
+)
+def test_overlap_with_the_cube_of_edge_two(
+    center: Vector, size: Vector, xyzw: tuple[float, float, float, float], overlap: bool
+) -> None:
+    assert (distance(Detection(center, size, xyzw), CUBE) == 0) is overlap
+
+
+def test_no_box_with_a_point_inside_is_called_outside() -> None:
+    """The slow way: a grid of points in the box; any of them in the bounds proves an overlap."""
+    rng = random.Random(0)
+    proved = 0
+    for _ in range(300):
+        center = (rng.uniform(-2.5, 2.5), rng.uniform(-2.5, 2.5), rng.uniform(-2.5, 2.5))
+        size = (rng.uniform(0.1, 3), rng.uniform(0.1, 3), rng.uniform(0.1, 3))
+        xyzw = normal_quaternion([rng.gauss(0, 1) for _ in range(4)])
+        columns = rotation_columns(xyzw)
+        steps = [-0.5, -0.25, 0.0, 0.25, 0.5]
+        inside = any(
+            all(
+                abs(center[axis] + sum(f * size[i] * columns[i][axis] for i, f in enumerate(fractions))) <= 1
+                for axis in range(3)
+            )
+            for fractions in itertools.product(steps, repeat=3)
+        )
+        proved += inside
+        if inside:
+            assert distance(Detection(center, size, xyzw), CUBE) == 0
+    assert 50 < proved < 290
+
+
+@pytest.mark.parametrize(
+    ("center", "apart"),
+    [
+        ((3, 0, 0), 1.5),
+        ((-3, 0, 0), 1.5),
+        ((3, 3, 0), math.hypot(1.5, 1.5)),
+        ((3, 3, 3), 1.5 * math.sqrt(3)),
+        ((0, 0, 0), 0),
+    ],
+)
+def test_the_distance_of_upright_boxes_is_exact(center: Vector, apart: float) -> None:
+    assert distance(Detection(center, (1, 1, 1)), CUBE) == pytest.approx(apart)
+
+
+FAR_ROOM = ((3500.0, 3000.0, 4400.0), (6500.0, 7000.0, 7000.0))
+OUTSIDE = "DETECTION_OUTSIDE_SCENE"
+
+
+@pytest.mark.parametrize(
+    ("box", "scenes", "reason", "said", "hint"),
+    [
+        (
+            Detection((-562, -283, 200), (546, 598, 511)),
+            [ROOM],
+            OUTSIDE,
+            "units from the scene's bounds",
+            "in millimeters? Divided by 1000",
+        ),
+        (
+            Detection((-56.2, -28.3, 20.0), (54.6, 59.8, 51.1)),
+            [ROOM],
+            OUTSIDE,
+            "",
+            "centimeters or inches? Divided by 100",
+        ),
+        (Detection((39.37, 39.37, 39.37), (20, 20, 20)), [ROOM], OUTSIDE, "units from", "or inches?"),
+        (
+            Detection((20, 20, 20), (1, 1, 1)),
+            [ROOM],
+            OUTSIDE,
+            "the size [1, 1, 1], the scene reaches from [-1.5, -2, -0.6]",
+            "own frame",
+        ),
+        (Detection((5.2, 5.1, 5.3), (0.5, 0.5, 0.5)), [FAR_ROOM], OUTSIDE, "", "Is the scene in millimeters?"),
+        (Detection((1.0, 1.5, 1.0), (0.5, 0.5, 0.5)), [((-0.3,) * 3, (0.3,) * 3), ROOM], OUTSIDE, "", "swapped"),
+        (
+            Detection((100, 80, 120), (550, 600, 520)),
+            [ROOM],
+            "INVALID_DETECTION",
+            "many times larger",
+            "millimeters",
+        ),
+    ],
+)
+def test_a_box_outside_tells_how_far_and_what_may_be_wrong(
+    box: Detection, scenes: Any, reason: str, said: str, hint: str
+) -> None:
+    with pytest.raises(InvalidDetectionError) as caught:
+        require_in_scene(box, *scenes)
+    assert caught.value.reason == reason
+    assert said in str(caught.value)
+    assert hint in (caught.value.hint or "")
+
+
+def test_a_scene_without_bounds_refuses_nothing() -> None:
+    far = Detection((9, 9, 9), (1, 1, 1))
+    require_in_scene(far, ([-math.inf] * 3, [math.inf] * 3))
+    require_in_scene(Detection((0, 0, 0), (30, 30, 30)), ROOM)  # nor does a room a box about itself

@@ -21,9 +21,3 @@ def slow_trilinear(value_at: Lookup, position: Array) -> float:
         weight = np.prod([share[axis] if corner[axis] else 1.0 - share[axis] for axis in range(3)])
         total += weight * value_at(tuple(int(c) + k for c, k in zip(cell, corner, strict=True)))
     return float(total)
-
-
-def numeric_gradient(value: Callable[[Array], float], point: Array, step: float = 1e-6) -> Array:
-    """Central differences of ``value`` at ``point`` (3,)."""
-    axes = step * np.eye(3)
-    return np.array([(value(point + axis) - value(point - axis)) / (2 * step) for axis in axes])

@@ -55,49 +55,27 @@ def test_a_field_without_color_has_none() -> None:
         assert inverse_deviation_of(view) is None
 
 
-def test_color_in_another_frame() -> None:
-    points, directions = questions()
-    view = TransformedField(PAINTED, T_BOX_FRAME)
-    assert isinstance(view, ColoredField)
-    rotation = T_BOX_FRAME.rotation.float()
-    expected = (
-        0.5 + 0.05 * T_BOX_FRAME.apply(points.double()).float() + 0.3 * (rotation @ directions[:, :, None])[:, :, 0]
-    )
-    torch.testing.assert_close(view.color(points, directions), expected)
-    # Lengths of the new frame are multiplied by the scale.
-    assert view.inverse_deviation == pytest.approx(40.0 * float(T_BOX_FRAME.scale))
+VIEWS = {
+    "frame": (TransformedField(PAINTED, T_BOX_FRAME), T_BOX_FRAME, 1.0),
+    "unit": (ScaledField(PAINTED, 4.0, -1), Sim3.identity(), 4.0),
+    "both": (TransformedField(ScaledField(ObservedField(PAINTED, unseen()), 3.0), T_BOX_FRAME), T_BOX_FRAME, 3.0),
+}
+"""Each with the transform from its frame, and the unit of what that leads to."""
 
 
-def test_color_in_another_unit() -> None:
-    points, directions = questions()
-    view = ScaledField(PAINTED, 4.0, -1)
-    assert has_color(view)
-    torch.testing.assert_close(view.color(4.0 * points, directions), PAINTED.color(points, directions))
-    assert view.inverse_deviation == pytest.approx(10.0)
-
-
-def test_the_opacity_between_two_points_is_the_same_in_every_frame() -> None:
+@pytest.mark.parametrize("name", VIEWS)
+def test_color_and_opacity_are_those_of_the_same_place_in_every_frame_and_unit(name: str) -> None:
     """NeuS's opacity depends on s S(x) alone, so that s must change with the unit of S."""
-    points, _ = questions()
-    for view, there in (
-        (TransformedField(PAINTED, T_BOX_FRAME), T_BOX_FRAME.inverse().apply(points.double()).float()),
-        (ScaledField(PAINTED, 4.0), 4.0 * points),
-    ):
-        assert view.inverse_deviation is not None
-        torch.testing.assert_close(
-            view.signed_distance(there) * view.inverse_deviation, PAINTED.signed_distance(points) * 40.0
-        )
-
-
-def test_views_of_views_and_an_observation() -> None:
     points, directions = questions()
-    view = TransformedField(ScaledField(ObservedField(PAINTED, unseen()), 3.0), T_BOX_FRAME)
+    view, T, unit = VIEWS[name]
     assert has_color(view)
-    moved = T_BOX_FRAME.apply(points.double()).float()
-    rotation = T_BOX_FRAME.rotation.float()
-    torch.testing.assert_close(view.color(points, directions), PAINTED.color(moved / 3.0, directions @ rotation.T))
-    assert view.inverse_deviation == pytest.approx(40.0 * float(T_BOX_FRAME.scale) / 3.0)
-    assert has_color(view.to("cpu"))
+    moved, turned = T.apply(points.double()).float() / unit, directions @ T.rotation.float().T
+    torch.testing.assert_close(view.color(points, directions), 0.5 + 0.05 * moved + 0.3 * turned)
+    assert view.inverse_deviation == pytest.approx(40.0 * float(T.scale) / unit)
+    distance = view.signed_distance(points) * (-1 if name == "unit" else 1)
+    torch.testing.assert_close(distance * view.inverse_deviation, PAINTED.signed_distance(moved) * 40.0)
+    again = pickle.loads(pickle.dumps(view.to("cpu")))  # as it is sent to another process
+    torch.testing.assert_close(again.color(points, directions), view.color(points, directions))
 
 
 def test_a_union_has_the_color_of_the_nearest_part() -> None:
@@ -109,10 +87,3 @@ def test_a_union_has_the_color_of_the_nearest_part() -> None:
     expected = PAINTED.color(torch.tensor([[0.9, 0.0, 0.0], [-0.9, 0.0, 0.0]]), directions)
     torch.testing.assert_close(union.color(points, directions), expected)
     assert union.inverse_deviation == 40.0
-
-
-def test_a_view_with_color_can_be_sent_to_another_process() -> None:
-    points, directions = questions()
-    view = TransformedField(ScaledField(PAINTED, 3.0), T_BOX_FRAME)
-    again = pickle.loads(pickle.dumps(view))
-    torch.testing.assert_close(again.color(points, directions), view.color(points, directions))

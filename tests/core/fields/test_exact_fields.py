@@ -10,11 +10,11 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.composite import BoxField, SurfaceSource, UnionField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_mesh
+from tests.core.importing.archives import assert_refused
 
 BOX = BoxField((-0.3, -0.2, -0.1), (0.3, 0.2, 0.5))
 
@@ -46,42 +46,9 @@ def test_mesh_of_a_box_agrees_with_the_formula() -> None:
     torch.testing.assert_close(gradient, slope, rtol=0, atol=1e-4)
     assert isinstance(box_mesh(BOX), SdfField)
 
-
-def test_mesh_of_a_sphere_agrees_with_the_formula() -> None:
-    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
-    field = MeshField(ball.vertices, ball.faces)
-    points = some_points()
-    distance, gradient = field.signed_distance_and_gradient(points)
-    # A chord of the icosphere lies at most 0.5 (1 - cos(edge / 2)) < 3e-4 below the sphere.
-    torch.testing.assert_close(distance, points.norm(dim=1) - 0.5, rtol=0, atol=3e-4)
-    cosine = (gradient * points).sum(dim=1) / points.norm(dim=1)
-    assert cosine[points.norm(dim=1) > 0.1].min() > 0.99
-
-
-def test_gradient_on_the_surface_is_the_normal() -> None:
     distance, gradient = box_mesh(BOX).signed_distance_and_gradient(torch.tensor([[0.1, 0.05, 0.5]]))
     torch.testing.assert_close(distance, torch.zeros(1))
     torch.testing.assert_close(gradient, torch.tensor([[0.0, 0.0, 1.0]]))
-
-
-def test_mesh_with_a_hole_still_has_an_inside() -> None:
-    whole = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    field = MeshField(whole.vertices, whole.faces[10:])
-    assert field.signed_distance(torch.zeros(1, 3)).item() < -0.49
-    assert field.signed_distance(torch.tensor([[0.0, 0.0, 0.9]])).item() > 0.39
-
-
-def test_mesh_loads_a_scene_graph(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    for x in (-1.0, 1.0):
-        pose = np.eye(4)
-        pose[0, 3] = x
-        scene.add_geometry(trimesh.creation.box((0.2, 0.2, 0.2)), transform=pose)
-    (tmp_path / "pair.glb").write_bytes(trimesh.exchange.gltf.export_glb(scene))  # type: ignore[no-untyped-call]
-    field = load_mesh(tmp_path / "pair.glb")
-    torch.testing.assert_close(field.bounds, torch.tensor([[-1.1, -0.1, -0.1], [1.1, 0.1, 0.1]], dtype=torch.float64))
-    points = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
-    torch.testing.assert_close(field.signed_distance(points), torch.tensor([-0.1, 0.9, 0.2]))
 
 
 def test_mesh_moves() -> None:
@@ -104,37 +71,23 @@ def test_mesh_moves() -> None:
     ],
 )
 def test_what_is_no_mesh_is_refused(vertices: object, faces: object) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        MeshField(np.asarray(vertices), np.asarray(faces))
-    assert caught.value.reason == "MESH_INVALID"
-
-
-@pytest.mark.parametrize("name", ["words.glb", "words.obj", "words.ply", "words.stl"])
-def test_files_that_hold_no_mesh_are_refused(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_text("no mesh at all")
-    with pytest.raises(FieldFormatError) as caught:
-        load_mesh(tmp_path / name)
-    assert caught.value.reason == "MESH_INVALID"
-    with pytest.raises(FileNotFoundError):
-        load_mesh(tmp_path / "absent.glb")
+    assert_refused(lambda: MeshField(np.asarray(vertices), np.asarray(faces)), "MESH_INVALID")
 
 
 @pytest.mark.parametrize(
     ("name", "content"),
     [
+        *((f"words.{kind}", "no mesh at all") for kind in ("glb", "obj", "ply", "stl")),
         ("parts.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "absent.bin", "byteLength": 3}]}'),
         ("short.obj", "v 0 0\nv 1 0 0\nv 0 1\nf 1 2 3\n"),
         ("far.obj", "v 0 0 0\nv 1 0 0\nf 1 2 9\n"),
     ],
 )
-def test_malformed_meshes_are_refused(name: str, content: str, tmp_path: Path) -> None:
+def test_files_that_hold_no_sound_mesh_are_refused(name: str, content: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(content)
-    with pytest.raises(FieldFormatError) as caught:
-        load_mesh(tmp_path / name)
-    assert caught.value.reason == "MESH_INVALID"
-
-
-def test_a_folder_is_no_mesh_file(tmp_path: Path) -> None:
+    assert_refused(lambda: load_mesh(tmp_path / name), "MESH_INVALID")
+    with pytest.raises(FileNotFoundError):
+        load_mesh(tmp_path / "absent.glb")
     with pytest.raises(IsADirectoryError):
         load_mesh(tmp_path)
 
@@ -159,14 +112,10 @@ def test_union_takes_the_nearest() -> None:
         other.signed_distance_and_gradient(points)[1],
     )
     torch.testing.assert_close(gradient, nearest)
-
-
-def test_union_takes_double_precision_and_no_points_at_all() -> None:
-    union = UnionField([BOX, BoxField((1, 1, 1), (2, 2, 2))])
-    points = some_points(100, reach=1.5)
-    distance, gradient = union.signed_distance_and_gradient(points.double())
-    assert distance.dtype == gradient.dtype == torch.float32
-    torch.testing.assert_close(distance, union.signed_distance(points))
+    union = UnionField([other, BOX])
+    double, slope = union.signed_distance_and_gradient(points.double())
+    assert double.dtype == slope.dtype == torch.float32
+    torch.testing.assert_close(double, distance)
     assert union.signed_distance(points[:0]).shape == (0,)
 
 

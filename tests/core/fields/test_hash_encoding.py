@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.schema.hash_grid_config import HashGridConfig, Interpolation
 from tests.core.fields.reference import central_differences, encode_slowly
+from tests.core.importing.archives import assert_refused
 from tests.devdata import dev_data
 
 GRID = HashGridConfig.from_top_resolution(40, levels=4, log2_table_size=9, base_resolution=5)
@@ -117,6 +117,4 @@ def test_points_that_are_no_numbers_read_nothing_outside_the_table() -> None:
 
 
 def test_wrong_table_is_refused() -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        HashEncoding(GRID, torch.zeros(GRID.entries + 8, 2))
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(lambda: HashEncoding(GRID, torch.zeros(GRID.entries + 8, 2)), "FIELD_SHAPES_MISMATCH")

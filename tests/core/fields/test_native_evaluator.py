@@ -77,7 +77,7 @@ def places(function: NeusFactoFunction, count: int = 203, seed: int = 3) -> torc
     return reach * torch.cat([spread, corners, spread[-1:]])
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(0, 40, 2))
 def test_agrees_with_the_plain_function(compiled: Any, seed: int) -> None:
     one = random_function(seed)
     assert suits(one)
@@ -150,7 +150,7 @@ def test_a_point_has_its_result_whatever_comes_with_it_and_wherever_it_lies(comp
     assert torch.equal(fast.value(strided), value)
 
 
-@pytest.mark.parametrize("seed", range(0, 40, 5))
+@pytest.mark.parametrize("seed", range(0, 40, 10))
 def test_what_is_no_place_has_no_distance(compiled: Any, seed: int) -> None:
     """NaN and infinity give what torch gives, and spoil no other point."""
     one = random_function(seed)

@@ -12,11 +12,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field, open_field
 from regnf_core.fields.observation import SdfField
 from regnf_core.schema.safe_format import parse_description, write_safe_field
-from tests.core.fields.grids import numeric_gradient
+from tests.core.fields.reference import central_differences
+from tests.core.importing.archives import assert_refused
 
 Array = NDArray[Any]
 CELL, REACH, MOST = 0.3, 2.5, 0.9
@@ -110,12 +110,10 @@ class Slow:
 
 
 CASES: dict[str, dict[str, Any]] = {
-    "blended first": {},
-    "decoded first": {"blend_first": False},
+    "blended first": {"buffer_size": 97},  # too small: points share a place in it
+    "decoded first": {"blend_first": False, "neighbors": 2},
     "turned": {"oriented": True},
     "turned, decoded first": {"oriented": True, "blend_first": False},
-    "a buffer too small": {"buffer_size": 97},
-    "two neighbors": {"neighbors": 2},
 }
 
 
@@ -124,16 +122,18 @@ def test_values_and_gradients_are_those_of_a_slow_evaluation(case: str) -> None:
     values = description(**CASES[case])
     parameters = tensors(values["oriented"])
     slow = Slow(values, parameters)
-    places = np.random.default_rng(1).uniform(-1.3, 1.0, (60, 3))
+    places = np.random.default_rng(1).uniform(-1.3, 1.0, (25, 3))
     distance, gradient = field(values, parameters).signed_distance_and_gradient(torch.from_numpy(places))
     known = np.array([bool(slow.nearest(place)) for place in places])
-    assert known.sum() > 40
+    assert known.sum() > 15
     expected = np.array([slow(place) for place in places])
-    slopes = np.array([numeric_gradient(slow, place) for place in places])
+    slopes = np.array([central_differences(slow, place) for place in places])
     np.testing.assert_allclose(distance.numpy()[known], expected[known], rtol=0, atol=2e-5)
     # A kink of the network, or a change of neighbors, may lie between the two ends of a difference.
     wrong = np.abs(gradient.numpy() - slopes).max(axis=1)[known] > 2e-3
     assert wrong.mean() < 0.05
+    on_points = torch.from_numpy(parameters["points"])
+    assert all(torch.isfinite(one).all() for one in field(values, parameters).signed_distance_and_gradient(on_points))
 
 
 def test_out_of_reach_the_distance_to_a_point_stands_in(tmp_path: Path) -> None:
@@ -149,15 +149,6 @@ def test_out_of_reach_the_distance_to_a_point_stands_in(tmp_path: Path) -> None:
     torch.testing.assert_close(open_field(tmp_path / "f").to("cpu").signed_distance(places), distance)
 
 
-def test_a_place_on_a_point_is_finite() -> None:
-    parameters = tensors()
-    distance, gradient = field(description(), parameters).signed_distance_and_gradient(
-        torch.from_numpy(parameters["points"])
-    )
-    assert torch.isfinite(distance).all()
-    assert torch.isfinite(gradient).all()
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -169,6 +160,4 @@ def test_a_place_on_a_point_is_finite() -> None:
     ],
 )
 def test_tensors_that_do_not_fit_are_refused(tmp_path: Path, change: dict[str, Array]) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        write_safe_field(tmp_path / "f", description(), tensors() | change)
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(lambda: write_safe_field(tmp_path / "f", description(), tensors() | change), "FIELD_SHAPES_MISMATCH")

@@ -25,7 +25,7 @@ def small_field(layers: int = 3, **changes: Any) -> NeusFactoField:
     return build_neus_facto(parse_description(description(**changes)), parameters)
 
 
-def some_points(count: int = 30) -> NDArray[np.float32]:
+def some_points(count: int = 10) -> NDArray[np.float32]:
     # Up to the scene's [-1, 1], then beyond it, where contraction acts and the raw grid wraps round.
     rng = np.random.default_rng(2)
     return np.concatenate((rng.uniform(-1, 1, (count, 3)), rng.uniform(-2.6, 2.6, (count, 3)))).astype(np.float32)
@@ -73,21 +73,14 @@ def test_chunks_change_nothing() -> None:
     ):
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
     assert parted.signed_distance(points).shape == (1000,)
-    assert parted.signed_distance(points[:0]).shape == (0,)
-
-
-def test_no_points_give_no_values() -> None:
-    field = small_field()
-    distance, gradient = field.signed_distance_and_gradient(torch.zeros(0, 3))
-    assert field.signed_distance(torch.zeros(0, 3)).shape == distance.shape == (0,)
+    distance, gradient = parted.signed_distance_and_gradient(points[:0])
+    assert parted.signed_distance(points[:0]).shape == distance.shape == (0,)
     assert gradient.shape == (0, 3)
 
 
 def test_masked_levels_count_as_zeros() -> None:
-    zeroed = tensors(6)
-    start = sum(GRID.level_entries()[:2])
-    zeroed["hash_table"][start:] = 0.0
-    parameters = {name: torch.from_numpy(array) for name, array in zeroed.items()}
+    parameters = {name: torch.from_numpy(array) for name, array in tensors(6).items()}
+    parameters["hash_table"][sum(GRID.level_entries()[:2]) :] = 0.0
     expected = build_neus_facto(parse_description(description()), parameters)
     points = torch.from_numpy(some_points())
     masked = small_field(6, level_mask=2)
@@ -96,14 +89,11 @@ def test_masked_levels_count_as_zeros() -> None:
 
 def test_unused_encodings_count_as_zeros() -> None:
     # With a table of zeros the grid's features are zero; the first three columns and the sines remain.
-    zeroed = tensors(6)
-    zeroed["hash_table"][:] = 0.0
-    points = torch.from_numpy(some_points())
-    with_zeros = build_neus_facto(parse_description(description()), {n: torch.from_numpy(a) for n, a in zeroed.items()})
+    zeroed = {name: torch.from_numpy(array) for name, array in tensors(6).items()}
+    points, table = torch.from_numpy(some_points()), zeroed["hash_table"].zero_()
+    with_zeros = build_neus_facto(parse_description(description()), {**zeroed, "hash_table": table})
     del zeroed["hash_table"]
-    without = build_neus_facto(
-        parse_description(description(use_grid=False)), {n: torch.from_numpy(a) for n, a in zeroed.items()}
-    )
+    without = build_neus_facto(parse_description(description(use_grid=False)), zeroed)
     assert without.function.hash_encoding is None
     torch.testing.assert_close(without.signed_distance(points), with_zeros.signed_distance(points), rtol=0, atol=2e-6)
 
@@ -124,20 +114,17 @@ def stored_field(family: str, contraction: str) -> tuple[Path, NeusFactoField]:
         parameters[f"layers.{i}.bias"] = state[f"glin{i}.bias"]
     if uses_grid:
         parameters["hash_table"] = state["encoding.params"].view(-1, grid["features_per_level"])
+    names = {
+        "levels": "n_levels",
+        "features_per_level": "features_per_level",
+        "log2_table_size": "log2_hashmap_size",
+        "base_resolution": "base_resolution",
+        "per_level_scale": "per_level_scale",
+    }
+    used = hyper.get("use_position_encoding", True)
     values = description(
-        hash={
-            "levels": grid["n_levels"],
-            "features_per_level": grid["features_per_level"],
-            "log2_table_size": grid["log2_hashmap_size"],
-            "base_resolution": grid["base_resolution"],
-            "per_level_scale": grid["per_level_scale"],
-            "interpolation": grid["interpolation"].lower(),
-        },
-        positional_encoding={
-            "degree": 6,
-            "two_pi": family.startswith("nerfstudio"),
-            "used": hyper.get("use_position_encoding", True),
-        },
+        hash={ours: grid[theirs] for ours, theirs in names.items()} | {"interpolation": grid["interpolation"].lower()},
+        positional_encoding={"degree": 6, "two_pi": family.startswith("nerfstudio"), "used": used},
         use_grid=uses_grid,
         contraction=contraction,
     )
@@ -151,12 +138,9 @@ CONTRACTED = ("linf", "sdf_contracted", "gradient_contracted_wrt_input")
 @pytest.mark.parametrize(
     ("family", "contraction", "values", "gradients"),
     [
-        ("sdfstudio_neus_facto", *RAW),
-        ("sdfstudio_neus_facto", *CONTRACTED),
-        ("sdfstudio_neus_facto_angelo", *RAW),
-        ("sdfstudio_neus_facto_angelo", *CONTRACTED),
-        ("sdfstudio_neus", *RAW),
-        ("sdfstudio_neus", *CONTRACTED),
+        *(("sdfstudio_neus_facto", *RAW), ("sdfstudio_neus_facto", *CONTRACTED)),
+        *(("sdfstudio_neus_facto_angelo", *RAW), ("sdfstudio_neus_facto_angelo", *CONTRACTED)),
+        *(("sdfstudio_neus", *RAW), ("sdfstudio_neus", *CONTRACTED)),
         ("nerfstudio_neus_facto", "linf_grid", "sdf", "gradient"),
     ],
 )

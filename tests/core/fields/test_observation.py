@@ -37,10 +37,7 @@ def test_states_are_packed_as_documented() -> None:
     for index, state in enumerate(states.ravel()):
         assert (int(words[index // 16]) >> (2 * (index % 16))) & 3 == state
     np.testing.assert_array_equal(GRID.unpack(words), states)
-
-
-def test_the_fourth_state_reads_as_a_surface() -> None:
-    assert (GRID.unpack(np.full(2, -1, np.int32)) == SURFACE).all()
+    assert (GRID.unpack(np.full(2, -1, np.int32)) == SURFACE).all()  # the fourth state
 
 
 def test_states_by_place() -> None:

@@ -57,13 +57,8 @@ Abs Acos Asin Asinh Atan Atanh Ceil Celu Cos Cosh Dropout Elu Erf Exp Floor Gelu
 LeakyRelu LogSoftmax Mish Neg Relu Round Selu Sigmoid Sign Sin Sinh Softmax Softplus Softsign Tan Tanh ThresholdedRelu
 """
 WITH_SETTINGS = (
-    "Elu x alpha:0.3",
-    "LeakyRelu x alpha:0.3",
-    "Celu x alpha:0.7",
-    "ThresholdedRelu x alpha:0.2",
-    "HardSigmoid x alpha:0.5 beta:0.1",
-    'Gelu x approximate:"tanh"',
-    "Selu x alpha:1.5 gamma:0.9",
+    *("Elu x alpha:0.3", "LeakyRelu x alpha:0.3", "Celu x alpha:0.7", "ThresholdedRelu x alpha:0.2"),
+    *("HardSigmoid x alpha:0.5 beta:0.1", 'Gelu x approximate:"tanh"', "Selu x alpha:1.5 gamma:0.9"),
     "Softmax x axis:1",
 )
 

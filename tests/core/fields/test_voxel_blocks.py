@@ -10,12 +10,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field, open_field
 from regnf_core.fields.observation import ColoredField, SdfField, has_color
 from regnf_core.schema.safe_format import parse_description, write_safe_field
-from regnf_core.schema.tensor_check import TensorSpec
-from tests.core.fields.grids import numeric_gradient, slow_trilinear
+from tests.core.fields.grids import slow_trilinear
+from tests.core.fields.reference import central_differences
+from tests.core.importing.archives import assert_refused
 
 EDGE, SIZE = 4, 0.1
 ORIGIN = np.array([0.05, 0.0, -0.02])
@@ -51,11 +51,11 @@ def slow(point: NDArray[np.float64], sign: int = 1) -> float:
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_values_and_gradients_are_those_of_slow_interpolation(sign: int) -> None:
-    drawn = np.random.default_rng(6).uniform(-1.2, 1.2, (200, 3))
+    drawn = np.random.default_rng(6).uniform(-1.2, 1.2, (70, 3))
     where = drawn[(np.abs((drawn - ORIGIN) / SIZE % 1.0 - 0.5) < 0.49).all(axis=1)]
     value, gradient = field(sign=sign).signed_distance_and_gradient(torch.from_numpy(where))
     expected = [sign * slow(point, sign) for point in where]
-    slopes = [sign * numeric_gradient(lambda p: slow(p, sign), point) for point in where]
+    slopes = [sign * central_differences(lambda p: slow(p, sign), point) for point in where]
     np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=1e-5)
     np.testing.assert_allclose(gradient.numpy(), slopes, rtol=0, atol=1e-3)
 
@@ -89,7 +89,6 @@ def test_round_about_a_surface_the_slope_stays_that_of_a_distance() -> None:
 def test_far_away_it_is_finite() -> None:
     points = torch.tensor([[1e7, 0.0, 0.0], [-1e7, 1e7, -1e7]])
     distance = field().signed_distance(points)
-    assert torch.isfinite(distance).all()
     torch.testing.assert_close(distance, points.norm(dim=-1), rtol=1e-4, atol=0)
 
 
@@ -102,24 +101,19 @@ def test_the_file_and_another_device_change_nothing(tmp_path: Path) -> None:
     torch.testing.assert_close(opened.to("cpu").signed_distance(points), expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("values", "blocks", "reason"),
-    [
-        (VALUES[:3], BLOCKS, "FIELD_SHAPES_MISMATCH"),
-        (VALUES[..., :2], BLOCKS, "FIELD_SHAPES_MISMATCH"),
-        (VALUES, BLOCKS[:, :2], "FIELD_SHAPES_MISMATCH"),
-        (VALUES, BLOCKS.astype(np.float32), "FIELD_SHAPES_MISMATCH"),
-        (VALUES, np.zeros_like(BLOCKS), "FIELD_INDEX_INVALID"),
-    ],
-)
-def test_faulty_tensors_are_refused(tmp_path: Path, values: Any, blocks: Any, reason: str) -> None:
-    def write_and_open() -> None:
+def test_faulty_tensors_are_refused(tmp_path: Path) -> None:
+    def write_and_open(values: Any = VALUES, blocks: Any = BLOCKS) -> None:
         write_safe_field(tmp_path / "f", description(), {"values": values, "blocks": blocks})
         open_field(tmp_path / "f")
 
-    with pytest.raises(FieldFormatError) as caught:
-        write_and_open()
-    assert caught.value.reason == reason
+    for values in (VALUES[:3], VALUES[..., :2]):
+        assert_refused(lambda values=values: write_and_open(values), "FIELD_SHAPES_MISMATCH")
+    for blocks in (BLOCKS[:, :2], BLOCKS.astype(np.float32)):
+        assert_refused(lambda blocks=blocks: write_and_open(blocks=blocks), "FIELD_SHAPES_MISMATCH")
+    assert_refused(lambda: write_and_open(blocks=np.zeros_like(BLOCKS)), "FIELD_INDEX_INVALID")
+    colored = {"values": VALUES, "blocks": BLOCKS, "color.values": VALUES.astype(np.float16)}
+    described = description(color={"form": "values"})
+    assert_refused(lambda: write_safe_field(tmp_path / "f", described, colored), "FIELD_SHAPES_MISMATCH")
 
 
 def slow_color(node: tuple[int, int, int], colors: NDArray[Any]) -> NDArray[Any]:
@@ -161,15 +155,3 @@ def test_nodes_without_color_do_not_count() -> None:
     point = ORIGIN + SIZE * np.array([0.9, 1.5, 1.5])  # between the first nodes along x and the second
     found = colored(colors).color(torch.from_numpy(point)[None], torch.zeros(1, 3)).numpy()
     np.testing.assert_allclose(found, [[0.25, 0.5, 0.75]], rtol=0, atol=1e-6)
-
-
-def test_colors_of_another_shape_are_refused() -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        parse_description(description(color={"form": "values"})).check(
-            {
-                "values": TensorSpec(VALUES.shape, "F32"),
-                "blocks": TensorSpec(BLOCKS.shape, "I32"),
-                "color.values": TensorSpec(VALUES.shape, "F16"),
-            }
-        )
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"

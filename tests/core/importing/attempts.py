@@ -48,32 +48,10 @@ def connect(family: int, address: Any) -> None:
         made.connect(address)
 
 
-def send_datagram(where: Where) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
-        made.sendto(b"x", ("127.0.0.1", where["port"]))
-
-
-def listen(_: Where) -> None:
-    socket.create_server(("127.0.0.1", 0)).close()
-
-
-def socket_pair(_: Where) -> None:
-    for end in socket.socketpair():
-        end.close()
-
-
-def fork(_: Where) -> None:
+def fork() -> None:
     if (child := os.fork()) == 0:
         os._exit(0)
     os.waitpid(child, 0)
-
-
-def spawn(_: Where) -> None:
-    os.waitpid(os.posix_spawn("/bin/true", ["true"], {}), 0)
-
-
-def trace_parent(where: Where) -> None:
-    call(101, _PTRACE_SEIZE, where["parent"], 0, 0)  # without stopping it; ends with this process
 
 
 def read_parents_memory(where: Where) -> None:
@@ -97,29 +75,7 @@ def take_parents_file(where: Where) -> None:
         os.close(opened)
 
 
-def change_parents_limits(where: Where) -> None:
-    limits = resource.prlimit(where["parent"], resource.RLIMIT_NOFILE)
-    resource.prlimit(where["parent"], resource.RLIMIT_NOFILE, limits)
-
-
-def change_parents_priority(where: Where) -> None:
-    os.setpriority(os.PRIO_PROCESS, where["parent"], os.getpriority(os.PRIO_PROCESS, where["parent"]))
-
-
-def bind_parent_to_a_core(where: Where) -> None:
-    os.sched_setaffinity(where["parent"], os.sched_getaffinity(where["parent"]))
-
-
-def signal_a_thread(where: Where) -> None:
-    call(234, where["parent"], where["parent"], 0)
-
-
-def queue_a_signal(where: Where) -> None:
-    information = (ctypes.c_int * 32)(0, 0, -1)
-    call(297, where["parent"], where["parent"], 0, ctypes.byref(information))
-
-
-def own_user_namespace(_: Where) -> None:
+def own_user_namespace() -> None:
     """In a thread, which may not have one: EINVAL says that the call itself was allowed."""
     ended: list[OSError] = []
 
@@ -139,33 +95,7 @@ def own_user_namespace(_: Where) -> None:
         raise ended[0]
 
 
-def shared_memory(_: Where) -> None:
-    call(31, call(29, 0, 4096, 0o1600), 0, None)  # made and marked for removal
-
-
-def message_queue(_: Where) -> None:
-    call(71, call(68, 0, 0o1600), 0, None)
-
-
-def outlive_the_parent(_: Where) -> None:
-    """Take back what ends this process with its parent, and put it there again."""
-    call(157, 1, 0, 0, 0, 0)
-    call(157, 1, signal.SIGKILL, 0, 0, 0)
-
-
-def file_in_memory(_: Where) -> None:
-    os.close(os.memfd_create("regnf"))
-
-
-def other_segments(_: Where) -> None:
-    call(154, 0, ctypes.create_string_buffer(8), 8)  # modify_ldt, to read
-
-
-def open_a_tree(where: Where) -> None:
-    os.close(call(428, _AT_FDCWD, where["store"].encode(), 0))
-
-
-def asynchronous_requests(_: Where) -> None:
+def asynchronous_requests() -> None:
     context = ctypes.c_ulong()
     call(206, 1, ctypes.byref(context))
     call(207, context)
@@ -194,7 +124,7 @@ def change_flags(where: Where) -> None:
     call(469, _AT_FDCWD, where["secret"].encode(), attributes, 24, 0)
 
 
-def start_a_thread(_: Where) -> None:
+def start_a_thread() -> None:
     thread = threading.Thread(target=int)
     try:
         thread.start()
@@ -207,18 +137,6 @@ def read(path: str | Path) -> bytes:
     return Path(path).read_bytes()
 
 
-def write(path: Path) -> None:
-    path.write_bytes(b"x")
-    path.unlink()
-
-
-def link(where: Where) -> None:
-    """A second name, in its own folder, for a file of the store."""
-    target = Path(where["home"], "linked")
-    os.link(where["secret"], target)
-    target.unlink()
-
-
 def move_out(where: Where) -> None:
     source, target = Path(where["home"], "mine"), Path(where["store"], "mine")
     source.write_bytes(b"")
@@ -229,56 +147,57 @@ def move_out(where: Where) -> None:
     target.unlink()
 
 
-def make_folder(where: Where) -> None:
-    Path(where["store"], "folder").mkdir()
-    Path(where["store"], "folder").rmdir()
+def make(name: str, made: Callable[[Path], object], undo: Callable[[Path], object] = Path.unlink) -> Attempt:
+    """Something new in the store, or at an absolute path, and away again."""
 
+    def attempt(where: Where) -> None:
+        path = Path(where["store"], name)
+        made(path)
+        undo(path)
 
-def make_link(where: Where) -> None:
-    Path(where["store"], "symbolic").symlink_to("/etc/passwd")
-    Path(where["store"], "symbolic").unlink()
-
-
-def keep_length(where: Where) -> None:
-    os.truncate(where["secret"], os.path.getsize(where["secret"]))
-
-
-def append(where: Where) -> None:
-    Path(where["secret"]).open("ab").close()
+    return attempt
 
 
 NETWORK: dict[str, Attempt] = {
     "connect to a port": lambda w: connect(socket.AF_INET, ("127.0.0.1", w["port"])),
     "connect to a socket in the file system": lambda w: connect(socket.AF_UNIX, w["unix"]),
     "connect to an abstract socket": lambda w: connect(socket.AF_UNIX, w["abstract"]),
-    "send a datagram": send_datagram,
-    "listen": listen,
-    "make a pair of sockets": socket_pair,
+    "send a datagram": lambda w: socket.socket(type=socket.SOCK_DGRAM).sendto(b"x", ("127.0.0.1", w["port"])),
+    "listen": lambda _: socket.create_server(("127.0.0.1", 0)).close(),
+    "make a pair of sockets": lambda _: [end.close() for end in socket.socketpair()],
 }
 PROCESSES: dict[str, Attempt] = {
-    "fork": fork,
-    "start a program": spawn,
+    "fork": lambda _: fork(),
+    "start a program": lambda _: os.waitpid(os.posix_spawn("/bin/true", ["true"], {}), 0),
     "signal the parent": lambda w: os.kill(w["parent"], 0),
-    "signal a thread of the parent": signal_a_thread,
-    "queue a signal to the parent": queue_a_signal,
+    "signal a thread of the parent": lambda w: call(234, w["parent"], w["parent"], 0),
+    "queue a signal to the parent": lambda w: call(
+        297, w["parent"], w["parent"], 0, ctypes.byref((ctypes.c_int * 32)(0, 0, -1))
+    ),
     "open the parent by its number": lambda w: os.close(os.pidfd_open(w["parent"])),
     "signal its own group": lambda w: os.killpg(0, 0),
-    "change the parent's limits": change_parents_limits,
-    "change the parent's priority": change_parents_priority,
-    "bind the parent to a core": bind_parent_to_a_core,
-    "share memory by a key": shared_memory,
-    "make a message queue": message_queue,
-    "make a user namespace": own_user_namespace,
-    "start a thread": start_a_thread,
-    "outlive the parent": outlive_the_parent,
-    "make a file in memory": file_in_memory,
-    "look at memory segments": other_segments,
-    "open a tree of files": open_a_tree,
-    "make asynchronous requests": asynchronous_requests,
+    "change the parent's limits": lambda w: resource.prlimit(
+        w["parent"], resource.RLIMIT_NOFILE, resource.prlimit(w["parent"], resource.RLIMIT_NOFILE)
+    ),
+    "change the parent's priority": lambda w: os.setpriority(
+        os.PRIO_PROCESS, w["parent"], os.getpriority(os.PRIO_PROCESS, w["parent"])
+    ),
+    "bind the parent to a core": lambda w: os.sched_setaffinity(w["parent"], os.sched_getaffinity(w["parent"])),
+    "share memory by a key": lambda _: call(31, call(29, 0, 4096, 0o1600), 0, None),  # made and marked for removal
+    "make a message queue": lambda _: call(71, call(68, 0, 0o1600), 0, None),
+    "make a user namespace": lambda _: own_user_namespace(),
+    "start a thread": lambda _: start_a_thread(),
+    # what ends this process with its parent is taken back, and put there again
+    "outlive the parent": lambda _: [call(157, 1, number, 0, 0, 0) for number in (0, signal.SIGKILL)],
+    "make a file in memory": lambda _: os.close(os.memfd_create("regnf")),
+    "look at memory segments": lambda _: call(154, 0, ctypes.create_string_buffer(8), 8),  # modify_ldt, to read
+    "open a tree of files": lambda w: os.close(call(428, _AT_FDCWD, w["store"].encode(), 0)),
+    "make asynchronous requests": lambda _: asynchronous_requests(),
     "watch a folder": watch_a_folder,
 }
 LOOKING: dict[str, Attempt] = {
-    "trace the parent": trace_parent,
+    # without stopping it; ends with this process
+    "trace the parent": lambda w: call(101, _PTRACE_SEIZE, w["parent"], 0, 0),
     "read the parent's memory through a file": read_parents_memory,
     "read the parent's memory through a call": copy_parents_memory,
     "take an open file from the parent": take_parents_file,
@@ -293,14 +212,15 @@ FILES: dict[str, Attempt] = {
     "list the store": lambda w: os.listdir(w["store"]),
     "read the system's users": lambda w: read("/etc/passwd"),
     "list the root": lambda w: os.listdir("/"),
-    "write to the store": lambda w: write(Path(w["store"], "new")),
-    "append to a file of the store": append,
-    "cut a file of the store": keep_length,
+    "write to the store": make("new", lambda path: path.write_bytes(b"x")),
+    "append to a file of the store": lambda w: Path(w["secret"]).open("ab").close(),
+    "cut a file of the store": lambda w: os.truncate(w["secret"], os.path.getsize(w["secret"])),
     "move a file into the store": move_out,
-    "link a file of the store": link,
-    "make a folder": make_folder,
-    "make a symbolic link": make_link,
-    "write to a common temporary folder": lambda w: write(Path("/tmp", f"regnf-attempt-{os.getpid()}")),
+    # a second name, in its own folder
+    "link a file of the store": lambda w: [os.link(w["secret"], f"{w['home']}/new"), os.unlink(f"{w['home']}/new")],
+    "make a folder": make("folder", Path.mkdir, Path.rmdir),
+    "make a symbolic link": make("symbolic", lambda path: path.symlink_to("/etc/passwd")),
+    "write to a common temporary folder": make(f"/tmp/regnf-{os.getpid()}", lambda path: path.write_bytes(b"x")),
 }
 ATTRIBUTES: dict[str, Attempt] = {
     "change a mode": lambda w: os.chmod(w["secret"], os.stat(w["secret"]).st_mode & 0o777),

@@ -87,9 +87,7 @@ def neus(skip: int = 3, multires: int = 3) -> Sample:
     for i, (weight, bias) in enumerate(layers):
         state |= normalized(f"lin{i}", weight, bias)
     beside = {"variance_network_fine": {"variance": torch.ones(())}, "iter_step": 300_000}
-    return Sample(
-        {"sdf_network_fine": state, "variance_network_fine": {"variance": torch.ones(())}, **beside}, function
-    )
+    return Sample({"sdf_network_fine": state} | beside, function)
 
 
 def siren() -> Sample:
@@ -176,12 +174,14 @@ def _gridded(
     return function, table, layers
 
 
-def instant_nsr_pl(step: int = 20_000, progressive: bool = False, relu: bool = False) -> Sample:
+def instant_nsr_pl(
+    step: int = 20_000, progressive: bool = False, relu: bool = False, active: int | None = None
+) -> Sample:
     """VolumeSDF with a VanillaMLP, six levels; the progressive grid opens one every 1000 steps, from four on."""
     grid = HashGridConfig.from_top_resolution(
         2048, levels=6, base_resolution=16, log2_table_size=9, interpolation="linear"
     )
-    active = min(6, 4 + step // 1000) if progressive else 6
+    active = active or (min(6, 4 + step // 1000) if progressive else 6)
     function, table, layers = _gridded(grid, active, 1.5, per_radius=True, relu=relu)
     name = "model.geometry.encoding.encoding." + ("encoding.params" if progressive else "params")
     state = OrderedDict({name: torch.from_numpy(table).float().flatten()})

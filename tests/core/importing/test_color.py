@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from regnf_core.schema.safe_format import parse_description
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.test_families import ANGELO_GRID
+from tests.core.importing.test_reference_checkpoints import SAID
 from tests.core.importing.test_sdfstudio import F, convert
 
 Change = Callable[[dict[str, Any]], object]
@@ -30,9 +31,7 @@ def with_tensor(name: str, value: torch.Tensor) -> Change:
 
 CHANGES: dict[str, Change] = {
     "a part is missing": lambda pipeline: pipeline.pop(F + "clin0.weight_g"),
-    "a layer is missing": lambda pipeline: [
-        pipeline.pop(F + f"clin0.{part}") for part in ("bias", "weight_g", "weight_v")
-    ],
+    "a layer is missing": lambda state: [state.pop(F + f"clin0.{part}") for part in ("bias", "weight_g", "weight_v")],
     "other columns": with_tensor("clin0.weight_v", torch.ones(8, 130)),
     "four results": with_tensor("clin1.weight_v", torch.ones(4, 8)),
     "not finite": with_tensor("clin1.bias", torch.full((3,), torch.nan)),
@@ -40,6 +39,13 @@ CHANGES: dict[str, Change] = {
     "no tensor": lambda pipeline: pipeline.update({F + "clin0.bias": "text"}),
     "columns of no direction": with_tensor("embedding_appearance.embedding.weight", torch.ones(5, 31)),
 }
+LAYOUT = SAID | {"hash": SAID["hash"] | {"features_per_level": 2}}
+
+
+@cache
+def whole() -> ConvertedField:
+    """With its color."""
+    return convert(checkpoint(), **LAYOUT)
 
 
 def built(converted: ConvertedField) -> Any:
@@ -51,32 +57,32 @@ def built(converted: ConvertedField) -> Any:
 def test_a_color_that_is_not_understood_is_left_out(change: Change) -> None:
     values = checkpoint()
     change(values["pipeline"])
-    converted, whole = convert(values), convert(checkpoint())
+    converted = convert(values, **LAYOUT)
     assert [warning.partition(":")[0] for warning in converted.warnings] == ["COLOR_LEFT_OUT"]
     assert "color" not in converted.description
     assert not has_color(built(converted))
-    assert has_color(built(whole))
+    assert has_color(built(whole()))
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.5
-    assert torch.equal(built(converted).signed_distance(points), built(whole).signed_distance(points))
+    assert torch.equal(built(converted).signed_distance(points), built(whole()).signed_distance(points))
 
 
 def test_a_checkpoint_without_color_is_nothing_to_warn_of() -> None:
     values = checkpoint()
     for name in [name for name in values["pipeline"] if ".clin" in name]:
         del values["pipeline"][name]
-    converted = convert(values)
+    converted = convert(values, **LAYOUT)
     assert converted.warnings == ()
     assert not has_color(built(converted))
     assert built(converted).inverse_deviation == pytest.approx(np.exp(3.0), rel=1e-6)
 
 
 def test_an_appearance_of_which_nothing_is_said_is_told() -> None:
-    (warning,) = convert(checkpoint()).warnings
+    (warning,) = whole().warnings
     assert warning.startswith("COLOR_ASSUMED: ")
     assert "color.average_appearance true" in warning  # what to say
     for said in (True, False):
-        assert convert(checkpoint(), color={"average_appearance": said}).warnings == ()
-    assert convert(checkpoint(), color={"keep": False}).warnings == ()
+        assert convert(checkpoint(), **LAYOUT, color={"average_appearance": said}).warnings == ()
+    assert convert(checkpoint(), **LAYOUT, color={"keep": False}).warnings == ()
 
 
 @pytest.mark.parametrize(("keep", "words"), [(None, ["COLOR_LEFT_OUT"]), (False, [])])
@@ -99,7 +105,7 @@ def test_all_readings_have_the_color() -> None:
 
 
 def test_a_color_that_takes_too_long_is_left_out() -> None:
-    converted = replace(convert(checkpoint()), readings=())
+    converted = whole()
     costly = with_affordable_color(converted, ImportLimits(work_s=0.1))
     assert [warning.partition(":")[0] for warning in costly.warnings] == ["COLOR_LEFT_OUT"]
     assert not has_color(built(costly))
@@ -110,7 +116,7 @@ def test_numbers_of_any_size_give_a_color() -> None:
     values = checkpoint()
     values["pipeline"][F + "clin0.weight_g"] *= 1e30
     values["pipeline"][F + "clin1.weight_g"] *= 1e30
-    field = built(convert(values))
+    field = built(convert(values, **LAYOUT))
     points, directions = torch.rand(2, 100, 3, generator=torch.Generator().manual_seed(0))
     color = field.color(points, torch.nn.functional.normalize(directions, dim=-1))
     assert bool(((color >= 0.0) & (color <= 1.0)).all())

@@ -136,28 +136,21 @@ def test_codes_that_are_not_there(drop: str, description: dict[str, Any], reason
     assert_refused(lambda: imported(tmp_path, values, **description), reason)
 
 
-def test_a_level_mask_may_be_said(tmp_path: Path) -> None:
-    sample = small.instant_nsr_pl(step=999, progressive=True)
-    sample.checkpoint["global_step"] = 50_000
-    imported(tmp_path, sample.checkpoint, level_mask=4, **INSTANT_GRID)
-    assert_is(tmp_path, sample.function)
-
-
-def test_instant_nsr_pl_without_its_sphere_has_relu(tmp_path: Path) -> None:
-    sample = small.instant_nsr_pl(relu=True)
-    imported(tmp_path, sample.checkpoint, **INSTANT_GRID | {"activation": "relu"})
-    assert_is(tmp_path, sample.function)
-
-
-def test_instant_nsr_pl_may_add_to_its_result_and_scale_it(tmp_path: Path) -> None:
-    sample = small.instant_nsr_pl()
-    imported(tmp_path, sample.checkpoint, output_bias=0.05, output_scale=0.5, **INSTANT_GRID)
-    assert_is(tmp_path, lambda x: (sample.function(x) + 0.05) * 0.5)
-
-
-def test_instant_nsr_pl_has_no_other_activations(tmp_path: Path) -> None:
-    values = small.instant_nsr_pl().checkpoint
-    assert_refused(lambda: imported(tmp_path, values, activation="sine"), "INVALID_DESCRIPTION")
+@pytest.mark.parametrize(
+    ("make", "said", "bias", "scale"),
+    [
+        (lambda: small.instant_nsr_pl(50_000, True, active=4), {"level_mask": 4}, 0.0, 1.0),
+        (lambda: small.instant_nsr_pl(relu=True), {"activation": "relu"}, 0.0, 1.0),
+        (small.instant_nsr_pl, {"output_bias": 0.05, "output_scale": 0.5}, 0.05, 0.5),
+    ],
+)
+def test_what_may_be_said_of_instant_nsr_pl(
+    make: Callable[[], small.Sample], said: dict[str, Any], bias: float, scale: float, tmp_path: Path
+) -> None:
+    sample = make()
+    imported(tmp_path, sample.checkpoint, **INSTANT_GRID | said)
+    assert_is(tmp_path, lambda x: (sample.function(x) + bias) * scale)
+    assert_refused(lambda: imported(tmp_path, sample.checkpoint, activation="sine"), "INVALID_DESCRIPTION")
 
 
 def round_siren(sign: float, size: float = 0.6) -> dict[str, torch.Tensor]:

@@ -18,18 +18,11 @@ from regnf_core.importing.gate.convert import FIELD_NAME, convert_file, run
 from regnf_core.importing.gate.picture import candidate_name
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.archives import assert_refused
-from tests.core.importing.networks.shapes import random_shape
-from tests.core.importing.networks.training import in_cube, train
+from tests.core.importing.networks.training import in_cube, random_shape, train
 
 LAYOUT = GridLayout(levels=4, features=2, log2_size=12, base=8, growth=1.5, smoothstep=False)
-GRID = {
-    "levels": 4,
-    "features_per_level": 2,
-    "log2_table_size": 12,
-    "base_resolution": 8,
-    "per_level_scale": 1.5,
-    "interpolation": "linear",
-}
+GRID: dict[str, Any] = {"levels": 4, "features_per_level": 2, "log2_table_size": 12, "base_resolution": 8}
+GRID |= {"per_level_scale": 1.5, "interpolation": "linear"}
 WIDTHS = [3 + LAYOUT.levels * LAYOUT.features, 64, 5]
 
 
@@ -74,45 +67,35 @@ class Trained:
         assert (error > 1e-3) if differs else (error < 1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_network_that_began_as_a_sphere_has_softplus(seed: int, tmp_path: Path) -> None:
-    made = Trained(True, softplus, seed)
+def test_a_network_that_began_as_a_sphere_has_softplus(tmp_path: Path) -> None:
+    made = Trained(True, softplus, 0)
     report = convert_file(made.save(tmp_path), tmp_path, {"hash": GRID}, ImportLimits())
     assert any("softplus" in why and "one sign" in why for why in report["why"])
     assert any(warning.startswith("ACTIVATION_ASSUMED") for warning in report["warnings"])
     made.assert_is(tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_other_network_is_asked_about(seed: int, tmp_path: Path) -> None:
-    """Read as the other, it is another field, and behaves no worse than many that are right."""
+    """Both are drawn. Read as the other, it is another field, and behaves no worse than many that are right."""
     made = Trained(False, torch.relu, seed)
     upload = made.save(tmp_path)
-    assert_refused(lambda: convert_file(upload, tmp_path, {"hash": GRID}, ImportLimits()), "LAYOUT_AMBIGUOUS")
+    refused = run(upload, tmp_path, {"hash": GRID}, ImportLimits(), ask_by_picture=seed == 0)
+    assert refused["reason"] == "LAYOUT_AMBIGUOUS"
+    assert [one["description"] for one in refused["candidates"]] == [{"activation": "softplus"}, {"activation": "relu"}]
+    assert all(json.dumps(one["description"]) in refused["detail"] for one in refused["candidates"])
+    assert all((tmp_path / candidate_name(number)).exists() == (seed == 0) for number in (1, 2))
     for activation in ("softplus", "relu"):
         said = {"hash": GRID, "activation": activation, "accept_implausible": True}
         convert_file(upload, tmp_path, said, ImportLimits())
         made.assert_is(tmp_path, differs=activation == "softplus")
 
 
-def test_both_are_drawn_for_whoever_is_asked(tmp_path: Path) -> None:
-    made = Trained(False, softplus, 1)
-    refused = run(made.save(tmp_path), tmp_path, {"hash": GRID}, ImportLimits(), ask_by_picture=True)
-    assert [one["description"] for one in refused["candidates"]] == [{"activation": "softplus"}, {"activation": "relu"}]
-    assert all(json.dumps(one["description"]) in refused["detail"] for one in refused["candidates"])
-    assert all((tmp_path / candidate_name(number)).exists() for number in (1, 2))
-
-
 @pytest.mark.parametrize(
     ("distance", "features", "told"),
     [
-        (64, 256, True),
-        (57, 256, True),
-        (7, 20, True),
-        (52, 256, False),
-        (64, 180, True),
-        (64, 160, False),
-        (64, 0, False),
+        *[(64, 256, True), (57, 256, True), (7, 20, True), (64, 180, True)],
+        *[(52, 256, False), (64, 160, False), (64, 0, False)],
     ],
 )
 def test_few_signs_tell_nothing(distance: int, features: int, told: bool, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,13 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.fields.build import build_field, open_field
+from regnf_core.fields.build import open_field
 from regnf_core.importing.containers.sniff import sniff_format
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.onnx import convert_onnx
-from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.onnx import model as reader
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.safe_format import parse_description, write_safe_field
+from regnf_core.schema.safe_format import write_safe_field
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.in_process import convert
 from tests.core.importing.onnx_models import model, nodes, sphere
@@ -50,15 +49,15 @@ class Network(nn.Module):
         return points.norm(dim=-1, keepdim=True) - 0.5 + 0.05 * self.second(hidden)
 
 
-def test_a_model_whose_few_numbers_are_all_constants_goes_through_the_gate(tmp_path: Path) -> None:
-    """Its field file holds no tensor; and may be uploaded again."""
-    report = import_field(saved(tmp_path, sphere().SerializeToString()), tmp_path / "out")
-    assert (report.family, report.parameters) == ("onnx", 0)
+def test_a_model_whose_few_numbers_are_all_constants_is_taken(tmp_path: Path) -> None:
+    """Its field file holds no tensor; and may be uploaded again. Through the gate's process: cost/test_onnx_work.py."""
+    report = convert(saved(tmp_path, sphere().SerializeToString()), tmp_path / "out")
+    assert (report["family"], report["parameters"]) == ("onnx", 0)
     again = convert(tmp_path / "out" / "field.safetensors", tmp_path / "again")
-    assert again["plausibility"] == pytest.approx(report.plausibility, abs=1e-6)  # processes may round differently
+    assert again["plausibility"] == report["plausibility"]
 
 
-@pytest.mark.parametrize("exporter", ["of today", "of before"])
+@pytest.mark.parametrize("exporter", [pytest.param("of today", marks=pytest.mark.long), "of before"])
 def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = Network().eval()
@@ -74,9 +73,7 @@ def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Pa
             torch.onnx.export(network, (torch.zeros(8, 3),), str(tmp_path / "net.onnx"), dynamo=False, **names)
     report = convert(tmp_path / "net.onnx", tmp_path / "out", {"bounds": [[-1, -1, -1], [1, 1, 1]], "label": "ball"})
     assert (report["family"], report["label"], report["warnings"]) == ("onnx", "ball", [])
-    assert report["parameters"] in range(
-        27 * 32 + 32 + 32, 27 * 32 + 32 + 32 + 20
-    )  # a few constants of the encoding too
+    assert 0 <= report["parameters"] - (27 * 32 + 32 + 32) < 20  # a few constants of the encoding too
     at = (2 * torch.rand(3000, 3) - 1).requires_grad_()
     expected = network(at)[:, 0]
     (slope,) = torch.autograd.grad(expected.sum(), at)
@@ -87,11 +84,7 @@ def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Pa
 
 def test_the_report_says_how_it_is_evaluated() -> None:
     open_number, fixed, single = (converted(sphere(given=(n, 3), made=(n, 1))) for n in ("n", 512, 1))
-    assert (open_number.description["batch"], fixed.description["batch"], single.description["batch"]) == (
-        1024,
-        512,
-        1024,
-    )
+    assert [found.description["batch"] for found in (open_number, fixed, single)] == [1024, 512, 1024]
     assert "made for 1 points" in single.why[1]
     assert [warning.split(":")[0] for warning in open_number.warnings] == ["BOUNDS_ASSUMED"]
     assert converted(sphere(), {"bounds": [[-1, -1, -1], [1, 1, 1]], "sign": -1}).warnings == ()
@@ -99,17 +92,13 @@ def test_the_report_says_how_it_is_evaluated() -> None:
 
 
 def test_a_field_that_mixes_its_points_is_none(tmp_path: Path) -> None:
-    proto = model(
-        "r = ReduceL2 x axes keepdims:1; m = ReduceMean r zero keepdims:1; y = Sub r m", HALF | {"zero": np.array([0])}
-    )
-    upload = saved(tmp_path, proto.SerializeToString())
-    assert_refused(lambda: convert(upload, tmp_path / "out"), "FIELD_NOT_A_FUNCTION")
-
-
-def test_a_graph_of_another_size_than_it_says(tmp_path: Path) -> None:
-    proto = model("f = Reshape x one; r = ReduceL2 f axes keepdims:1; y = Sub r half", HALF | {"one": np.array([1, 3])})
-    upload = saved(tmp_path, proto.SerializeToString())
-    assert_refused(lambda: convert(upload, tmp_path / "out"), "ONNX_GRAPH_INVALID")
+    """And a graph of another size than it says is refused too."""
+    mixed = "r = ReduceL2 x axes keepdims:1; m = ReduceMean r zero keepdims:1; y = Sub r m"
+    other = "f = Reshape x one; r = ReduceL2 f axes keepdims:1; y = Sub r half"
+    values = {"zero": np.array([0]), "one": np.array([1, 3])}
+    for number, (body, reason) in enumerate(((mixed, "FIELD_NOT_A_FUNCTION"), (other, "ONNX_GRAPH_INVALID"))):
+        upload, out = saved(tmp_path, model(body, HALF | values).SerializeToString()), tmp_path / f"out{number}"
+        assert_refused(partial(convert, upload, out), reason)
 
 
 def external(proto: onnx.ModelProto) -> None:
@@ -217,34 +206,3 @@ def test_shapes_that_depend_on_the_points(tmp_path: Path) -> None:
 
 def test_an_old_operator_set() -> None:
     assert_refused(lambda: converted(sphere(opset=8)), "ONNX_NOT_SUPPORTED")
-
-
-def test_bytes_changed_at_random_are_refused_or_taken() -> None:
-    """Nothing but a refusal comes of it: no other exception, no endless work."""
-    sound = model("h = Gemm x w b; g = Softplus h; y = MatMul g v", _weights()).SerializeToString()
-    rng = np.random.default_rng(0)
-    refused = 0
-    for _ in range(400):
-        data = bytearray(sound)
-        for _ in range(rng.integers(1, 4)):
-            data[rng.integers(len(data))] = rng.integers(256)
-        data = data[: rng.integers(1, len(data) + 1)] if rng.random() < 0.2 else data
-        try:
-            _evaluated(bytes(data))
-        except FieldFormatError:
-            refused += 1
-    assert 50 < refused < 400
-
-
-def _weights() -> dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
-    rng = np.random.default_rng(0)
-    shapes = {"w": (3, 4), "b": (4,), "v": (4, 1)}
-    return {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-
-
-def _evaluated(data: bytes) -> None:
-    found = convert_onnx(memoryview(data), BUDGET, UploadDescription())
-    field = build_field(
-        parse_description(found.description), {name: torch.from_numpy(array) for name, array in found.tensors.items()}
-    )
-    field.signed_distance(torch.zeros(2, 3))

@@ -92,12 +92,10 @@ def test_what_the_settings_say_is_followed(tmp_path: Path) -> None:
     assert float(distance) == pytest.approx(0.2, abs=1e-5)
 
 
-def without_biases(checkpoint: dict[str, Any]) -> None:
-    del checkpoint["sdf"]["layers.0.bias"], checkpoint["sdf"]["lout.bias"]
-
-
 def test_a_decoder_without_biases(tmp_path: Path) -> None:
-    assert converted(tmp_path, floor(without_biases))["warnings"] == []
+    checkpoint = floor()
+    del checkpoint["sdf"]["layers.0.bias"], checkpoint["sdf"]["lout.bias"]
+    assert converted(tmp_path, checkpoint)["warnings"] == []
 
 
 def set_option(name: str, value: Any) -> Any:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,6 @@ def layout(header: object, body: bytes = b"", length: int | None = None) -> byte
 
 def entry(begin: int, end: int, **values: Any) -> dict[str, Any]:
     return {"dtype": "F32", "shape": [(end - begin) // 4], "data_offsets": [begin, end]} | values
-
-
-def assert_rejected(data: bytes, reason: str) -> None:
-    assert_refused(lambda: read_header(memoryview(data)), reason)
 
 
 def test_a_sound_header_is_read() -> None:
@@ -66,7 +64,7 @@ def test_a_sound_header_is_read() -> None:
     ],
 )
 def test_faulty_headers_are_refused(data: bytes, reason: str) -> None:
-    assert_rejected(data, reason)
+    assert_refused(lambda: read_header(memoryview(data)), reason)
 
 
 @pytest.fixture(scope="module")
@@ -90,17 +88,12 @@ def test_its_description_may_be_overruled(field_file: Path, tmp_path: Path) -> N
     assert (description["label"], description["level_mask"], description["contraction"]) == ("moon", 3, "linf")
 
 
-@pytest.mark.parametrize(
-    ("description", "reason"),
-    [
+def test_what_it_says_of_itself_stands(field_file: Path, tmp_path: Path) -> None:
+    for said, reason in (
         ({"family": "sdfstudio_neus_facto"}, "FAMILY_NOT_SUPPORTED"),
         ({"hash": {"base_resolution": 8}}, "INVALID_DESCRIPTION"),
-    ],
-)
-def test_what_it_says_of_itself_stands(
-    field_file: Path, tmp_path: Path, description: dict[str, Any], reason: str
-) -> None:
-    assert_refused(lambda: convert_file(field_file, tmp_path, description, ImportLimits()), reason)
+    ):
+        assert_refused(partial(convert_file, field_file, tmp_path, said, ImportLimits()), reason)
 
 
 def test_other_safetensors_files_are_refused(tmp_path: Path) -> None:
@@ -115,14 +108,19 @@ def test_weights_that_are_not_finite_are_refused(field_file: Path, tmp_path: Pat
     assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "FIELD_NOT_FINITE")
 
 
-@pytest.mark.parametrize("label", ["\ud800", "a\0b", "a\r\nX-Bad: 1", "a\n", "a\u202eb"])
-def test_labels_that_no_file_can_hold_or_no_page_show_are_refused(field_file: Path, tmp_path: Path, label: str) -> None:
-    """JSON can spell half a surrogate pair; UTF-8 cannot."""
+def described(field_file: Path, change: Callable[[dict[str, Any]], str]) -> bytes:
+    """The field file with another text for its description."""
     data = field_file.read_bytes()
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
-    header["__metadata__"]["field"] = json.dumps(json.loads(header["__metadata__"]["field"]) | {"label": label})
-    path = saved(tmp_path, layout(header, data[8 + length :]))
+    header["__metadata__"]["field"] = change(json.loads(header["__metadata__"]["field"]))
+    return layout(header, data[8 + length :])
+
+
+@pytest.mark.parametrize("label", ["\ud800", "a\0b", "a\r\nX-Bad: 1", "a\n", "a\u202eb"])
+def test_labels_that_no_file_can_hold_or_no_page_show_are_refused(field_file: Path, tmp_path: Path, label: str) -> None:
+    """JSON can spell half a surrogate pair; UTF-8 cannot."""
+    path = saved(tmp_path, described(field_file, lambda entries: json.dumps(entries | {"label": label})))
     assert_refused(lambda: convert_file(path, tmp_path / "out", None, ImportLimits()), "SAFE_FORMAT_INVALID")
 
 
@@ -132,13 +130,12 @@ def test_a_description_that_nests_deep_is_refused(
     field_file: Path, tmp_path: Path, depth: int, opening: str, closing: str
 ) -> None:
     """What can be read but not be written again, by this program or another's."""
-    data = field_file.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    described = json.loads(header["__metadata__"]["field"]) | {"source": {"of": "@"}}
-    deep = json.dumps(described).replace('"@"', opening * depth + "1" + closing * depth)
-    header["__metadata__"]["field"] = deep
-    path = saved(tmp_path, layout(header, data[8 + length :]))
+
+    def nested(entries: dict[str, Any]) -> str:
+        deep = opening * depth + "1" + closing * depth
+        return json.dumps(entries | {"source": {"of": "@"}}).replace('"@"', deep)
+
+    path = saved(tmp_path, described(field_file, nested))
     assert_refused(lambda: convert_file(path, tmp_path / "out", None, ImportLimits()), "SAFE_FORMAT_INVALID")
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad
-from scipy.special import k1
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import ResamplingOptions
@@ -63,14 +62,6 @@ def test_gradient_against_finite_differences() -> None:
     assert torch.autograd.gradcheck(robust_kernel, inputs)
 
 
-def test_partition_where_it_is_known() -> None:
-    # alpha = 1: integral of exp(1 - sqrt(x^2 + 1)) = 2 e K1(1); alpha -> 0: integral of 1 / (x^2 / 2 + 1) = pi sqrt 2.
-    assert float(log_partition(torch.tensor(1.0, dtype=torch.float64))) == pytest.approx(math.log(2 * math.e * k1(1.0)))
-    assert float(log_partition(torch.tensor(1e-7, dtype=torch.float64))) == pytest.approx(
-        math.log(math.pi * math.sqrt(2)), abs=1e-5
-    )
-
-
 @pytest.mark.parametrize("shape", [0.001, 0.05, 0.3, 0.7, 0.999])
 def test_partition_by_another_quadrature(shape: float) -> None:
     def density(u: float) -> float:
@@ -88,14 +79,10 @@ def test_partition_gradient_against_finite_differences() -> None:
     assert torch.autograd.gradcheck(log_partition, (torch.tensor(0.5, dtype=torch.float64, requires_grad=True),))
 
 
-def test_starts_at_scale_one_and_mid_shape() -> None:
+def test_starts_at_scale_one_and_mid_shape_and_cannot_leave_the_ranges() -> None:
     kernel = AdaptiveKernel()
     assert float(kernel.scale.detach()) == pytest.approx(1.0)
     assert float(kernel.shape.detach()) == pytest.approx(sum(SHAPE_RANGE) / 2)
-
-
-def test_latents_cannot_leave_the_ranges() -> None:
-    kernel = AdaptiveKernel()
     for latent in (-1e3, 1e3):
         with torch.no_grad():
             kernel.latents.fill_(latent)
@@ -106,7 +93,7 @@ def test_latents_cannot_leave_the_ranges() -> None:
 def _learn(residuals: torch.Tensor) -> AdaptiveKernel:
     kernel = AdaptiveKernel()
     adam = torch.optim.Adam([kernel.latents], lr=0.05)
-    for _ in range(400):
+    for _ in range(250):
         adam.zero_grad()
         kernel.negative_log_likelihood((residuals,)).backward()  # type: ignore[no-untyped-call]
         adam.step()
@@ -234,29 +221,21 @@ def test_accepted_samples_meet_all_four_conditions() -> None:
     torch.testing.assert_close(new.own_distance, own.signed_distance(new.points))
 
 
-def test_nothing_is_accepted_where_the_other_surface_is_not() -> None:
+def test_nothing_is_accepted_where_the_other_surface_is_not_and_the_transform_carries_samples_there() -> None:
     old = ball_samples(200)
     far = resample(old, sphere(0.3), sphere(0.3, (0.9, 0.0, 0.0)), IDENTITY, OPTIONS, torch.Generator().manual_seed(1))
     assert torch.equal(far.points, old.points)
-
-
-def test_the_transform_carries_samples_to_the_other_field() -> None:
-    old = ball_samples(200)
     T_other_own = Sim3.from_quaternion(2.0, [0, 0, 0, 1], [0.5, 0.0, 0.0])
     grown = resample(old, sphere(0.3), sphere(0.6, (0.5, 0, 0)), T_other_own, OPTIONS, torch.Generator().manual_seed(1))
     assert len(grown.points) > 210
 
 
-def test_the_number_of_samples_stays_bounded() -> None:
+def test_the_number_of_samples_stays_bounded_and_the_seed_decides_which() -> None:
     few = ResamplingOptions(max_samples=250)
-    new = resample(ball_samples(240), sphere(0.3), sphere(0.3), IDENTITY, few, torch.Generator().manual_seed(1))
-    assert len(new.points) == 250
-
-
-def test_the_same_seed_gives_the_same_samples() -> None:
     one, two, other = (
-        resample(ball_samples(200), sphere(0.3), sphere(0.3), IDENTITY, OPTIONS, torch.Generator().manual_seed(seed))
+        resample(ball_samples(240), sphere(0.3), sphere(0.3), IDENTITY, few, torch.Generator().manual_seed(seed)).points
         for seed in (5, 5, 6)
     )
-    assert torch.equal(one.points, two.points)
-    assert not torch.equal(one.points[200:], other.points[200:])
+    assert torch.equal(one, two)
+    assert not torch.equal(one, other)
+    assert len(one) == 250

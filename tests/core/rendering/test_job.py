@@ -67,7 +67,7 @@ def test_an_orbit_through_a_pillar_shows_what_it_goes_round(tmp_path: Path) -> N
     place = {"position": [1.0, 0.0, 0.25], "target": [0.0, 0.0, 0.25]}
     with pytest.raises(RegnfError) as caught:
         run_render(scene, RenderRequest.from_dict(values | {"look_at": [place]}), ball, tmp_path)
-    assert caught.value.reason == "CAMERA_IN_MATTER"
+    assert caught.value.reason == "CAMERA_INVALID"
 
 
 def test_cameras_of_poses_and_places(tmp_path: Path) -> None:

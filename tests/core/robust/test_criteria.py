@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,12 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from regnf_core import RegistrationResult, register, register_batch
+from regnf_core.document import result_document
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import LibraryObject, model_object, search_library
 from regnf_core.options import RegistrationOptions, RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.verdict.evaluation import PoseVerdict, evaluate_pose
 from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidence
 from regnf_core.robust.working_frame import Samples
+from tests.core.analytic import chair, chair_pose, room, table
+from tests.core.robust.shapes import detection, run, slab_table, table_room
+from tests.golden.cases import SLAB_BOX
 
 D = torch.float64
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -66,34 +74,39 @@ def verdict_on(
     return evaluate_pose(told(evidence, hidden, unexplained), 0, rivals, RobustOptions(**options), probability)
 
 
-def test_coarse_agreement_by_hand() -> None:
-    # Scene: 8 of 10 near ones within 0.03, one too far to count. Object: 9 of 10 within, one of all 10 in free space.
-    found = evidence_of([0.02] * 8 + [0.05] * 2 + [0.4], [0.025] * 9 + [0.06])
-    assert float(found.coarse[0]) == pytest.approx(0.8 - 0.1)
-
-
-def test_matter_around_the_object_is_no_free_space() -> None:
-    # 2 of 10 within matter: no agreement, but none of the 8 others lies in free space.
-    assert float(evidence_of([0.0] * 10, [0.0] * 8 + [-0.2] * 2).coarse[0]) == pytest.approx(0.8)
+@pytest.mark.parametrize(
+    ("scene_to_object", "object_to_scene", "expected"),
+    [
+        # Scene: 8 of 10 near ones within 0.03, one too far to count. Object: 9 of 10 within, one in free space.
+        ([0.02] * 8 + [0.05] * 2 + [0.4], [0.025] * 9 + [0.06], 0.8 - 0.1),
+        # 2 of 10 within matter: no agreement, but none of the 8 others lies in free space.
+        ([0.0] * 10, [0.0] * 8 + [-0.2] * 2, 0.8),
+    ],
+)
+def test_coarse_agreement_by_hand(scene_to_object: list[float], object_to_scene: list[float], expected: float) -> None:
+    found = evidence_of(scene_to_object, object_to_scene).numbers["coarse_agreement"]
+    assert float(found[0]) == pytest.approx(expected)
 
 
 FREE = evidence_of([0.0] * 10, [0.0] * 7 + [0.1] * 3)
 """Three tenths of the object are where the scene is free."""
 
 
-@pytest.mark.parametrize("enough", [0.5, 0.9, 0.95])
-def test_from_the_probability_of_the_options_on_shares_do_not_count(enough: float) -> None:
-    found = verdict_on(FREE, probability=enough, share_limits_below=enough, min_probability=0.5)
-    assert (found.verdict, found.reason) == ("registered", "SURFACES_AGREE")
-    several = verdict_on(FREE, probability=enough, share_limits_below=enough, min_probability=0.5, rivals=1)
-    assert (several.verdict, several.reason) == ("ambiguous", "SEVERAL_POSES_AGREE")
-    less = verdict_on(FREE, probability=enough - 0.01, share_limits_below=enough, min_probability=0.2)
-    assert (less.verdict, less.reason) == ("rejected", "FREE_SPACE_VIOLATED")
-
-
-def test_the_share_limits_may_count_always_or_never() -> None:
-    assert verdict_on(FREE, probability=1.0, share_limits_below=1.0).reason == "FREE_SPACE_VIOLATED"
-    assert verdict_on(FREE, probability=0.7, share_limits_below=0.0).reason == "SURFACES_AGREE"
+@pytest.mark.parametrize(
+    ("probability", "below", "rivals", "verdict", "reason"),
+    [
+        *((enough, enough, 0, "registered", "SURFACES_AGREE") for enough in (0.5, 0.9, 0.95)),
+        *((enough, enough, 1, "ambiguous", "SEVERAL_POSES_AGREE") for enough in (0.5, 0.9, 0.95)),
+        *((enough - 0.01, enough, 0, "rejected", "FREE_SPACE_VIOLATED") for enough in (0.5, 0.9, 0.95)),
+        (1.0, 1.0, 0, "rejected", "FREE_SPACE_VIOLATED"),  # always
+        (0.7, 0.0, 0, "registered", "SURFACES_AGREE"),  # never
+    ],
+)
+def test_from_the_probability_of_the_options_on_shares_do_not_count(
+    probability: float, below: float, rivals: int, verdict: str, reason: str
+) -> None:
+    found = verdict_on(FREE, probability, rivals=rivals, share_limits_below=below, min_probability=0.2)
+    assert (found.verdict, found.reason) == (verdict, reason)
 
 
 @given(
@@ -106,7 +119,6 @@ def test_the_share_limits_may_count_always_or_never() -> None:
 def test_no_answer_below_the_minimum_is_accepted(
     probability: float, least: float, below: float, shares: float, rivals: int
 ) -> None:
-    """Whatever the other options say. And where nothing else is wrong, every answer from it on is."""
     options: dict[str, Any] = {
         "min_probability": least,
         "share_limits_below": below,
@@ -142,8 +154,7 @@ def test_by_default_a_pose_below_nine_tenths_has_to_keep_the_share_limits() -> N
     assert verdict_on(probability=0.7).verdict == "registered"
     assert verdict_on(probability=0.7).margin == 0.0
     less = verdict_on(probability=0.69)
-    assert (less.verdict, less.reason) == ("rejected", "LOW_PROBABILITY")
-    assert less.margin == pytest.approx(-0.01)
+    assert (less.verdict, less.reason, round(less.margin, 6)) == ("rejected", "LOW_PROBABILITY", -0.01)
     assert verdict_on(FREE, probability=0.69).reason == "FREE_SPACE_VIOLATED"
     assert verdict_on(FREE, probability=0.89).reason == "FREE_SPACE_VIOLATED"
     assert verdict_on(FREE, probability=0.9).verdict == "registered"
@@ -151,7 +162,6 @@ def test_by_default_a_pose_below_nine_tenths_has_to_keep_the_share_limits() -> N
 
 @pytest.mark.parametrize(("hidden", "verdict"), [(0.94, "registered"), (0.96, "rejected"), (float("nan"), "rejected")])
 def test_where_nearly_nothing_was_observed_no_probability_helps(hidden: float, verdict: str) -> None:
-    """All samples agree, at places that nobody saw."""
     judged = verdict_on(hidden=hidden)
     assert judged.verdict == verdict
     assert (judged.reason == "TOO_LITTLE_SURFACE") is (verdict == "rejected")
@@ -225,3 +235,44 @@ def test_numbers_that_are_none_are_rejected() -> None:
     nothing = float("nan")
     assert verdict_on(probability=nothing).verdict == "rejected"
     assert verdict_on(evidence_of([nothing] * 5, [nothing] * 5), probability=0.8).verdict == "rejected"
+
+
+# The option ``min_probability`` on every way to an answer: none below it is accepted, and those from it on are.
+
+
+NEAR = Sim3.from_quaternion(1.02, [0.02, -0.03, 0.04, 1.0], [0.02, -0.01, 0.02]) @ chair_pose()
+Way = Callable[[RegistrationOptions], RegistrationResult | None]
+
+
+def searched(options: RegistrationOptions) -> RegistrationResult:
+    shapes = {"table": table(), "chair": chair()}
+    library = [LibraryObject(name, partial(shapes.__getitem__, name), model_object(shapes[name])) for name in shapes]
+    found = search_library(room(chair_pose()), detection(), library, options)
+    first = found.ranking[0]
+    assert (first.name, first.verdict, first.probability) == ("chair", found.result.verdict, found.result.probability)
+    assert all(one.verdict == "rejected" for one in found.ranking[1:] if one.verdict)
+    return found.result
+
+
+WAYS: dict[str, Way] = {
+    "register": lambda options: run(room(chair_pose()), chair(), detection(), options),
+    "from a start": lambda options: register(
+        room(chair_pose()), chair(), detection(), options, initial_transform=NEAR, clouds=False
+    ),
+    "ambiguous": lambda options: run(table_room(chair_pose(1.4)), slab_table(), SLAB_BOX, options),
+    "batch": lambda options: register_batch(room(chair_pose()), [detection()], [chair()], options=options)[0].result,
+    "search": searched,
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_above_its_probability_no_answer_is_accepted(way: str) -> None:
+    found = WAYS[way](RegistrationOptions.from_dict({"robust": {"min_probability": 1.0, "feature_draws": 0}}))
+    assert found is not None
+    assert found.probability is not None
+    assert 0.9 <= found.probability < 1.0, "a right answer, which the default accepts"
+    assert (found.verdict, found.verdict_reason) == ("rejected", "LOW_PROBABILITY")
+    document = result_document(found)
+    assert document["probability"] == document["metrics"]["probability"] == found.probability
+    assert "at least" in document["verdict_detail"]
+    assert document["considered"][0]["metrics"]["probability"] == found.probability

@@ -5,19 +5,21 @@ The device of these tests has no numbers; that its branches give the numbers of 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode, resolve_name
 
 from regnf_core import OrientedBox, open_field
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.metrics import NearestNeighbors, nearest_of_all
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust import working_frame
 from regnf_core.robust.model import model_object
@@ -33,9 +35,46 @@ from regnf_core.robust.verdict import evidence as features_module
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR, gather_evidence, pose_features
 from regnf_core.robust.working_frame import Samples, WorkingField, WorkingFrame
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
-from tests.core.robust.elsewhere import ELSEWHERE, Border
-from tests.core.robust.shapes import ROBUST, detection
+from tests.core.robust.shapes import alone, detection, run
 from tests.golden.cases import EXAMPLES
+
+# A device without a GPU: torch's "meta" device, and a watch on what crosses its border. Its tensors have no numbers: to
+# read one, or to copy it to the CPU, raises. torch itself does not tell of copies to the device; the watch does.
+
+
+ELSEWHERE = torch.device("meta")
+_MAKERS = (torch.tensor, torch.as_tensor, Tensor.new_tensor)
+
+
+class Border(TorchFunctionMode):
+    """Raises where an operation mixes devices; ``copies`` names what brought numbers from the CPU to the device."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.copies: list[str] = []
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        given = [one for one in _tensors([args, kwargs or {}]) if one.ndim > 0]
+        devices = {one.device for one in given}
+        made = {one.device for one in _tensors(result)}
+        name = resolve_name(func)
+        if len(devices) > 1 and name != "torch.Tensor.to":
+            raise AssertionError(f"{name} mixes {devices}")
+        if ELSEWHERE in made and ELSEWHERE not in devices and (given or func in _MAKERS):
+            self.copies.append(str(name))
+        return result
+
+
+def _tensors(values: Any) -> Iterator[Tensor]:
+    if isinstance(values, Tensor):
+        yield values
+    elif isinstance(values, dict):
+        yield from _tensors(list(values.values()))
+    elif isinstance(values, list | tuple):
+        for one in values:
+            yield from _tensors(one)
+
 
 OPTIONS = RegistrationOptions().robust
 BRANCHING = (distance_grid, levenberg_marquardt, working_frame)
@@ -77,18 +116,11 @@ def test_a_problem_is_moved_whole(neural: RegistrationProblem) -> None:
     assert neural.bound.points.device == neural.model.extremal_points.device == ELSEWHERE
     assert neural.view.distance_grid.low.device == ELSEWHERE
     T = poses(3)
+    points = torch.zeros(50, 3, device=ELSEWHERE)
     with Border() as border:
         assert neural.bound.admits(T).device == neural.bound.penalty(T).device == ELSEWHERE
-    assert border.copies == []
-
-
-def test_a_look_up_stays_on_the_device(neural: RegistrationProblem) -> None:
-    points = torch.zeros(50, 3, device=ELSEWHERE)
-    grid = neural.model.distance_grid
-    with Border() as border:
-        value, gradient = grid.value_and_gradient(points)
-    assert value.shape == (50,)
-    assert gradient.shape == (50, 3)
+        value, gradient = neural.model.distance_grid.value_and_gradient(points)
+    assert (value.shape, gradient.shape) == ((50,), (50, 3))
     assert value.device == gradient.device == ELSEWHERE
     assert border.copies == []
 
@@ -139,7 +171,7 @@ def test_evidence_and_features_stay_on_the_device(neural: RegistrationProblem, m
         evidence = gather_evidence(r, T.scale, OPTIONS)
         found = pose_features(problem, T, r, T.scale)
     assert list(found) == list(SPEAKS_FOR)
-    assert {one.device for one in found.values()} == {evidence.scores.device} == {ELSEWHERE}
+    assert {one.device for one in found.values()} == {evidence.numbers["score"].device} == {ELSEWHERE}
     assert set(border.copies) <= {"torch.Tensor.new_tensor"}  # two quantiles, by their numbers
 
 
@@ -167,9 +199,9 @@ def test_a_tree_and_all_distances_find_the_same_neighbors() -> None:
 
 @pytest.mark.usefixtures("cpu_as_elsewhere")
 def test_the_other_devices_branches_give_the_same_registration(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = register(room(chair_pose()), chair(), detection(), ROBUST, seed=5, clouds=False)
+    found = run(room(chair_pose()), chair(), detection())
     monkeypatch.undo()
-    plain = register(room(chair_pose()), chair(), detection(), ROBUST, seed=5, clouds=False)
+    plain = alone().result
     assert found.verdict == plain.verdict == "registered"
     assert found.metrics["field_evaluations"] == plain.metrics["field_evaluations"]
     torch.testing.assert_close(found.T_object_scene.matrix(), plain.T_object_scene.matrix(), rtol=0, atol=1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from math import cos, sin
 from typing import Any
 
 import pytest
@@ -10,8 +11,20 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import VERDICT
-from regnf_core.robust.verdict.answer import LEAD, PoseOdds, ProbabilityModel, pose_odds
+from regnf_core.robust.model import SelfSymmetry
+from regnf_core.robust.search.bounds import turns_about
+from regnf_core.robust.verdict.answer import (
+    LEAD,
+    PoseOdds,
+    ProbabilityModel,
+    apart,
+    apart_from_answer,
+    leads,
+    merits,
+    pose_odds,
+)
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 STORED: dict[str, Any] = {
@@ -23,24 +36,23 @@ STORED: dict[str, Any] = {
 }
 
 
-def features(**values: float) -> dict[str, torch.Tensor]:
-    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
-
-
-def logit(**values: float) -> float:
-    return float(ProbabilityModel.from_dict(STORED).logit(features(**values))[0])
-
-
-def test_terms_by_hand() -> None:
-    assert logit(confirmed=0.9, free=0.0) == pytest.approx(2.0)
-    assert logit(confirmed=0.4, free=0.0) == pytest.approx(2.0 - 2.0)  # half way between -3 and -1
-    assert logit(confirmed=0.7, free=0.25) == pytest.approx(2.0 - 0.5 - 2.0)
-    assert logit(confirmed=0.0, free=0.9) == pytest.approx(2.0 - 3.0 - 4.0)  # constant beyond the outer knots
-
-
-def test_what_is_not_a_number_is_as_bad_as_can_be() -> None:
-    assert logit(confirmed=math.nan, free=0.0) == pytest.approx(2.0 - 3.0)
-    assert logit(confirmed=0.9, free=math.inf) == pytest.approx(2.0 - 4.0)
+@pytest.mark.parametrize(
+    ("confirmed", "free", "expected"),
+    [
+        (0.9, 0.0, 2.0),
+        (0.4, 0.0, 2.0 - 2.0),  # half way between -3 and -1
+        (0.7, 0.25, 2.0 - 0.5 - 2.0),
+        (0.0, 0.9, 2.0 - 3.0 - 4.0),  # constant beyond the outer knots
+        (math.nan, 0.0, 2.0 - 3.0),  # no number is as bad as can be
+        (0.9, math.inf, 2.0 - 4.0),
+    ],
+)
+def test_terms_by_hand(confirmed: float, free: float, expected: float) -> None:
+    told = {
+        "confirmed": torch.tensor([confirmed], dtype=torch.float64),
+        "free": torch.tensor([free], dtype=torch.float64),
+    }
+    assert float(ProbabilityModel.from_dict(STORED).logit(told)[0]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +128,67 @@ def test_the_shipped_models_use_what_they_must(observed: bool) -> None:
     assert float(odds.log_odds(best, alike, several)[0].sigmoid()) < likely
 
 
-@OBSERVED
-def test_a_perfect_pose_alone_is_as_likely(observed: bool) -> None:
-    best = {name: torch.tensor([1e3 if better else -1e3]).double() for name, better in SPEAKS_FOR.items()}
-    assert float(pose_odds(observed).alone.logit(best)[0].sigmoid()) > 0.98
+# Leads of poses over other answers, by hand: near poses and symmetric ones are the same answer.
+
+
+POINTS = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+NO_SYMMETRY = SelfSymmetry(Sim3.identity()[None][:0], None, torch.zeros(0))
+
+
+def turns(*angles: float) -> Sim3:
+    """Turns about the upright axis, as transforms (K,)."""
+    none = torch.zeros(len(angles), 3, dtype=torch.float64)
+    rotations = torch.tensor(
+        [[[cos(a), -sin(a), 0.0], [sin(a), cos(a), 0.0], [0.0, 0.0, 1.0]] for a in angles]
+    ).double()
+    return Sim3(torch.ones(len(angles)).double(), rotations, none)
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.0, 20.0])
+def test_poses_are_apart_beyond_a_twentieth_of_the_diameter_whatever_the_scale(scale: float) -> None:
+    shifts = torch.tensor([[0.0, 0.0, 0.0], [0.04, 0.0, 0.0], [0.06, 0.0, 0.0]]).double()
+    T = Sim3(torch.full((3,), scale).double(), torch.eye(3).double().expand(3, 3, 3), shifts)
+    expected = [[False, False, True], [False, False, False], [True, False, False]]
+    assert apart(T, POINTS, NO_SYMMETRY).tolist() == expected
+
+
+def test_symmetric_poses_are_one_answer() -> None:
+    T = turns(0.0, math.pi, math.pi / 2)
+    half = SelfSymmetry(turns(math.pi), None, torch.zeros(1))
+    assert apart(T, POINTS, half).tolist() == [[False, False, True], [False, False, True], [True, True, False]]
+    nearly = SelfSymmetry(turns(math.pi), None, torch.ones(1))  # the object's field does not confirm it
+    assert apart(T, POINTS, nearly)[0].tolist() == [False, True, True]
+
+
+def test_turns_about_an_axis_of_symmetry_are_one_answer() -> None:
+    axis = SelfSymmetry(Sim3.identity()[None][:0], UP, torch.zeros(0))
+    tilted = Sim3(torch.ones(1).double(), turns_about(UP.roll(1), 4)[1:2], torch.zeros(1, 3).double())
+    T = Sim3.cat([turns(0.0, 0.3, 2.0), tilted])
+    assert apart(T, POINTS, axis).tolist()[0] == [False, False, False, True]
+
+
+def test_leads_by_hand() -> None:
+    elsewhere = torch.tensor([[False, False, True], [False, False, True], [True, True, False]])
+    found = leads(torch.tensor([2.0, 1.0, 0.5]).double(), elsewhere)
+    assert found.tolist() == pytest.approx([1.5, 0.5, -1.5])
+
+
+def test_poses_of_one_answer_lead_over_what_is_apart_from_all_of_them() -> None:
+    """0 and 1 are listed; 2 lies near 1, 3 elsewhere. Only 3 competes with the answer; 2 and 3 have their rivals."""
+    elsewhere = torch.tensor(
+        [[False, True, True, True], [True, False, False, True], [True, False, False, True], [True, True, True, False]]
+    )
+    joined = apart_from_answer(elsewhere, [0, 1])
+    assert joined[:2].tolist() == [[False, False, False, True]] * 2
+    assert joined[2:].tolist() == elsewhere[2:].tolist()
+    found = leads(torch.tensor([2.0, 1.9, 1.8, 0.5]).double(), joined)
+    assert found.tolist() == pytest.approx([1.5, 1.4, -0.2, -1.5])
+
+
+def test_of_poses_that_are_about_as_likely_the_better_score_has_the_merit() -> None:
+    found = merits(torch.tensor([1.0, 0.5, -3.0]).double(), torch.tensor([0.40, 0.35, 0.35]))
+    assert found.argmax() == 1
+    assert found[1] - found[2] == pytest.approx(3.5), "the odds count where the scores are alike"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -9,8 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from regnf_core.errors import InvalidOptionsError
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.library import register
+from regnf_core.options import RegistrationOptions, RobustOptions
 from regnf_core.robust.constants import REFINEMENT, SEARCH, VERDICT
 from regnf_core.robust.model import model_object
 from regnf_core.robust.pipeline import search_poses
@@ -19,10 +21,12 @@ from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.refine.loss import normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
 from regnf_core.robust.scene import view_scene
+from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBound, seed_poses
 from regnf_core.robust.search.distance_grid import feature_seeds
+from regnf_core.robust.verdict.covariance import with_known_scale
 from regnf_core.robust.working_frame import sample_object_surface
 from tests.core.analytic import AnalyticField, chair, chair_pose, room
-from tests.core.robust.shapes import ROBUST, can, detection, placement_error, run
+from tests.core.robust.shapes import ROBUST, can, detection, placement_error, random_pose, reframed, run
 
 # How often a pose is searched for: once more where the first answer is rejected or leaves doubt.
 
@@ -45,7 +49,7 @@ def test_an_accepted_answer_that_leaves_doubt_is_searched_for_once_more(
     doubtful: float, more: int, thorough: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("regnf_core.robust.verdict.evaluation.VERDICT", replace(VERDICT, doubtful=doubtful))
-    result = register(room(chair_pose()), chair(), detection(), ROBUST, clouds=False)
+    result = run(room(chair_pose()), chair(), detection())
     assert len(thorough) == more
     assert result.verdict == "registered"
     assert 0.95 < result.metrics["probability"] < 1.0
@@ -53,7 +57,7 @@ def test_an_accepted_answer_that_leaves_doubt_is_searched_for_once_more(
 
 
 def test_a_rejected_answer_is_searched_for_once_more(thorough: list[int]) -> None:
-    assert register(room(chair_pose()), can(), detection(), ROBUST, clouds=False).verdict == "rejected"
+    assert run(room(chair_pose()), can(), detection()).verdict == "rejected"
     assert thorough == [1]
 
 
@@ -82,7 +86,6 @@ D = torch.float64
 
 
 def thickened(field: AnalyticField, by: float) -> AnalyticField:
-    """The same field with its surface ``by`` units farther out."""
     return AnalyticField(lambda points: field.formula(points) - by, field.bounds.tolist())
 
 
@@ -106,12 +109,6 @@ def test_the_offset_is_taken_out_of_both_directions() -> None:
     torch.testing.assert_close(moved.values[:, :n], plain.values[:, :n] - 0.02)
     torch.testing.assert_close(moved.values[:, n:], plain.values[:, n:] + 0.02)
     torch.testing.assert_close(moved.jacobian, plain.jacobian)
-
-
-def test_the_offsets_column_is_the_derivative_of_the_values() -> None:
-    r = some_residuals(0.0)
-    column = r.jacobian_with_offset()[0, :, 7]
-    assert column.tolist() == [-1.0] * 4 + [1.0] * 5
 
 
 def test_the_gradient_is_that_of_the_cost() -> None:
@@ -166,5 +163,115 @@ def test_a_thick_rough_scene_is_registered_at_its_scale_and_says_so() -> None:
     assert result.metrics["surface_offset"] == pytest.approx(diameters, abs=0.005)
 
 
-def test_a_smooth_scene_has_no_offset() -> None:
-    assert run(room(chair_pose()), chair(), detection()).metrics["surface_offset"] == 0.0
+# What the caller knows of the scale: by hand, against conditioning by linear algebra, and in whole registrations.
+
+
+def numbers(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def between(low: float, high: float) -> RegistrationOptions:
+    return RegistrationOptions(robust=RobustOptions(min_scale=low, max_scale=high, feature_draws=0))
+
+
+def test_the_options_are_in_the_fields_units() -> None:
+    bound = ScaleBound.of(RobustOptions(min_scale=0.5, max_scale=4.0), scene_length=3.0, object_length=2.0)
+    assert (bound.low, bound.high) == (0.75, 6.0)
+    assert bound.log_width == pytest.approx(math.log(8.0))
+    assert ScaleBound.of(RobustOptions(), 3.0, 2.0) == ANY_SCALE
+    assert ScaleBound.of(RobustOptions(min_scale=0.5), 3.0, 2.0) == ScaleBound(0.75, math.inf)
+    assert ScaleBound.of(RobustOptions(max_scale=4.0), 3.0, 2.0) == ScaleBound(0.0, 6.0)
+
+
+def test_changes_end_at_the_bound() -> None:
+    bound = ScaleBound(0.5, 2.0)
+    scale, growth = numbers(1.0, 1.0, 1.0, 2.0, 0.5), numbers(0.1, 3.0, -3.0, 0.1, 0.1)
+    expected = numbers(0.1, math.log(2.0), -math.log(2.0), 0.0, 0.1)
+    torch.testing.assert_close(bound.limited_growth(scale, growth), expected)
+    torch.testing.assert_close(ANY_SCALE.limited_growth(scale, growth), growth)
+
+
+def test_limited_poses_keep_the_objects_center_in_place() -> None:
+    T = Sim3.cat([random_pose(seed, scale)[None] for seed, scale in ((1, 0.1), (2, 1.0), (3, 9.0))])
+    limited = ScaleBound(0.5, 2.0).limited_poses(T)
+    torch.testing.assert_close(limited.scale, numbers(0.5, 1.0, 2.0))
+    center = torch.zeros(1, 3, dtype=torch.float64)
+    torch.testing.assert_close(limited.inverse().apply(center), T.inverse().apply(center))
+    torch.testing.assert_close(limited.rotation, T.rotation)
+
+
+def test_seeds_of_one_scale_are_not_tried_twice() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scene, obj = (torch.randn(50, 3, generator=generator) for _ in range(2))
+    axes, rotations = torch.eye(3).double(), torch.eye(3).double()[None]
+    factors = torch.tensor([0.8, 1.0, 1.25])
+    free = seed_poses(scene, obj, axes, numbers(4, 4, 4), rotations, factors)
+    fixed = seed_poses(scene, obj, axes, numbers(4, 4, 4), rotations, factors, ScaleBound(1.5, 1.5))
+    assert (len(free), len(fixed)) == (5, 3), "by moments once instead of three times, by points and by the box"
+    assert fixed.scale.tolist() == [1.5] * 3
+
+
+@pytest.mark.parametrize("allowed", [1.0, 1.1])
+def test_the_minimum_on_the_bound_is_that_of_the_poses_on_it(allowed: float) -> None:
+    """From poses of another scale the steps go up to the bound; the minimum there is where steps of fixed scale end.
+    Without normals: the cost is smooth, so there is one minimum. On the bound the kernels of both are equally wide:
+    widths are those at the start, and stay the same in the scene."""
+    generator = torch.Generator().manual_seed(0)
+    target = sample_object_surface(chair(), 600, generator)
+    surfaces = SurfacePair(target.field, target.field, target.samples, target.samples)
+    step = torch.randn(6, 7, generator=generator, dtype=torch.float64) * numbers(*[0.05] * 3, *[0.02] * 3, 0.0)
+    start = Sim3.identity().expand(6).perturb(step)
+    larger = Sim3(torch.full_like(start.scale, 1.3), start.rotation, start.translation)
+    widths = [0.2] * 25
+    wider = [0.2 * 1.3 / allowed] * 25
+    from_above = minimize(surfaces, larger, wider, Settings(scale=ScaleBound(allowed, 2.0), normals=False))
+    on_it = Sim3(torch.full_like(start.scale, allowed), start.rotation, start.translation)
+    along = minimize(surfaces, on_it, widths, Settings(scale=ScaleBound(allowed, allowed), normals=False))
+    torch.testing.assert_close(along.T.scale, torch.full_like(start.scale, allowed))
+    torch.testing.assert_close(from_above.T.scale, along.T.scale, atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(from_above.costs, along.costs, atol=1e-5, rtol=1e-3)
+    assert torch.all(along.T.translation.norm(dim=-1) < 0.02)
+
+
+def test_the_covariance_is_that_of_a_measured_scale() -> None:
+    generator = torch.Generator().manual_seed(0)
+    half = torch.randn(7, 9, generator=generator, dtype=torch.float64)
+    cov = half @ half.mT
+    width = 0.3
+    information = torch.linalg.inv(cov)
+    information[6, 6] += 12.0 / width**2
+    torch.testing.assert_close(with_known_scale(cov, width), torch.linalg.inv(information))
+    assert with_known_scale(cov, math.inf) is cov
+    fixed = with_known_scale(cov, 0.0)
+    assert float(fixed[6, 6]) == pytest.approx(0.0, abs=1e-9)
+    assert float(torch.linalg.eigvalsh(fixed)[0]) > 0.0
+    torch.testing.assert_close(fixed[:6, :6], torch.linalg.inv(torch.linalg.inv(cov)[:6, :6]), atol=1e-8, rtol=1e-6)
+
+
+def test_a_known_scale_is_kept_exactly() -> None:
+    scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, 12.0))
+    scale = float(truth.scale)
+    known = run(scene, obj, box, between(scale, scale))
+    assert float(known.T_object_scene.scale) == pytest.approx(scale, rel=1e-12)
+    assert known.verdict == "registered"
+    assert placement_error(known, truth) < 0.002
+    assert known.covariance is not None
+    assert float(known.covariance[6, 6].sqrt()) < 1e-5
+    assert float(torch.linalg.eigvalsh(known.covariance)[0]) > 0.0
+
+
+def test_a_scale_that_is_not_the_true_one_is_not_registered() -> None:
+    scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
+    wrong = 1.3 * float(truth.scale)
+    result = run(scene, obj, box, between(wrong, wrong))
+    assert float(result.T_object_scene.scale) == pytest.approx(wrong, rel=1e-12)
+    assert result.verdict == "rejected"
+
+
+def test_bounds_in_the_wrong_order() -> None:
+    with pytest.raises(InvalidOptionsError, match=r"min_scale 2 is larger than max_scale 1"):
+        RegistrationOptions.from_dict({"robust": {"min_scale": 2.0, "max_scale": 1.0}})
+    with pytest.raises(ValueError, match="larger than"):
+        RobustOptions(min_scale=2.0, max_scale=1.0)
+    with pytest.raises(InvalidOptionsError, match="min_scale"):
+        RegistrationOptions.from_dict({"robust": {"min_scale": 0.0}})

@@ -15,11 +15,10 @@ from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.model import model_object
-from regnf_core.robust.pipeline import WarmStart
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.search import bounds
 from regnf_core.robust.search.bounds import PoseBound, super_fibonacci
-from regnf_core.robust.search.distance_grid import feature_seeds
+from regnf_core.robust.search.distance_grid import DistanceGrid, feature_seeds, nearest_sample_distance
 from regnf_core.robust.working_frame import Samples
 from tests.core.analytic import AnalyticField, sphere, union
 from tests.core.robust.shapes import random_pose, reframed
@@ -30,7 +29,7 @@ from tests.core.robust.shapes import random_pose, reframed
 def poses(points: torch.Tensor) -> torch.Tensor:
     scales = torch.tensor([0.85, 1.0, 1.18])
     axes, size = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    return bounds.seed_poses(points, 2.0 * points, axes, size, super_fibonacci(301), scales).matrix()
+    return bounds.seed_poses(points, 2.0 * points, axes, size, super_fibonacci(61), scales).matrix()
 
 
 def test_turned_in_parts_objects_have_the_same_extents(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,12 +62,6 @@ def test_copies_are_about_as_far_off_as_the_spread_says() -> None:
         angle = ((turn - 1.0) / 2.0).clamp(-1.0, 1.0).acos()
         assert 0.045 < float(growth.std()) < 0.055
         assert 0.09 < float((angle.square().mean() / 3.0).sqrt()) < 0.11
-
-
-def test_no_copies_leave_all_as_it_is() -> None:
-    own = candidates()
-    found = own.with_copies(0, (0.1, 0.03, 0.05), torch.Generator().manual_seed(0))
-    torch.testing.assert_close(found.T.matrix(), own.T.matrix(), rtol=0, atol=0)
 
 
 # What a detection allows: by hand, for a cube of edge 1 in a box of edge 2, scaled to a diagonal of 1.
@@ -119,35 +112,29 @@ def test_the_boxs_own_axes_count() -> None:
     turn = torch.tensor([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     poses = Sim3.cat([placed(0.70), placed(0.71)])
     assert bound(0.0, turn).admits(poses).tolist() == [True, False]
+    assert bound(0.0, turn).loosened(2.0).admits(poses).tolist() == [True, False], "twice nothing"
+    assert [one.admits(placed(1.3)).item() for one in (bound(0.1), bound(0.1).loosened(2.0))] == [False, True]
 
 
 def test_a_pose_that_fills_the_box_is_not_penalized() -> None:
-    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0))])
-    exact, tight, small, large, beside = bound(1.0).penalty(poses).tolist()
+    """And by half of the weight where every face is one kernel width off."""
+    off = placed(1.0 + 2.0 * SEARCH.box_width)
+    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0)), off])
+    exact, tight, small, large, beside, half = bound(1.0).penalty(poses).tolist()
     assert exact == pytest.approx(0.0, abs=1e-12)
     assert exact < tight < beside < small < large < SEARCH.box_weight
-
-
-def test_the_penalty_is_half_its_weight_where_every_face_is_one_kernel_width_off() -> None:
-    pose = placed(1.0 + 2.0 * SEARCH.box_width)
-    assert float(bound(1.0).penalty(pose)) == pytest.approx(SEARCH.box_weight / 2)
-
-
-def test_loosened() -> None:
-    assert not bound(0.1).admits(placed(1.3)).item()
-    assert bound(0.1).loosened(2.0).admits(placed(1.3)).item()
+    assert half == pytest.approx(SEARCH.box_weight / 2)
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "verdict", "reason"),
-    [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")],
+    ("tolerance", "verdict", "reason"), [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")]
 )
 def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str, reason: str) -> None:
     """Every edge of the box is 0.7 of the chair's. The search begins at the right pose, so it is the one judged."""
     scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
     part = OrientedBox(box.center, 0.7 * box.size, box.rotation)
     options = RegistrationOptions.from_dict({"robust": {"box_tolerance": tolerance}})
-    found = register(scene, obj, part, options, seed=0, warm_start=WarmStart(T_object_scene=truth), clouds=False)
+    found = register(scene, obj, part, options, seed=0, initial_transform=truth, clouds=False)
     assert (found.verdict, found.verdict_reason) == (verdict, reason)
     assert float(found.T_object_scene.scale) == pytest.approx(float(truth.scale), rel=1e-3)
 
@@ -191,3 +178,46 @@ def test_too_small_a_cloud_gives_no_seed() -> None:
     few = Samples(torch.randn(20, 3), torch.zeros(20), torch.tensor([[0.0, 0.0, 1.0]]).expand(20, 3))
     assert feature_seeds(few, model_object(blob()).samples, 2, seed=0).scale.numel() == 0
     assert feature_seeds(few, few, 0, seed=0).scale.numel() == 0
+
+
+# Distance grids against the samples they are made of.
+
+
+def unit_directions(count: int = 1500) -> torch.Tensor:
+    draw = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    return draw / draw.norm(dim=1, keepdim=True)
+
+
+def made() -> tuple[torch.Tensor, DistanceGrid]:
+    normals = unit_directions()
+    return normals, DistanceGrid.of(0.5 * normals, normals, 0.05, SEARCH.grid_margin)
+
+
+def test_holds_the_samples_distance_at_the_cells_centers() -> None:
+    normals, grid = made()
+    numbers = torch.randint(SEARCH.grid_cells, (200, 3), generator=torch.Generator().manual_seed(1))
+    centers = grid.low[:, 0] + (numbers + 0.5) * grid.edge[:, 0]
+    value, gradient = grid.value_and_gradient(centers)
+    expected, slope = nearest_sample_distance(0.5 * normals, normals, 0.05, centers)
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(gradient, slope, rtol=0, atol=1e-6)
+
+
+def test_goes_on_from_the_center_along_the_gradient() -> None:
+    _, grid = made()
+    center = grid.low[:, 0] + 10.5 * grid.edge[:, 0]
+    value, gradient = grid.value_and_gradient(center[None])
+    step = 0.4 * grid.edge[:, 0] * torch.tensor([1.0, -1.0, 0.5])
+    moved, same = grid.value_and_gradient((center + step)[None])
+    torch.testing.assert_close(same, gradient)
+    torch.testing.assert_close(moved, value + (gradient[0] @ step)[None], rtol=0, atol=1e-6)
+
+
+def test_adds_the_distance_to_the_grid_beyond_it() -> None:
+    _, grid = made()
+    border = torch.stack([grid.high[:, 0], torch.tensor([0.0, 0.0, float(grid.low[2, 0])])])
+    outside = border + torch.tensor([[0.3, 0.4, 0.0], [0.0, 0.0, -2.0]])
+    value, gradient = grid.value_and_gradient(outside)
+    at_border, _ = grid.value_and_gradient(border)
+    torch.testing.assert_close(value - at_border, torch.tensor([0.5, 2.0]))
+    torch.testing.assert_close(gradient, torch.tensor([[0.6, 0.8, 0.0], [0.0, 0.0, -1.0]]))

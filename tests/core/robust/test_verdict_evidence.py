@@ -46,18 +46,6 @@ def test_patches_by_hand() -> None:
     assert found["covered_patches"].tolist() == [0.5, 0.25]
 
 
-def test_agreement_in_one_place_covers_less_than_the_same_spread_out() -> None:
-    mine, nothing = about([12, 12, 12, 12]), torch.zeros(1, 1, dtype=torch.bool)
-    together, spread = torch.zeros(1, 48, dtype=torch.bool), torch.zeros(1, 48, dtype=torch.bool)
-    together[0, :16] = spread[0, ::3] = True
-    assert int(together.sum()) == int(spread.sum())
-    shares = [
-        float(coverage(CENTERS, mine, CENTERS[None, :1], one, nothing)["confirmed_patches"][0])
-        for one in (together, spread)
-    ]
-    assert shares == [0.5, 1.0]
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_against_a_slow_count(seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
@@ -103,10 +91,9 @@ def samples(*rows: tuple[float, float, float]) -> Samples:
     return Samples(points, torch.zeros(len(rows)), normals)
 
 
-def share(A: Samples, right: float, T: Sim3 | None = None) -> float:
+def share(A: Samples, right: float) -> float:
     """Of the samples near the plane z = 0 as object, in a scene whose matter reaches to ``right`` above x = 5."""
-    surfaces = SurfacePair(Floor(0.0, right), Floor(0.0, 0.0), A, A)
-    return share_of(surfaces, (Sim3.identity() if T is None else T)[None])
+    return share_of(SurfacePair(Floor(0.0, right), Floor(0.0, 0.0), A, A), Sim3.identity()[None])
 
 
 def share_of(surfaces: SurfacePair, T: Sim3) -> float:
@@ -117,24 +104,27 @@ def share_of(surfaces: SurfacePair, T: Sim3) -> float:
     return float(found.sum() / near.sum().clamp_min(1))
 
 
-def test_what_lies_on_the_object_is_unexplained() -> None:
-    A = samples(*[(float(x), 0.0, 1.0) for x in range(5)], (6.0, 0.06, 1.0), (7.0, 0.06, 1.0), (8.0, 0.5, 1.0))
-    assert share(A, 0.06) == pytest.approx(2 / 7)  # the last is too far off to be near
+ON = tuple((float(x), 0.0, 1.0) for x in range(5))
+ACROSS = (*((float(x), 0.0, 1.0) for x in range(8)), (6.0, 0.06, -1.0), (7.0, 0.06, -1.0))
 
 
-def test_what_faces_the_object_across_a_gap_is_not() -> None:
-    A = samples(*[(float(x), 0.0, 1.0) for x in range(8)], (6.0, 0.06, -1.0), (7.0, 0.06, -1.0))
-    assert share(A, 0.0) == 0.0
-    assert share(A, 0.06) == pytest.approx(0.2)  # the same, but what it faces is not there
-
-
-def test_only_what_is_asked_about_is_unexplained() -> None:
-    A = samples((0.0, 0.029, 1.0), (1.0, -0.06, 1.0), (2.0, 0.031, 1.0))
-    assert share(A, 0.0) == pytest.approx(1 / 3)
+@pytest.mark.parametrize(
+    ("rows", "right", "expected"),
+    [
+        # what lies on the object; the last is too far off to be near
+        ((*ON, (6.0, 0.06, 1.0), (7.0, 0.06, 1.0), (8.0, 0.5, 1.0)), 0.06, 2 / 7),
+        (ACROSS, 0.0, 0.0),  # what faces the object across a gap
+        (ACROSS, 0.06, 0.2),  # the same, but what it faces is not there
+        (((0.0, 0.029, 1.0), (1.0, -0.06, 1.0), (2.0, 0.031, 1.0)), 0.0, 1 / 3),  # only what is asked about
+        (((0.0, 3.0, 1.0),), 0.0, 0.0),  # nothing is near
+    ],
+)
+def test_what_is_unexplained_by_hand(rows: Any, right: float, expected: float) -> None:
+    assert share(samples(*rows), right) == pytest.approx(expected)
 
 
 def test_it_is_the_same_in_every_frame() -> None:
-    A = samples(*[(float(x), 0.0, 1.0) for x in range(5)], (6.0, 0.06, 1.0))
+    A = samples(*ON, (6.0, 0.06, 1.0))
     T = Sim3.from_quaternion(2.0, [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
     half = Samples(A.points / 2.0, A.values, A.normals)
 
@@ -149,10 +139,6 @@ def test_it_is_the_same_in_every_frame() -> None:
     assert share(A, 0.06) == pytest.approx(1 / 6)
 
 
-def test_nothing_near_is_no_share() -> None:
-    assert share(samples((0.0, 3.0, 1.0)), 0.0) == 0.0
-
-
 # Features of poses by hand: exact agreement, a known gap, hidden and free samples, stiffness by differences.
 
 OPTIONS = RegistrationOptions().robust
@@ -161,7 +147,6 @@ NO_OFFSET = torch.zeros(1, dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def problem() -> RegistrationProblem:
-    """A chair in a room, both exact."""
     scene, obj = room(chair_pose()), chair()
     view = view_scene(scene, detection(), OPTIONS)
     return make_problem(view, model_object(obj, OPTIONS), scene, obj, OPTIONS)
@@ -188,7 +173,6 @@ def test_the_right_pose_agrees_in_all_respects(problem: RegistrationProblem) -> 
 
 
 def test_every_feature_gets_worse_far_away(problem: RegistrationProblem) -> None:
-    """The object a third of its diameter beside its place."""
     right, T = features_at(problem, truth(problem)), truth(problem)
     wrong = features_at(problem, replace(T, translation=T.translation + torch.tensor([0.33, 0.0, 0.0]).double()))
     for name in ("object_agrees", "scene_agrees", "confirmed", "confirmed_patches", "free", "seen_through", "noise"):
@@ -217,7 +201,6 @@ def test_an_offset_counts_either_way(problem: RegistrationProblem) -> None:
 
 
 def test_stiffness_by_finite_differences(problem: RegistrationProblem) -> None:
-    """No small motion of unit length on the object's surface changes the agreeing residuals by less than it says."""
     T = truth(problem)
     found = features_at(problem, T)
     r = residuals(problem.held_out, T[None], NO_OFFSET)
@@ -240,19 +223,12 @@ def test_stiffness_by_finite_differences(problem: RegistrationProblem) -> None:
     assert least < 3.0 * found["stiffness"]
 
 
-def test_nothing_agrees_far_away(problem: RegistrationProblem) -> None:
-    T = truth(problem)
-    found = features_at(problem, replace(T, translation=T.translation + 5.0))
-    assert all(value == value for value in found.values())
-    assert found["confirmed"] == 0.0
-    assert found["stiffness"] == 0.0
-
-
 def test_a_pose_of_extreme_scale_far_away_has_features_too(problem: RegistrationProblem) -> None:
     T = truth(problem)
     for scale, distance in ((1e-6, 1e-6), (1e6, 1e8), (1.0, 1e8)):
         found = features_at(problem, replace(T, scale=T.scale * scale, translation=T.translation + distance))
         assert all(value == value for value in found.values())
+    assert (found["confirmed"], found["stiffness"]) == (0.0, 0.0), "nothing agrees far away"
 
 
 # The answer among candidates that are placed by hand: who wins, who is listed, and how likely they are.
@@ -278,7 +254,6 @@ def answer(
 
 
 def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> None:
-    """Two poses an eighth of the diameter apart fit alike; a third, elsewhere, fits worse than the margin allows."""
     found = answer([0.0, 0.12, 0.6], [0.2, 0.21, 0.5])
     single = answer([0.0, 0.6], [0.2, 0.5])
     assert (found.winner, found.rivals) == (0, [1])
@@ -287,15 +262,14 @@ def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> No
     assert float(found.probability[2]) == pytest.approx(float(found.probability_alone[2])), "it is not listed"
 
 
-def test_poses_that_place_other_surface_compete_though_both_are_listed() -> None:
-    found = answer([0.0, 0.6], [0.2, 0.21])
-    assert (found.winner, found.rivals) == (0, [1])
-    assert torch.equal(found.probability, found.probability_alone)
-
-
-def test_without_rivals_both_probabilities_are_the_same() -> None:
-    found = answer([0.0, 0.03, 0.6], [0.2, 0.21, 0.5])
-    assert found.rivals == []
+@pytest.mark.parametrize(
+    ("shifts", "scores", "rivals"), [([0.0, 0.6], [0.2, 0.21], [1]), ([0.0, 0.03, 0.6], [0.2, 0.21, 0.5], [])]
+)
+def test_poses_that_place_other_surface_compete_though_both_are_listed(
+    shifts: list[float], scores: list[float], rivals: list[int]
+) -> None:
+    found = answer(shifts, scores)
+    assert (found.winner, found.rivals) == (0, rivals)
     assert torch.equal(found.probability, found.probability_alone)
 
 
@@ -304,20 +278,11 @@ def test_what_fits_by_its_score_and_is_much_less_likely_is_no_rival() -> None:
     assert (found.winner, found.rivals) == (0, [])
 
 
-def test_what_is_known_of_the_scene_decides_on_the_model() -> None:
-    """The same numbers mean another probability where nobody says what was seen."""
-    told, silent = (answer([0.0, 0.6], [0.2, 0.5], one, noise=[0.01, 0.01]) for one in (OBSERVED, None))
-    assert float(told.probability[0]) != float(silent.probability[0])
-    assert float(told.probability[0]) == pytest.approx(float(_said(True)), abs=1e-9)
-    assert float(silent.probability[0]) == pytest.approx(float(_said(False)), abs=1e-9)
-
-
-def _said(observed: bool) -> torch.Tensor:
-    features = {name: torch.full((2,), value).double() for name, value in GOOD.items()} | {
-        "noise": torch.tensor([0.01, 0.01]).double()
-    }
-    return (
-        pose_odds(observed)
-        .log_odds(features, torch.tensor([0.2, 0.5]).double(), ~torch.eye(2, dtype=torch.bool))
-        .sigmoid()[0]
-    )
+@pytest.mark.parametrize("observation", [OBSERVED, None])
+def test_what_is_known_of_the_scene_decides_on_the_model(observation: object | None) -> None:
+    found = answer([0.0, 0.6], [0.2, 0.5], observation, noise=[0.01, 0.01])
+    features = {name: torch.full((2,), value).double() for name, value in (GOOD | {"noise": 0.01}).items()}
+    scores, apart = torch.tensor([0.2, 0.5]).double(), ~torch.eye(2, dtype=torch.bool)
+    said, other = (pose_odds(known).log_odds(features, scores, apart).sigmoid()[0] for known in (True, False))
+    assert said != other
+    assert float(found.probability[0]) == pytest.approx(float(said if observation else other), abs=1e-9)

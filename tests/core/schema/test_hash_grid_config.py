@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from tests.core.importing.archives import assert_refused
 
 
 @pytest.mark.parametrize(
@@ -47,16 +47,12 @@ def test_a_table_settles_how_a_whole_number_was_rounded() -> None:
 
 
 def test_a_table_of_no_possible_size_is_refused() -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        HashGridConfig.from_top_resolution(512).with_entry_count(5_246_025)
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(lambda: HashGridConfig.from_top_resolution(512).with_entry_count(5_246_025), "FIELD_SHAPES_MISMATCH")
 
 
 @pytest.mark.parametrize("name", ["resolutions", "strides"])
 def test_one_resolution_a_level(name: str) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        HashGridConfig(levels=3, **{name: (16, 20)})
-    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+    assert_refused(lambda: HashGridConfig(levels=3, **{name: (16, 20)}), "FIELD_SHAPES_MISMATCH")
 
 
 def test_only_dense_levels_with_room_are_indexed_otherwise() -> None:

@@ -7,15 +7,14 @@ import sys
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
-import pytest
 import torch
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
 from regnf_core.fields.observation import SdfField
 from regnf_core.schema.kinds import KINDS
 from regnf_core.schema.safe_format import description_to_dict, parse_description
 from tests.core.fields.small_field import description, tensors
+from tests.core.importing.archives import assert_refused
 
 
 def small_field(**changes: Any) -> SdfField:
@@ -23,27 +22,24 @@ def small_field(**changes: Any) -> SdfField:
     return build_field(parse_description(description(**changes)), parameters)
 
 
-def test_a_description_of_the_first_version_opens_unchanged() -> None:
-    """Entries that came later have defaults."""
+def test_entries_that_all_kinds_share_have_defaults() -> None:
     parsed = parse_description(description())
     assert (parsed.world_scale, parsed.sign, parsed.up_axis) == (1.0, 1, None)
     assert parse_description(description_to_dict(parsed)) == parsed
 
 
-@pytest.mark.parametrize("kind", [None, 3, ["neus_facto"], "neus-facto", {}])
-def test_unknown_kinds(kind: Any) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        parse_description(description(kind=kind))
-    assert caught.value.reason == "FIELD_KIND_UNKNOWN"
-
-
-@pytest.mark.parametrize(
-    "changes", [{"sign": 0}, {"sign": 2}, {"world_scale": 0.0}, {"world_scale": float("nan")}, {"up_axis": "w"}]
-)
-def test_faulty_shared_entries(changes: dict[str, Any]) -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        parse_description(description(**changes))
-    assert caught.value.reason == "SAFE_FORMAT_INVALID"
+def test_faulty_shared_entries() -> None:
+    for kind in (None, 3, ["neus_facto"], "neus-facto", {}):
+        assert_refused(lambda kind=kind: parse_description(description(kind=kind)), "FIELD_KIND_UNKNOWN")
+    for name, value in (
+        ("sign", 0),
+        ("sign", 2),
+        ("world_scale", 0.0),
+        ("world_scale", float("nan")),
+        ("up_axis", "w"),
+    ):
+        faulty = description(**{name: value})
+        assert_refused(lambda faulty=faulty: parse_description(faulty), "SAFE_FORMAT_INVALID")
 
 
 def test_coordinates_and_distances_scale_together() -> None:

@@ -86,21 +86,21 @@ def drawn(observation: Observation, state: int, count: int, seed: int = 0) -> Te
 
 
 def test_what_is_free_was_looked_through(observation: Observation) -> None:
-    points = middles(observation, drawn(observation, FREE, 150))
+    points = middles(observation, drawn(observation, FREE, 80))
     field = room()
     assert bool((field.signed_distance(points) > 0).all())
     assert float(slowly_free(field, walk(9), points, 0.0).float().mean()) >= 0.99
 
 
 def test_what_is_unobserved_was_not_looked_through_but_for_borders(observation: Observation) -> None:
-    points = middles(observation, drawn(observation, UNSEEN, 150))
+    points = middles(observation, drawn(observation, UNSEEN, 80))
     field = room()
     far = field.signed_distance(points).abs() > 2.0 * observation.voxel
     assert float(slowly_free(field, walk(9), points[far], 0.0).float().mean()) <= 0.06
 
 
 def test_observed_surface_is_where_a_line_of_sight_ends(observation: Observation) -> None:
-    index = drawn(observation, SURFACE, 150)
+    index = drawn(observation, SURFACE, 80)
     field, points = room(), middles(observation, index)
     distance, gradient = field.signed_distance_and_gradient(points)
     on = points - distance[:, None] * gradient
@@ -114,26 +114,22 @@ def test_surface_that_a_line_of_sight_leads_to_is_observed(observation: Observat
     points = 2.0 * torch.rand(40_000, 3, generator=generator) - 1.0
     distance, gradient = field.signed_distance_and_gradient(points)
     points = (points - distance[:, None] * gradient)[distance.abs() < 0.2]
-    points = points[field.signed_distance(points).abs() < 1e-4][:400]
+    points = points[field.signed_distance(points).abs() < 1e-4][:250]
     seen = slowly_free(field, walk(9), points, 0.02)
     states = observation.at(points)
-    assert int(seen.sum()) > 100
-    assert int((~seen).sum()) > 100
+    assert int(seen.sum()) > 50
+    assert int((~seen).sum()) > 50
     assert float((states[seen] == SURFACE).float().mean()) >= 0.97
     assert float((states[~seen] == SURFACE).float().mean()) <= 0.1
 
 
 def test_fewer_evaluations_make_larger_voxels(observation: Observation) -> None:
-    coarse, _ = observe_by_cameras(room(), walk(9), 100_000)
+    coarse, again = (observe_by_cameras(room(), walk(9), 100_000)[0] for _ in range(2))
     assert coarse.voxel > 1.5 * observation.voxel
-    points = middles(coarse, drawn(coarse, FREE, 150))
+    assert torch.equal(coarse.states, again.states)
+    assert torch.equal(coarse.low, again.low)
+    points = middles(coarse, drawn(coarse, FREE, 80))
     assert float(slowly_free(room(), walk(9), points, 0.0).float().mean()) >= 0.97
-
-
-def test_the_same_cameras_observe_the_same() -> None:
-    first, second = (observe_by_cameras(room(), walk(4), 100_000)[0] for _ in range(2))
-    assert torch.equal(first.states, second.states)
-    assert torch.equal(first.low, second.low)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, -0.55), (30.0, 0.0, 0.0)])

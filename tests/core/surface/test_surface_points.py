@@ -9,7 +9,7 @@ from torch import Tensor
 from regnf_core.fields.observation import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import SamplingOptions
+from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_scene
 from regnf_core.surface.result_clouds import (
     newton_step,
@@ -19,7 +19,7 @@ from regnf_core.surface.result_clouds import (
     scene_residuals,
     upsample,
 )
-from regnf_core.surface.sphere_tracing import Rays, first_hits
+from regnf_core.surface.sphere_tracing import Rays, camera_positions, cast_rays, first_hits
 from tests.core.analytic import AnalyticField, boxes, sphere
 
 # Sphere tracing: first crossings from free space into matter, against shapes whose surface is known.
@@ -91,16 +91,10 @@ def test_one_step_reaches_the_surface_of_an_exact_distance() -> None:
 
 
 def test_each_step_and_the_end_evaluate_once() -> None:
-    counting = CountingField(sphere(0.3))
+    counting, once = CountingField(sphere(0.3)), CountingField(sphere(0.3))
     project_to_surface(counting.signed_distance_and_gradient, torch.full((7, 3), 0.3), 3)
-    assert counting.evaluations == project_evaluations(4)
-
-
-def project_evaluations(rounds: int) -> int:
-    counting = CountingField(sphere(0.3))
-    for _ in range(rounds):
-        counting.signed_distance_and_gradient(torch.zeros(7, 3) + 0.1)
-    return counting.evaluations
+    once.signed_distance_and_gradient(torch.full((7, 3), 0.3))
+    assert counting.evaluations == 4 * once.evaluations
 
 
 @pytest.mark.parametrize(("slope", "floor", "moved"), [(0.5, 0.5, 2.0), (0.1, 0.5, 0.4), (0.1, 0.01, 10.0)])
@@ -171,14 +165,49 @@ def test_points_lie_on_the_floor_and_leave_the_box_out() -> None:
     assert cloud.points[:, 2].abs().max() < 0.01
     torch.testing.assert_close(cloud.normals[:, 2], torch.ones(len(cloud.points)).to(cloud.normals), atol=1e-4, rtol=0)
     assert cloud.points[:, :2].abs().max() <= 1.0
-
-
-def test_every_quarter_of_the_floor_is_covered() -> None:
-    points = sample_surroundings(FLOOR_AND_BALL, ROUND_THE_BALL, 2000, torch.Generator().manual_seed(1)).points
-    quarters = (points[:, 0] > 0).long() * 2 + (points[:, 1] > 0).long()
-    assert torch.bincount(quarters, minlength=4).min() > 0.15 * len(points)
+    quarters = (cloud.points[:, 0] > 0).long() * 2 + (cloud.points[:, 1] > 0).long()
+    assert torch.bincount(quarters, minlength=4).min() > 0.15 * len(cloud.points)
 
 
 def test_a_scene_without_a_surface_has_no_surroundings() -> None:
     empty = sphere(0.5, (5.0, 5.0, 5.0))
     assert len(sample_surroundings(empty, ROUND_THE_BALL, 500, torch.Generator().manual_seed(0)).points) == 0
+
+
+# Where cameras stand, and what they see.
+
+
+def test_cameras_stand_on_the_upper_half_sphere_and_apart() -> None:
+    center = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    axes: list[tuple[Axis, int]] = [("x", 0), ("y", 1), ("z", 2)]
+    for axis, number in axes:
+        offsets = camera_positions(center, 0.9, 5, axis) - center
+        torch.testing.assert_close(offsets.norm(dim=1), torch.full((5,), 0.9, dtype=torch.float64))
+        torch.testing.assert_close(
+            offsets[:, number], 0.9 * torch.tensor([0.9, 0.7, 0.5, 0.3, 0.1], dtype=torch.float64)
+        )
+        angles = torch.pdist(offsets / 0.9)
+        assert float(angles.min()) > 0.6  # chord of about 35 degrees
+
+
+def test_every_corner_of_the_box_is_in_view_and_the_view_is_no_wider() -> None:
+    position = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
+    corners = OrientedBox.from_corners([-0.5, -0.2, -1.0], [0.5, 0.2, 1.0]).corners()
+    (rays,) = cast_rays(position, torch.zeros(3, dtype=torch.float64), corners, 512, 8)
+    assert rays.directions.shape == (64 * 64, 3)
+    torch.testing.assert_close(rays.directions.norm(dim=1), torch.ones(64 * 64))
+    # The nearest corner is 0.5 and 0.2 off the axis at depth 1; pixel centers reach 63/64 of the way.
+    slopes = (rays.directions[:, :2] / -rays.directions[:, 2:]).abs().amax(0)
+    torch.testing.assert_close(slopes, torch.full((2,), 0.5 * 63 / 64), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, 450, 10**6])
+def test_rays_in_parts_are_the_same_rays_in_the_same_order(most: int) -> None:
+    target = torch.zeros(3, dtype=torch.float64)
+    positions = camera_positions(target, 2.0, 3, "z", 0.3)
+    corners = OrientedBox.from_corners([-0.5, -0.2, -1.0], [0.5, 0.2, 1.0]).corners()
+    (whole,) = cast_rays(positions, target, corners, 96, 8)
+    parts = list(cast_rays(positions, target, corners, 96, 8, most))
+    assert max(len(part.origins) for part in parts) <= most
+    assert torch.equal(torch.cat([part.origins for part in parts]), whole.origins)
+    assert torch.equal(torch.cat([part.directions for part in parts]), whole.directions)

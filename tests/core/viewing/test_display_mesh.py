@@ -13,15 +13,17 @@ from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.importing.gate.gate import import_field
+from regnf_core.viewing import field_views as module
 from regnf_core.viewing.field_views import (
     COARSE_TRIANGLES,
     FINE_TRIANGLES,
     FINE_VERTICES,
     TooSlowError,
     Triangles,
-    at_most,
     clustered,
     display_meshes,
+    field_views,
     mesh_file,
 )
 from tests.core.analytic import sphere
@@ -74,13 +76,6 @@ def test_clustering_by_hand() -> None:
     assert len(found.faces) == 1
 
 
-def test_clustering_ends_for_far_and_flat_meshes() -> None:
-    rng = np.random.default_rng(0)
-    vertices = rng.random((3000, 3)) * [1e6, 1e-3, 0.0]
-    faces = rng.permutation(3000).reshape(-1, 3)
-    assert len(at_most(Triangles(vertices, faces), 50, 60).faces) <= 50
-
-
 def test_files_are_read_by_others(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(2)
     path = tmp_path / "mesh.glb"
@@ -106,3 +101,31 @@ def test_a_mesh_far_from_the_origin_keeps_its_digits(own_triangles: bool, tmp_pa
     path.write_bytes(mesh_file(there.vertices, there.faces))
     read = trimesh.load_scene(path).to_geometry()
     np.testing.assert_allclose(read.vertices - shift, here.vertices, atol=1e-5)
+
+
+# A field's views.
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ball")
+    axis = np.linspace(-1.0, 1.0, 24, dtype=np.float32)
+    values = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1) - np.float32(0.5)
+    np.savez(folder / "ball.npz", sdf=values, bounds=np.array([[-1.0] * 3, [1.0] * 3]))
+    import_field(folder / "ball.npz", folder / "out")
+    return folder / "out" / "field.safetensors"
+
+
+def test_a_field_is_drawn(ball: Path) -> None:
+    found = field_views(ball)
+    assert found.fine is not None
+    assert found.coarse is not None
+    assert found.picture is not None
+    assert found.fine[:4] == found.coarse[:4] == b"glTF"
+    assert len(found.coarse) < len(found.fine)
+    assert found.picture.startswith(b"\x89PNG")
+
+
+def test_a_field_that_is_too_slow_has_nothing_to_look_at(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_BUDGET_S", 0.0)
+    assert field_views(ball) == module.FieldViews(None, None, None)

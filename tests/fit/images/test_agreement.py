@@ -13,12 +13,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.worlds.trajectories import look_at
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
 from regnf_data.sdfstudio import load_dataset, write_dataset
-from regnf_data.trajectories import look_at
-from regnf_fit.images.agreement import check_agreement
+from regnf_fit.images.checks import check_agreement
+from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.fusion import fuse_images
+from tests.fit.images import scenes
 
 Floats = NDArray[np.float64]
 SIZE = 60, 80
@@ -110,32 +112,23 @@ def test_the_convention_that_the_images_agree_by_is_named(name: str) -> None:
     assert re.search(mend, caught.value.hint), caught.value.hint
 
 
-@pytest.mark.parametrize("count", [2, 3, 16])
-@pytest.mark.parametrize("noise", [0.0, 0.006])
+@pytest.mark.parametrize(("count", "noise"), [(2, 0.006), (3, 0.0), (16, 0.006)])
 def test_good_recordings_pass(count: int, noise: float) -> None:
     assert check_agreement(recording(count, noise)) is None
 
 
-def test_one_image_or_a_flat_wall_tells_nothing() -> None:
+def test_one_image_a_flat_wall_and_images_that_share_nothing_tell_nothing() -> None:
     one = recording()
     assert one.depths is not None
     single = replace(one, depths=one.depths[:1], T_world_camera=np.linalg.inv(one.T_world_camera[:1]),
                      intrinsics=one.intrinsics[:1], colors=one.colors[:1])  # fmt: skip
     assert check_agreement(single) is None
-    wall = np.tile(np.eye(4), (6, 1, 1))
-    wall[:, 0, 3] = np.arange(6) * 0.1
-    flat = replace(one, depths=np.full((6, *SIZE), 2.0, np.float32), T_world_camera=wall, intrinsics=one.intrinsics[:6],
-                   colors=one.colors[:6])  # fmt: skip
-    assert check_agreement(flat) is None
-
-
-def test_images_that_share_nothing_tell_no_unit() -> None:
-    one = recording()
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, 0, 3] = 6.0  # beside the first, looking the same way at another part of a wall
-    apart = replace(one, depths=np.full((2, *SIZE), 2.0, np.float32), T_world_camera=poses,
-                    intrinsics=one.intrinsics[:2], colors=one.colors[:2])  # fmt: skip
-    assert check_agreement(apart) is None
+    for count, apart in ((6, 0.1), (2, 6.0)):
+        wall = np.tile(np.eye(4), (count, 1, 1))
+        wall[:, 0, 3] = np.arange(count) * apart
+        flat = replace(one, depths=np.full((count, *SIZE), 2.0, np.float32), T_world_camera=wall,
+                       intrinsics=one.intrinsics[:count], colors=one.colors[:count])  # fmt: skip
+        assert check_agreement(flat) is None
 
 
 def test_poses_of_nowhere_are_warned_of() -> None:
@@ -155,3 +148,70 @@ def test_fusing_refuses_and_the_reader_mends(tmp_path: Path) -> None:
     folder = tmp_path / "images"
     write_dataset(images, folder)
     np.testing.assert_allclose(load_dataset(folder, opengl=True).T_world_camera, recording().T_world_camera, atol=1e-6)
+
+
+# What is refused before a fit or a fusion, and what the refusal says.
+
+
+def within(images: PosedImages | None = None) -> PosedImages:
+    """The images with bounds that the cameras stand in, and without masks: many pixels show nothing."""
+    return replace(images or scenes.images(), bounds=np.array([[-3.0] * 3, [3.0] * 3]), masks=None)
+
+
+def scaled(factor: float, poses: float = 1.0) -> PosedImages:
+    """Depths and poses of another unit than the bounds."""
+    images = within()
+    assert images.depths is not None
+    T = images.T_world_camera.copy()
+    T[:, :3, 3] *= poses
+    return replace(images, depths=(factor * images.depths).astype(np.float32), T_world_camera=T)
+
+
+def fit(images: PosedImages, path: Path) -> object:
+    return reconstruct(images, FitFiles(path))
+
+
+@pytest.mark.parametrize(
+    ("make", "factor", "poses", "said"),
+    [
+        (fit, 1000.0, 1.0, "depths in millimeters? Divided by 1000, 100 %"),
+        (fuse_images, 1000.0, 1000.0, "depths and poses in millimeters? Divided by 1000"),
+        (fuse_images, 1.0, 1000.0, "poses in millimeters? Divided by 1000"),
+        (fuse_images, 100.0, 1.0, "depths in centimeters? Divided by 100"),
+        (fuse_images, 5000.0, 1.0, "depths in steps of 1/5000? Divided by 5000"),
+    ],
+)
+def test_another_unit_is_named(
+    make: Callable[..., object], factor: float, poses: float, said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(DatasetError, match="median") as caught:
+        make(scaled(factor, poses), tmp_path / "map.safetensors")
+    assert caught.value.reason == "DATASET_NOTHING_IN_BOUNDS"
+    assert said in str(caught.value.hint)
+    assert "bounds, (-3, -3, -3) to (3, 3, 3);" in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bounds_that_were_not_given_are_said(tmp_path: Path) -> None:
+    images = scenes.images()
+    far = images.T_world_camera.copy()
+    far[:, :3, 3] += (5.0, 0.0, 0.0)
+    cube = np.array([[-1.0] * 3, [1.0] * 3])
+    with pytest.raises(DatasetError, match=r"where meta_data.json has no scene_box.*end within \(4") as caught:
+        fuse_images(replace(images, T_world_camera=far, bounds=cube), tmp_path / "map.safetensors")
+    assert '"scene_box": {"aabb": [[4' in str(caught.value.hint)
+
+
+def test_masks_that_leave_nothing(tmp_path: Path) -> None:
+    images = scenes.images()
+    with pytest.raises(DatasetError, match="only 0 pixels") as caught:
+        fuse_images(replace(images, masks=np.zeros(images.colors.shape[:3], bool)), tmp_path / "map.safetensors")
+    assert "the other way round" in str(caught.value.hint)
+
+
+def test_an_empty_image_among_good_ones_is_passed_over(tmp_path: Path) -> None:
+    images = within()
+    assert images.depths is not None
+    depths = images.depths.copy()
+    depths[3] = 0.0
+    assert fuse_images(replace(images, depths=depths), tmp_path / "map.safetensors").depth_error_median < 0.01

@@ -9,12 +9,12 @@ from regnf_core.geometry.exponential_map import rotation_exp
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.observing import NO_SPREAD, DepthSpread
 from regnf_fit.images.preparation import prepare
-from regnf_fit.images.trainer import CameraPoses, PoseErrors, expected_errors
+from regnf_fit.images.trainer import CameraPoses, expected_errors
 from tests.fit.images import scenes
-from tests.fit.images.test_reconstruct import SMALL, StoppedError, surface_errors
+from tests.fit.images.test_reconstruct import SMALL, surface_errors
 
 SHIFT, TURN = 0.025, 0.015
-OPTIONS = replace(SMALL, iterations=400, refine_poses=True)
+OPTIONS = replace(SMALL, refine_poses=True)
 
 
 def astray(images, seed=0):
@@ -30,7 +30,7 @@ def astray(images, seed=0):
 
 def test_corrections_move_rays_and_images_alike():
     images = replace(scenes.images(count=3), bounds=np.array([[-2.0] * 3, [2.0] * 3]))  # which all rays meet
-    poses = CameraPoses(3, PoseErrors(0.1, 0.1))
+    poses = CameraPoses(3, 0.1, 0.1)
     with torch.no_grad():
         poses.steps += torch.randn(poses.steps.shape, generator=torch.Generator().manual_seed(1))
     rays = prepare(images, "auto", np.random.default_rng(0)).training
@@ -41,7 +41,7 @@ def test_corrections_move_rays_and_images_alike():
 
 
 def test_corrections_are_zero_in_the_mean():
-    poses = CameraPoses(5, PoseErrors(0.1, 0.2))
+    poses = CameraPoses(5, 0.2, 0.1)
     with torch.no_grad():
         poses.steps += 1.0 + torch.randn(poses.steps.shape, generator=torch.Generator().manual_seed(1))
     _, shifts = poses.corrections()
@@ -49,6 +49,7 @@ def test_corrections_are_zero_in_the_mean():
     assert float(shifts.detach().norm(dim=1).min()) > 0.01, "the first image is corrected as the others are"
 
 
+@pytest.mark.long
 def test_poses_that_err_are_corrected(tmp_path):
     true = scenes.images(count=12)
     given = astray(true)
@@ -62,29 +63,7 @@ def test_poses_that_err_are_corrected(tmp_path):
     assert 0.3 * SHIFT < report.pose_shift < 4.0 * SHIFT
 
 
-def test_without_the_option_nothing_is_said_of_poses(tmp_path):
-    options = replace(OPTIONS, refine_poses=False, iterations=5)
-    assert reconstruct(scenes.images(), FitFiles(tmp_path / "f.safetensors"), options).pose_shift is None
-
-
-def test_an_interrupted_fit_goes_on_with_its_poses(tmp_path):
-    images = astray(scenes.images())
-    options = replace(OPTIONS, iterations=40)
-    whole, path, checkpoint = (tmp_path / name for name in ("whole.safetensors", "f.safetensors", "f.checkpoint"))
-    reconstruct(images, FitFiles(whole), options, device="cpu")
-
-    def stop(iteration, loss, seconds_left):
-        if iteration >= 25:
-            raise StoppedError
-
-    with pytest.raises(StoppedError):
-        reconstruct(images, FitFiles(path, checkpoint), options, device="cpu", progress=stop)
-    assert checkpoint.exists()
-    reconstruct(images, FitFiles(path, checkpoint), options, device="cpu")
-    assert path.read_bytes() == whole.read_bytes()
-
-
 def test_what_is_expected_of_poses():
     found = expected_errors(DepthSpread(np.array([1.0, 2.0, 4.0]), np.array([0.01, 0.02, 0.08])), 3.0)
-    assert found == PoseErrors(0.02, 0.01)
-    assert expected_errors(NO_SPREAD, 3.0).shift == pytest.approx(0.003)
+    assert found == (0.01, 0.02)
+    assert expected_errors(NO_SPREAD, 3.0)[1] == pytest.approx(0.003)

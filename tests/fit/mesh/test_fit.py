@@ -17,7 +17,7 @@ from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
-from regnf_fit.mesh import fit_field
+from regnf_fit.mesh import fit_field, mesh_target
 from regnf_fit.network import StartShape, TrainableField
 from regnf_fit.options import FitOptions
 from tests.core.analytic import AnalyticField, sphere
@@ -113,3 +113,28 @@ def test_a_target_that_is_large_and_far_away_is_fitted_where_it_lies(target: str
     torch.testing.assert_close(field.bounds.mean(0), shift, rtol=0, atol=0.01)
     points = torch.tensor([[0.0, 3.0, 0.0], [2.0, 0.0, 2.0], [-3.0, 0.0, 0.0]]).double() + shift
     torch.testing.assert_close(field.signed_distance(points), torch.tensor([0.0, -0.17, 0.0]), rtol=0, atol=0.08)
+
+
+# A mesh file as the target of a fit.
+
+TOP = trimesh.creation.box(bounds=[[-1.0, -1.0, 0.8], [1.0, 1.0, 1.0]])
+LEG = trimesh.creation.box(bounds=[[-0.2, -0.2, -1.0], [0.2, 0.2, 0.7]])
+
+
+def written(folder: Path, *meshes: trimesh.Trimesh) -> Path:
+    path = folder / "table.ply"
+    trimesh.util.concatenate([mesh.copy() for mesh in meshes]).export(path)
+    return path
+
+
+def test_a_part_that_is_inside_out_is_matter(tmp_path: Path) -> None:
+    leg = LEG.copy()
+    leg.invert()
+    found = mesh_target(written(tmp_path, TOP, leg), extent=1.0)
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.45], [0.3, 0.3, 0.0]])
+    np.testing.assert_allclose(found.field.signed_distance(places), [-0.1, -0.05, 0.2 * 2**0.5], atol=1e-6)
+    assert any("turned round" in done for done in found.source["mesh_faces"])
+
+
+def test_nothing_is_said_of_faces_that_stay(tmp_path: Path) -> None:
+    assert mesh_target(written(tmp_path, TOP, LEG)).source == {"mesh": "table.ply"}

@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
-from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
+from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.families.layers import folded_weight
+from regnf_core.importing.families.network import Order, encoding_order
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.schema.description import COLOR, VALUES, NetworkColor, ValueColor, color_tensors
 from regnf_core.schema.tensor_check import MAX_LAYERS
@@ -102,7 +104,7 @@ def with_color(converted: ConvertedField, read: Callable[[], ReadColor], hidden_
     try:
         form, tensors = read()
     except FieldFormatError as error:
-        return replace(converted, warnings=(*converted.warnings, f"{LEFT_OUT}: {error}"))
+        return _warned(converted, error)
     layers = sum(name.endswith(".weight") for name in tensors)
     return replace(
         _added(converted, {COLOR: asdict(form)}, _scaled(form.own_width, tensors, hidden_factor)),
@@ -110,19 +112,15 @@ def with_color(converted: ConvertedField, read: Callable[[], ReadColor], hidden_
     )
 
 
-def with_assumption(converted: ConvertedField, assumed: str | None) -> ConvertedField:
-    """``converted`` with the warning COLOR_ASSUMED, if it has a color and ``assumed`` was taken for granted of it."""
-    if assumed is None or COLOR not in converted.description:
-        return converted
-    return replace(converted, warnings=(*converted.warnings, f"{ASSUMED}: {assumed}"))
-
-
 def without_color(converted: ConvertedField, keys: Sequence[str], family: str) -> ConvertedField:
     """``converted`` with the warning COLOR_LEFT_OUT, if the file has a color that is not read, under ``keys``."""
-    if not keys:
-        return converted
-    told = f"{LEFT_OUT}: {keys[0]}: colors of {family} are not read; the geometry is kept"
-    return replace(converted, warnings=(*converted.warnings, told))
+    return (
+        _warned(converted, f"{keys[0]}: colors of {family} are not read; the geometry is kept") if keys else converted
+    )
+
+
+def _warned(converted: ConvertedField, why: object) -> ConvertedField:
+    return replace(converted, warnings=(*converted.warnings, f"{LEFT_OUT}: {why}"))
 
 
 def with_hidden_factor(reading: Reading, hidden_width: int, factor: float) -> Reading:
@@ -138,7 +136,7 @@ def with_values(converted: ConvertedField, read: Callable[[], StoredArray | None
     try:
         values = read()
     except FieldFormatError as error:
-        return replace(converted, warnings=(*converted.warnings, f"{LEFT_OUT}: {error}"))
+        return _warned(converted, error)
     if values is None:
         return converted
     colored = _added(converted, {COLOR: asdict(ValueColor("values"))}, color_tensors({VALUES: values}))
@@ -176,13 +174,35 @@ def _added(converted: ConvertedField, entries: Mapping[str, Any], tensors: Mappi
         description, stored = {**reading.description, **entries}, {**reading.tensors, **tensors}
         return replace(reading, description=description, tensors=stored)
 
-    def later(reading: OpenReading) -> OpenReading:
-        return replace(reading, make=lambda: added(reading.make()))
-
     return replace(
         converted,
         description={**converted.description, **entries},
         tensors={**converted.tensors, **tensors},
         readings=tuple(map(added, converted.readings)),
-        open_readings=tuple(map(later, converted.open_readings)),
     )
+
+
+# The columns of a direction's sines and cosines: how many there are, and in which order we keep them.
+
+MAX_DEGREE = 24
+
+
+def degree_of(columns: int, said: int | None = None) -> int:
+    """Frequencies of a direction's encoding with so many columns: the direction and its sines and cosines.
+
+    Raises FieldFormatError (FAMILY_NOT_SUPPORTED) for columns of anything else, or another number than was said.
+    """
+    degree, rest = divmod(columns - 3, 6)
+    understood(
+        rest == 0 and 0 <= degree <= MAX_DEGREE, f"{columns} columns for the direction, expected 3 + 6 a frequency"
+    )
+    understood(said in (None, degree), f"{degree} frequencies of the direction, the description says {said}")
+    return degree
+
+
+def our_order(degree: int, order: Order, direction_first: bool) -> npt.NDArray[np.int64]:
+    """Where in the trainer's columns each of ours is: direction, sines, cosines."""
+    sines = encoding_order(order, degree, 6 * degree)
+    if direction_first:
+        return np.concatenate((np.arange(3), 3 + sines))
+    return np.concatenate((6 * degree + np.arange(3), sines))

@@ -11,8 +11,15 @@ from typing import Any
 import numpy as np
 
 from regnf_core.importing.arrays import Float32Array
-from regnf_core.importing.families.color.frequencies import degree_of, our_order
-from regnf_core.importing.families.color.head import ColorNetwork, Pair, read_network, read_pair, understood
+from regnf_core.importing.families.color.head import (
+    ColorNetwork,
+    Pair,
+    degree_of,
+    our_order,
+    read_network,
+    read_pair,
+    understood,
+)
 from regnf_core.importing.families.layers import layer_names
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import ColorOverrides, Inputs

@@ -1,1 +1,1 @@
-"""One module a trainer: which of its settings' keys the gate knows, and what they mean."""
+"""Which of the trainers' settings the gate knows, and what their keys mean, by the kind of network."""

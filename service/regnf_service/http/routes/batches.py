@@ -9,13 +9,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from regnf_service.batches import Posting, cancel, find_batch, is_waiting, results_page, state_of
-from regnf_service.concurrency import PARSING, blocking, in_thread
+from regnf_service.concurrency import PARSING, blocking, in_thread, portions
 from regnf_service.http import body
-from regnf_service.http.batch_intake import Intake, lines_of, portions, read_library
+from regnf_service.http.batch_intake import Intake, lines_of, read_library
 from regnf_service.http.body import (
     CallerDep,
     LimitQuery,
-    Pace,
     PageTokenQuery,
     PrefixDep,
     ServicesDep,
@@ -29,7 +28,7 @@ from regnf_service.http.schemas.batches import BatchDocument, BatchPage, BatchPa
 from regnf_service.http.schemas.batches import batch_document as document_of
 from regnf_service.http.schemas.batches import summary_document as summary_of
 from regnf_service.http.schemas.reading import reference
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch
 
@@ -37,6 +36,8 @@ router = APIRouter(tags=["batches"])
 MEDIA_TYPE = "application/x-ndjson"
 _MOST_LINES = 2**31 - 1
 """More than any batch has; what a query may ask for at most."""
+_LINES_AT_ONCE = 50
+_BYTES_AT_ONCE = 64 * 1024
 _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
 
 
@@ -53,22 +54,8 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "links": BATCH_LINKS,
         },
         **refusals(
-            "INVALID_QUERY",
-            "INVALID_HEADER",
-            "UNSUPPORTED_MEDIA_TYPE",
-            "MALFORMED_JSON",
-            "REQUEST_TOO_LARGE",
-            "TOO_MANY_PAIRS",
-            "UPLOAD_INCOMPLETE",
-            "REQUEST_STALLED",
-            "TOO_MANY_UPLOADS",
-            "QUOTA_ACTIVE_JOBS",
-            "QUOTA_BATCHES",
-            "QUOTA_STORED_BYTES",
-            "QUOTA_WORKER_SECONDS",
-            "QUEUE_FULL",
-            "RECORDS_FULL",
-            "STORAGE_FULL",
+            "INVALID_QUERY INVALID_HEADER UNSUPPORTED_MEDIA_TYPE MALFORMED_JSON REQUEST_TOO_LARGE UPLOAD_INCOMPLETE "
+            "TOO_MANY_REQUESTS_AT_ONCE QUOTA_ACTIVE_JOBS QUOTA_STORED QUEUE_FULL STORAGE_FULL"
         ),
     },
     openapi_extra={"requestBody": {"required": True, "content": {MEDIA_TYPE: _BODY}}},
@@ -82,11 +69,10 @@ async def post_batch(request: Request, services: ServicesDep, caller: CallerDep,
     that failed or were cancelled start anew, and nothing is done twice.
     """
     if body.media_type(request) != MEDIA_TYPE:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send JSON Lines as {MEDIA_TYPE}.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send JSON Lines as {MEDIA_TYPE}.")
     body.refuse_encoding(request)
-    pace = Pace(services.settings)
-    async with services.uploads.held(fair_key(request.scope, caller), pace):
-        posting = await _read(request, services, Intake(services, caller), pace)
+    with services.uploads.held(fair_key(request.scope, caller)):
+        posting = await _read(request, services, Intake(services, caller))
         for lines in posting.portions():
             await in_thread(posting.check, lines)
         await in_thread(posting.require_room)
@@ -98,11 +84,11 @@ async def post_batch(request: Request, services: ServicesDep, caller: CallerDep,
     return answer
 
 
-async def _read(request: Request, services: Services, intake: Intake, pace: Pace) -> Posting:
+async def _read(request: Request, services: Services, intake: Intake) -> Posting:
     """The lines as they arrive, a few at a time beside the event loop."""
-    chunks = body.chunks(request, services.settings.max_batch_bytes, pace, "REQUEST_TOO_LARGE")
+    chunks = body.chunks(request, services.settings.max_batch_bytes, "REQUEST_TOO_LARGE")
     async for lines in lines_of(chunks):
-        for few in portions(lines):
+        for few in portions(lines, lambda line: len(line.text or b""), _BYTES_AT_ONCE, _LINES_AT_ONCE):
             read = await PARSING.run(intake.read, few)
             await read_library(intake.library, [spec for _, _, spec in read if spec is not None])
             await in_thread(intake.take, read)

@@ -23,7 +23,6 @@ _NO_DEMO = "This service offers no demo: `regnf serve` does. Upload fields of yo
 
 
 def _folder(services: Services) -> Path:
-    """Where the files lie. Raises Problem NOT_FOUND."""
     folder = services.settings.demo_dir
     if folder is None or not all((folder / name).is_file() for name in (*_FIELDS.values(), _DETECTION)):
         raise Problem("NOT_FOUND", _NO_DEMO)

@@ -31,9 +31,9 @@ def get_and_head(router: APIRouter, path: str, *, summary: str, **how: Any) -> C
 
 
 def refusals(*reasons: str) -> dict[int | str, dict[str, Any]]:
-    """The responses entry for these reasons, grouped by status."""
+    """The responses entry for these reasons, several in a word list, grouped by status."""
     by_status: dict[int, list[str]] = defaultdict(list)
-    for reason in reasons:
+    for reason in dict.fromkeys(" ".join(reasons).split()):
         by_status[REASONS[reason].status].append(reason)
     return {
         status: {
@@ -65,21 +65,8 @@ FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
 NOT_MODIFIED: dict[str, Any] = {"description": "Nothing has changed since one of the ETags given."}
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 UPLOAD_REFUSALS = (
-    "INVALID_HEADER",
-    "INVALID_DIGEST",
-    "DIGEST_MISMATCH",
-    "UPLOAD_EMPTY",
-    "UPLOAD_INCOMPLETE",
-    "REQUEST_STALLED",
-    "UPLOAD_TOO_LARGE",
-    "UNSUPPORTED_MEDIA_TYPE",
-    "FIELD_NOT_RECOGNIZED",
-    "TOO_MANY_UPLOADS",
-    "QUOTA_FIELDS",
-    "QUOTA_STORED_BYTES",
-    "QUOTA_IMPORTS",
-    "QUOTA_WORKER_SECONDS",
-    "STORAGE_FULL",
+    "INVALID_HEADER INVALID_DIGEST DIGEST_MISMATCH UPLOAD_INCOMPLETE UPLOAD_TOO_LARGE UNSUPPORTED_MEDIA_TYPE "
+    "FIELD_NOT_RECOGNIZED TOO_MANY_REQUESTS_AT_ONCE QUOTA_STORED QUOTA_ACTIVE_JOBS STORAGE_FULL"
 )
-PIECE_REFUSALS = ("UPLOAD_OFFSET_MISMATCH", "UPLOAD_NOT_FINISHED", "TOO_MANY_PIECES")
-MULTIPART_REFUSALS = ("MALFORMED_MULTIPART", "MISSING_PART", "UNKNOWN_PART", "REQUEST_TOO_LARGE")
+PIECE_REFUSALS = "UPLOAD_NOT_FINISHED TOO_MANY_PIECES"
+MULTIPART_REFUSALS = "MALFORMED_MULTIPART REQUEST_TOO_LARGE"

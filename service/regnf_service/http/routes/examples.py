@@ -7,15 +7,15 @@ from typing import Any
 SCENE = "a3" * 32
 OBJECT = "7c" * 32
 OTHER = "e1" * 32
+_BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
+_ASKED = {"scene": SCENE, "object": OBJECT, "detection": _BOX}
+_WHERE = [[2.0, 0.0, 0.0, 0.3], [0.0, 2.0, 0.0, 0.1], [0.0, 0.0, 2.0, -0.4], [0.0, 0.0, 0.0, 1.0]]
+_CAMERA = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]]
 
 REGISTER_EXAMPLES: dict[str, Any] = {
     "shortest": {
         "summary": "An axis-aligned box by its corners; everything else at its default",
-        "value": {
-            "scene": SCENE,
-            "object": OBJECT,
-            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
-        },
+        "value": _ASKED,
     },
     "oriented": {
         "summary": "An oriented box from a detector, with options and a seed",
@@ -35,46 +35,27 @@ REGISTER_EXAMPLES: dict[str, Any] = {
     },
     "open3d": {
         "summary": "A box as Open3D has it",
-        "value": {
-            "scene": SCENE,
-            "object": OBJECT,
+        "value": _ASKED
+        | {
             "detection": {
                 "center": [-0.15, -0.05, 0.2],
                 "extent": [0.5, 0.5, 0.4],
                 "R": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
-            },
+            }
         },
     },
     "published": {
         "summary": "The published method instead, with options of its own",
-        "value": {
-            "scene": SCENE,
-            "object": OBJECT,
-            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
-            "options": {"preset": "paper", "sampling": {"views": 8}, "optimization": {"iterations": 300}},
-        },
+        "value": _ASKED
+        | {"options": {"preset": "paper", "sampling": {"views": 8}, "optimization": {"iterations": 300}}},
     },
     "library search": {
         "summary": "Which of these objects is it, and where?",
-        "value": {
-            "scene": SCENE,
-            "candidates": [OBJECT, OTHER],
-            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
-        },
+        "value": {"scene": SCENE, "candidates": [OBJECT, OTHER], "detection": _BOX},
     },
     "warm start": {
         "summary": "Where to look first, from an earlier result or a robot's odometry",
-        "value": {
-            "scene": SCENE,
-            "object": OBJECT,
-            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
-            "initial_transform": [
-                [2.0, 0.0, 0.0, 0.3],
-                [0.0, 2.0, 0.0, 0.1],
-                [0.0, 0.0, 2.0, -0.4],
-                [0.0, 0.0, 0.0, 1.0],
-            ],
-        },
+        "value": _ASKED | {"initial_transform": _WHERE},
     },
     "measured": {
         "summary": "With the known transform: the metrics then hold the errors",
@@ -94,7 +75,6 @@ REGISTER_EXAMPLES: dict[str, Any] = {
     },
 }
 
-_WHERE = [[2.0, 0.0, 0.0, 0.3], [0.0, 2.0, 0.0, 0.1], [0.0, 0.0, 2.0, -0.4], [0.0, 0.0, 0.0, 1.0]]
 RENDER_EXAMPLES: dict[str, Any] = {
     "substitution": {
         "summary": "The library object where the registered one stands, seen from all sides; instead of object and "
@@ -132,17 +112,7 @@ RENDER_EXAMPLES: dict[str, Any] = {
                     "camera_angle_x": 0.8,
                     "w": 640,
                     "h": 480,
-                    "frames": [
-                        {
-                            "file_path": "0.png",
-                            "transform_matrix": [
-                                [1.0, 0.0, 0.0, 0.0],
-                                [0.0, 1.0, 0.0, 0.0],
-                                [0.0, 0.0, 1.0, 2.0],
-                                [0.0, 0.0, 0.0, 1.0],
-                            ],
-                        }
-                    ],
+                    "frames": [{"file_path": "0.png", "transform_matrix": _CAMERA}],
                 }
             },
             "outputs": ["color", "depth"],

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Any, Literal
 
@@ -12,6 +13,7 @@ from starlette.responses import JSONResponse, Response
 
 from regnf_core.errors import MOST_CANDIDATES
 from regnf_core.field_notes import MESH_NAMES, PICTURE_NAME
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import missing_view, redescribe
 from regnf_service.http import body
@@ -25,7 +27,6 @@ from regnf_service.http.body import (
     read_json,
     wait_for,
 )
-from regnf_service.http.description_change import described_anew
 from regnf_service.http.query import decode_token, encode_token, wants_page
 from regnf_service.http.ranges import IfNoneMatch, IfNoneMatchDep, field_etag, file_answer, is_sha256
 from regnf_service.http.routes.documentation import (
@@ -39,8 +40,8 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
-from regnf_service.http.schemas.reading import reference
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.http.schemas.reading import read_model, reference
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.pieces import view_key
@@ -56,12 +57,11 @@ _PRIVATE_HOUR = "private, max-age=3600"
 _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
     304: NOT_MODIFIED,
-    **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
+    **refusals("FIELD_NOT_FOUND", "FIELD_VIEW_NOT_FOUND"),
 }
 
 
 def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
-    """The caller's field. Raises Problem FIELD_NOT_FOUND."""
     record = services.records.get_field(reference_of(caller, sha256)) if is_sha256(sha256) else None
     if record is None:
         raise Problem("FIELD_NOT_FOUND")
@@ -120,7 +120,7 @@ async def get_field_preview(
     Made once the field is ready, as the mesh is.
     """
     record = await in_thread(_require, services, caller, sha256)
-    return await _view_answer(request, services, record, (PICTURE_NAME,), "FIELD_PREVIEW_NOT_FOUND", "image/png", held)
+    return await _view_answer(request, services, record, (PICTURE_NAME,), "image/png", held)
 
 
 @get_and_head(
@@ -131,7 +131,7 @@ async def get_field_preview(
     responses={
         200: {"description": "Triangles in the field's frame and unit.", "content": {"model/gltf-binary": BINARY}},
         304: NOT_MODIFIED,
-        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND", "FIELD_MESH_NOT_FOUND"),
+        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND", "FIELD_VIEW_NOT_FOUND"),
     },
 )
 async def get_field_mesh(
@@ -153,7 +153,7 @@ async def get_field_mesh(
     record = await in_thread(_require, services, caller, sha256)
     fine, coarse = MESH_NAMES
     names = (coarse, fine) if detail == "coarse" else (fine,)
-    return await _view_answer(request, services, record, names, "FIELD_MESH_NOT_FOUND", "model/gltf-binary", held)
+    return await _view_answer(request, services, record, names, "model/gltf-binary", held)
 
 
 @get_and_head(
@@ -174,13 +174,13 @@ async def get_candidate_picture(
     """One of the `candidates` of a field's error, for as long as the upload is kept (`kept_until`)."""
     record = await in_thread(_require, services, caller, sha256)
     if number not in _NUMBERS or not record.has_candidate_picture(int(number)):
-        raise Problem("FIELD_PREVIEW_NOT_FOUND")
+        raise Problem("FIELD_VIEW_NOT_FOUND")
     headers = {"ETag": field_etag(record), "Cache-Control": "private, no-cache"}
     try:
         key = candidate_key(record.sha256, int(number))
         return await file_answer(request, services.blobs, key, "image/png", headers, held)
     except FileNotFoundError as error:
-        raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
+        raise Problem("FIELD_VIEW_NOT_FOUND") from error
 
 
 async def _view_answer(
@@ -188,17 +188,16 @@ async def _view_answer(
     services: Services,
     record: FieldRecord,
     names: Sequence[str],
-    reason: str,
     media_type: str,
     held: IfNoneMatch,
 ) -> Response:
-    """The first of the files ``names`` that a ready field has. Raises Problem ``reason``."""
+    """The first of the files ``names`` that a ready field has. Raises Problem FIELD_VIEW_NOT_FOUND."""
     headers = {"ETag": field_etag(record), "Cache-Control": _PRIVATE_HOUR}
     for name in names if record.state == "ready" else ():
         with suppress(FileNotFoundError):
             key = view_key(record.sha256, name)
             return await file_answer(request, services.blobs, key, media_type, headers, held)
-    raise await in_thread(missing_view, services, record, reason)
+    raise await in_thread(missing_view, services, record)
 
 
 @router.get(
@@ -238,22 +237,9 @@ def list_fields(
         200: {"description": "The label alone has changed, or nothing.", "headers": {"ETag": header("For GET.")}},
         202: {"description": "The kept bytes are imported anew.", "model": FieldDocument, "links": FIELD_LINKS},
         **refusals(
-            "INVALID_HEADER",
-            "MALFORMED_JSON",
-            "UPLOAD_INCOMPLETE",
-            "REQUEST_STALLED",
-            "TOO_MANY_UPLOADS",
-            "REQUEST_TOO_LARGE",
-            "UNSUPPORTED_MEDIA_TYPE",
-            "INVALID_REQUEST",
-            "INVALID_DESCRIPTION",
-            "FIELD_NOT_FOUND",
-            "FIELD_VALIDATING",
-            "FIELD_IN_USE",
-            "FIELD_BYTES_GONE",
-            "CONFLICT",
-            "QUOTA_IMPORTS",
-            "QUOTA_WORKER_SECONDS",
+            "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
+            "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST INVALID_DESCRIPTION FIELD_NOT_FOUND FIELD_VALIDATING FIELD_IN_USE "
+            "FIELD_BYTES_GONE CONFLICT QUOTA_ACTIVE_JOBS"
         ),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: _CHANGE}}},
@@ -267,7 +253,7 @@ async def patch_field(
     The body may also be sent as `application/merge-patch+json`.
     """
     if body.media_type(request) not in _PATCHES:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.")
     change = await read_json(request, services, caller, FieldChange)
     record, imported = await in_thread(_changed, services, caller, sha256, change)
     headers = {"ETag": field_etag(record)} | ({"Retry-After": "1"} if imported else {})
@@ -276,10 +262,33 @@ async def patch_field(
 
 def _changed(services: Services, caller: str, sha256: str, change: FieldChange) -> tuple[FieldRecord, bool]:
     known = _require(services, caller, sha256)
-    said = described_anew(known, change.description_change(known.said))
+    said = _described_anew(known, change.description_change(known.said))
     label = change.label if "label" in change.model_fields_set else (said.label or known.label)
     imported = redescribe(services, caller, known, said, label)
     return _require(services, caller, sha256), imported
+
+
+def _described_anew(known: FieldRecord, change: Mapping[str, Any]) -> UploadDescription:
+    """What is said of a field after a change as RFC 7396 has it. Raises Problem INVALID_DESCRIPTION."""
+    merged = _merged(known.said, change)
+    try:
+        return read_model(UploadDescription, json.dumps(merged).encode(), "INVALID_DESCRIPTION")
+    except Problem as problem:
+        faults = [{**fault, "pointer": "/description" + fault.get("pointer", "")} for fault in problem.errors]
+        raise Problem(problem.reason, problem.detail, errors=faults, hint=problem.hint) from problem
+
+
+def _merged(held: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(held)
+    for name, value in change.items():
+        if value is None:
+            merged.pop(name, None)
+        elif isinstance(value, dict):
+            inner = merged.get(name)
+            merged[name] = _merged(inner if isinstance(inner, dict) else {}, value)
+        else:
+            merged[name] = value
+    return merged
 
 
 @router.delete(

@@ -26,7 +26,7 @@ from regnf_service.http.schemas.library import (
 )
 from regnf_service.http.schemas.reading import reference
 from regnf_service.library import add_entry, change_entry, find_entry, remove_entry
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import sha256_of
 from regnf_state.record_store import LibraryEntry
@@ -34,16 +34,8 @@ from regnf_state.record_store import LibraryEntry
 router = APIRouter(tags=["library"])
 _PATCHES = (JSON, "application/merge-patch+json")
 _BODY_REFUSALS = (
-    "INVALID_HEADER",
-    "MALFORMED_JSON",
-    "UPLOAD_INCOMPLETE",
-    "REQUEST_STALLED",
-    "TOO_MANY_UPLOADS",
-    "REQUEST_TOO_LARGE",
-    "UNSUPPORTED_MEDIA_TYPE",
-    "INVALID_REQUEST",
-    "CONFLICT",
-    "LIBRARY_NAME_TAKEN",
+    "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
+    "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST CONFLICT LIBRARY_NAME_TAKEN"
 )
 NamePath = Annotated[str, Path(description="Of the entry.", max_length=4 * MAX_NAME)]
 
@@ -85,7 +77,7 @@ def list_library(
     responses={
         200: {"description": "It was one, and says the same.", "model": EntryDocument},
         201: {"headers": {"Location": header("The entry.")}},
-        **refusals(*_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY", "QUOTA_WORKER_SECONDS"),
+        **refusals(_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY"),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(NewEntry)}}}},
 )
@@ -95,7 +87,7 @@ async def post_library(request: Request, services: ServicesDep, caller: CallerDe
     A worker then makes the object's model, with the signature that searches compare, and looks for its symmetry.
     """
     if body.media_type(request) != JSON:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.")
     asked = await read_json(request, services, caller, NewEntry)
     notes = EntryNotes.checked(asked.name, asked.tags, asked.unit, asked.note, _plain(asked.symmetry))
     entry, created = await in_thread(add_entry, services, caller, asked.field, notes)
@@ -120,7 +112,7 @@ def get_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep, 
     "/library/{name}",
     summary="Change an entry",
     response_model=EntryDocument,
-    responses=refusals(*_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND", "LIBRARY_ENTRY_INVALID"),
+    responses=refusals(_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND", "INVALID_REQUEST"),
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(EntryChange)}}}},
 )
 async def patch_library_entry(
@@ -129,7 +121,7 @@ async def patch_library_entry(
     """What is left out stays, in a symmetry too; null takes a unit, a note or a symmetry back, and `[]` all tags
     (RFC 7396)."""
     if body.media_type(request) not in _PATCHES:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.")
     change = await read_json(request, services, caller, EntryChange)
     entry = await in_thread(_changed, services, caller, name, change)
     return JSONResponse(entry_document(entry, prefix))

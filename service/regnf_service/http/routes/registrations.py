@@ -15,12 +15,11 @@ from regnf_core.field_source import Role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, room_for_bytes, store_upload
-from regnf_service.fields.uploads import open_settings, open_upload, settings_limit
+from regnf_service.fields.uploads import SettingsUpload, Upload, settings_limit
 from regnf_service.http import body
 from regnf_service.http.batch_intake import Library, asked_by_reference, read_library
 from regnf_service.http.body import (
     CallerDep,
-    Pace,
     PrefixDep,
     ServicesDep,
     boundary_of,
@@ -46,7 +45,7 @@ from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.reading import reference
 from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
 from regnf_service.jobs.submit import check_fields, check_idempotency_key, future_job_id, submit
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.records import ACTIVE, FINISHED
 from regnf_state.registration_request import JobRequest, RegistrationRequest
@@ -77,13 +76,8 @@ JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
     },
 }
 JOB_REFUSALS = (
-    "INVALID_QUERY",
-    "INVALID_HEADER",
-    "WEBHOOK_NOT_ALLOWED",
-    "IDEMPOTENCY_KEY_REUSED",
-    "QUEUE_FULL",
-    "QUOTA_ACTIVE_JOBS",
-    "QUOTA_WEBHOOKS",
+    "INVALID_QUERY INVALID_HEADER WEBHOOK_NOT_ALLOWED IDEMPOTENCY_KEY_REUSED QUEUE_FULL QUOTA_ACTIVE_JOBS "
+    "QUOTA_WEBHOOKS"
 )
 
 
@@ -153,25 +147,12 @@ _ONE_SHOT = {
     responses={
         **JOB_RESPONSES,
         **refusals(
-            *UPLOAD_REFUSALS,
-            *MULTIPART_REFUSALS,
-            *JOB_REFUSALS,
-            "MALFORMED_JSON",
-            "FIELD_NOT_FOUND",
-            "INVALID_REQUEST",
-            "INVALID_DETECTION",
-            "INVALID_OPTIONS",
-            "OPTIONS_TOO_COSTLY",
-            "INVALID_TRANSFORM",
-            "INITIAL_TRANSFORM_UNSUPPORTED",
-            "LIBRARY_SEARCH_UNSUPPORTED",
-            "LIBRARY_ENTRY_NOT_FOUND",
-            "LIBRARY_EMPTY",
-            "LIBRARY_TOO_LARGE",
-            "FIELD_REJECTED",
-            "FIELD_DESCRIPTION_DIFFERS",
-            "INVALID_DESCRIPTION",
-            "DETECTION_OUTSIDE_SCENE",
+            UPLOAD_REFUSALS,
+            MULTIPART_REFUSALS,
+            JOB_REFUSALS,
+            "MALFORMED_JSON FIELD_NOT_FOUND INVALID_REQUEST INVALID_DETECTION INVALID_OPTIONS OPTIONS_TOO_COSTLY "
+            "INVALID_TRANSFORM PRESET_UNSUITABLE LIBRARY_ENTRY_NOT_FOUND LIBRARY_EMPTY LIBRARY_TOO_LARGE "
+            "FIELD_REJECTED FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION DETECTION_OUTSIDE_SCENE",
         ),
     },
     openapi_extra={
@@ -209,7 +190,7 @@ async def _read(request: Request, services: Services, caller: str, keep: bool) -
             return await _by_reference(request, services, caller)
         case "multipart/form-data":
             return await _one_shot(request, services, caller, keep)
-    raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=CLOSE)
+    raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.")
 
 
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
@@ -228,20 +209,19 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     besides = 2 * settings.max_request_bytes + 4 * DESCRIPTION_BYTES
     limit = 2 * (settings.max_upload_bytes + settings_limit(services)) + besides
     declared = body.declared_length(request, besides)
-    pace = Pace(settings)
     async with AsyncExitStack() as stack:
-        await stack.enter_async_context(services.uploads.held(fair_key(request.scope, caller), pace, count=2))
+        stack.enter_context(services.uploads.held(fair_key(request.scope, caller), count=2))
         room = await in_thread(room_for_bytes, services, caller)
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
-        files = {name: await stack.enter_async_context(open_upload(services, claim)) for name in _ROLES}
-        configs = {name: await stack.enter_async_context(open_settings(services, claim)) for name in _ROLES}
+        files = {name: await stack.enter_async_context(Upload(services, claim)) for name in _ROLES}
+        configs = {name: await stack.enter_async_context(SettingsUpload(services, claim)) for name in _ROLES}
         sinks = files | {f"{name}_settings": config for name, config in configs.items()}
         texts = {"request": settings.max_request_bytes} | {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
-        data = body.chunks(request, limit, pace)
+        data = body.chunks(request, limit)
         parts = await read_parts(data, boundary_of(request), sinks, texts)
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
-            raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
+            raise Problem("MALFORMED_MULTIPART", f"The part `{missing[0]}` is missing.")
         spec = await read_text(RegistrationSpec, parts["request"], what="The part `request`")
         said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
         received = {name: await upload.finish() for name, upload in files.items()}

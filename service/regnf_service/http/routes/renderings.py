@@ -32,7 +32,7 @@ from regnf_service.http.schemas.scenes import MOST_CAMERAS, RenderBody
 from regnf_service.http.strict_json import MOST_VALUES_WITH_CAMERAS
 from regnf_service.jobs.edits import plain_edits
 from regnf_service.jobs.submit import check_fields, check_idempotency_key
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.registration_request import RenderingRequest, objects_of
 
@@ -47,31 +47,11 @@ router = APIRouter(tags=["renderings"])
     responses={
         **JOB_RESPONSES,
         **refusals(
-            *JOB_REFUSALS,
-            "MALFORMED_JSON",
-            "INVALID_HEADER",
-            "REQUEST_TOO_LARGE",
-            "UNSUPPORTED_MEDIA_TYPE",
-            "REQUEST_STALLED",
-            "TOO_MANY_UPLOADS",
-            "UPLOAD_INCOMPLETE",
-            "INVALID_REQUEST",
-            "INVALID_OPTIONS",
-            "INVALID_TRANSFORM",
-            "INVALID_DETECTION",
-            "DETECTION_OUTSIDE_SCENE",
-            "EDIT_INVALID",
-            "EDIT_POSE_REJECTED",
-            "CAMERA_INVALID",
-            "RENDER_TOO_LARGE",
-            "FIELD_NOT_FOUND",
-            "FIELD_REJECTED",
-            "JOB_NOT_FOUND",
-            "JOB_EXPIRED",
-            "JOB_NOT_READY",
-            "JOB_DISMISSED",
-            "JOB_FAILED",
-            "QUOTA_WORKER_SECONDS",
+            JOB_REFUSALS,
+            "MALFORMED_JSON INVALID_HEADER REQUEST_TOO_LARGE UNSUPPORTED_MEDIA_TYPE TOO_MANY_REQUESTS_AT_ONCE "
+            "UPLOAD_INCOMPLETE INVALID_REQUEST INVALID_OPTIONS INVALID_TRANSFORM INVALID_DETECTION "
+            "DETECTION_OUTSIDE_SCENE EDIT_INVALID CAMERA_INVALID RENDER_TOO_LARGE FIELD_NOT_FOUND FIELD_REJECTED "
+            "JOB_NOT_FOUND JOB_EXPIRED JOB_NOT_READY JOB_DISMISSED JOB_FAILED",
         ),
     },
     openapi_extra={
@@ -93,14 +73,13 @@ async def render(
     """A job like a registration: the same request twice is one job. Edits that name a registration must be finished."""
     check_idempotency_key(idempotency_key)
     if body.media_type(request) != JSON:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.")
     said = await read_json(request, services, caller, RenderBody, MOST_VALUES_WITH_CAMERAS)
     asked = await in_thread(_checked, services, caller, said)
     return await answer(services, caller, prefix, asked, Asking(dry_run, prefer, idempotency_key))
 
 
 def _checked(services: Services, caller: str, said: RenderBody) -> RenderingRequest:
-    """The request with a transform for every edit. Raises Problem."""
     edits = plain_edits(services, caller, said.scene, [one.plain() for one in said.edits])
     try:
         rendering = said.rendering(edits, _poses(said))
@@ -112,7 +91,6 @@ def _checked(services: Services, caller: str, said: RenderBody) -> RenderingRequ
 
 
 def _poses(said: RenderBody) -> list[dict[str, Any]] | None:
-    """The cameras of the file that came, if one did. Raises InvalidInputError."""
     file = said.transforms
     if file is None:
         return None

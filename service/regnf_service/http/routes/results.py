@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from regnf_core.document import ResultDocument
 from regnf_service.concurrency import blocking
 from regnf_service.http.body import CallerDep, PrefixDep, ServicesDep, wait_for
-from regnf_service.http.ranges import IfNoneMatchDep, RangeDep, file_answer
+from regnf_service.http.ranges import IfNoneMatchDep, IfRangeHeader, RangeHeader, file_answer, parse_range
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
 from regnf_service.http.schemas.scenes import RenderResultDocument
 from regnf_service.jobs.edits import find_job, manifest_of, result_of
@@ -29,7 +29,6 @@ _FILES = {kind: {} if kind == JSON else BINARY for kind in sorted(MEDIA_TYPES)}
 
 
 def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
-    """The manifest of the caller's job. Raises as ``find_job`` and ``manifest_of``."""
     return manifest_of(services, find_job(services, job_id, caller))
 
 
@@ -39,13 +38,7 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
     response_model=ResultDocument | RenderResultDocument,
     responses={
         200: {"links": links("name", "/artifacts/0/name", "get_artifact", "head_artifact", id="id")},
-        **refusals(
-            "JOB_NOT_FOUND",
-            "JOB_NOT_READY",
-            "JOB_DISMISSED",
-            "JOB_FAILED",
-            "JOB_EXPIRED",
-        ),
+        **refusals("JOB_NOT_FOUND JOB_NOT_READY JOB_DISMISSED JOB_FAILED JOB_EXPIRED"),
     },
 )
 @blocking
@@ -57,15 +50,16 @@ def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: Prefix
     manifest = _manifest(services, id, caller)
     document = result_of(services, manifest)
     known = {one["name"]: one for one in document.get("artifacts", ())}  # a rendering says what its files show
+    told = {
+        **{
+            name: {"state": "ready", "bytes": one.bytes, "sha256": one.sha256}
+            for name, one in manifest.served().items()
+        },
+        **{name: {"state": "pending", "bytes": None, "sha256": None} for name in manifest.pending},
+    }
     listed = [
-        known.get(name, {})
-        | {"name": name, "bytes": entry.bytes, "sha256": entry.sha256, "url": f"{prefix}/jobs/{id}/artifacts/{name}"}
-        for name, entry in manifest.served().items()
-    ]
-    listed = [one | {"state": "ready"} for one in listed]
-    listed += [
-        {"name": name, "state": "pending", "bytes": None, "sha256": None, "url": f"{prefix}/jobs/{id}/artifacts/{name}"}
-        for name in manifest.pending
+        known.get(name, {}) | {"name": name, "url": f"{prefix}/jobs/{id}/artifacts/{name}"} | one
+        for name, one in told.items()
     ]
     added = {"artifacts": listed} | ({"missing_artifacts": list(manifest.missing)} if manifest.missing else {})
     return JSONResponse(document | added, headers={"Cache-Control": _CACHE})
@@ -80,15 +74,8 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
     },
     304: NOT_MODIFIED,
     **refusals(
-        "JOB_NOT_FOUND",
-        "ARTIFACT_NOT_FOUND",
-        "ARTIFACT_NOT_READY",
-        "JOB_NOT_READY",
-        "JOB_DISMISSED",
-        "JOB_FAILED",
-        "JOB_EXPIRED",
-        "RANGE_NOT_SATISFIABLE",
-        "INVALID_QUERY",
+        "JOB_NOT_FOUND ARTIFACT_NOT_FOUND ARTIFACT_NOT_READY JOB_NOT_READY JOB_DISMISSED JOB_FAILED JOB_EXPIRED "
+        "RANGE_NOT_SATISFIABLE INVALID_QUERY"
     ),
 }
 
@@ -108,12 +95,13 @@ async def get_artifact(
     id: str,  # noqa: A002
     name: str,
     services: ServicesDep,
-    caller: CallerDep,
     held: IfNoneMatchDep,
-    range_: RangeDep,
+    range_: RangeHeader = None,
+    if_range: IfRangeHeader = None,
     wait: ArtifactWaitQuery = _ARTIFACT_WAIT_S,
 ) -> Response:
     """The names are those of the result's `artifacts` list. The answer is held back while the file is still to come."""
+    caller = request.state.caller
     manifest = await wait_for(
         lambda: _manifest(services, id, caller), lambda now: name not in now.pending, wait, services, caller
     )
@@ -125,7 +113,7 @@ async def get_artifact(
     size, etag = artifact.bytes, f'"{artifact.sha256[:32]}"'
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": _CACHE}
     headers["Content-Disposition"] = f'attachment; filename="{name}"'
-    part = range_.part(size, etag)
+    part = parse_range(range_ if if_range in (None, etag) else None, size)
     try:
         return await file_answer(request, services.blobs, manifest.key(name), artifact.media_type, headers, held, part)
     except FileNotFoundError as error:

@@ -14,19 +14,16 @@ from starlette.responses import JSONResponse
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.texts import TextError, decode_text
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.ingest import Beside, StoredUpload, check_room, room_for_bytes, store_upload
-from regnf_service.fields.piecewise import finish_pieces
-from regnf_service.fields.uploads import Received, SettingsUpload, Upload, open_settings, open_upload, settings_limit
+from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, room_for_bytes, store_upload
+from regnf_service.fields.piecewise import PieceRange, PieceUpload, check_piece, finish_pieces
+from regnf_service.fields.uploads import Received, SettingsUpload, Upload, settings_limit
 from regnf_service.http import body
 from regnf_service.http.body import (
     CallerDep,
-    Pace,
-    Piece,
     PrefixDep,
     ServicesDep,
     boundary_of,
     read_parts,
-    receive_piece,
 )
 from regnf_service.http.middleware import fair_key
 from regnf_service.http.ranges import PATTERN, announced_digest, content_range, field_etag, is_sha256
@@ -41,8 +38,9 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.schemas.fields import FieldDocument, UploadProgress, field_document
 from regnf_service.http.schemas.reading import read_model, reference
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import Problem
 from regnf_service.services import Services
+from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
@@ -87,7 +85,7 @@ _MULTIPART = {
             "model": UploadProgress,
             "headers": {"Upload-Offset": header("How many bytes have arrived.")},
         },
-        **refusals(*UPLOAD_REFUSALS, *PIECE_REFUSALS),
+        **refusals(UPLOAD_REFUSALS, PIECE_REFUSALS),
     },
     openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": FILE}}}},
 )
@@ -116,23 +114,26 @@ async def put_field(
     one breaks off. `bytes */total` without a body asks how much has arrived, and finishes what has arrived whole.
     """
     if not is_sha256(sha256):
-        raise Problem("INVALID_DIGEST", headers=CLOSE)
+        raise Problem("INVALID_DIGEST")
     if body.media_type(request).startswith("multipart/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.")
     digest = announced_digest(content_digest)
     span = content_range(content_range_, services.settings.max_upload_bytes)
-    pace = Pace(services.settings)
-    if span is not None:
-        piece = Piece(caller, sha256, span, digest, upload_complete == "?1")
-        async with services.uploads.held(fair_key(request.scope, caller), pace):
-            found = await receive_piece(request, services, piece, pace)
-        return _progress(piece, found) if isinstance(found, int) else _answer(found, prefix)
     declared = body.declared_length(request)
-    async with services.uploads.held(fair_key(request.scope, caller), pace):
+    with services.uploads.held(fair_key(request.scope, caller)):
+        if span is not None:
+            held = await _receive_piece(request, services, caller, sha256, span, digest)
+            if held is not None:
+                return _answer(StoredUpload(held, created=False), prefix)
+            offset = (await in_thread(services.pieces.find, caller, sha256)).offset
+            if upload_complete == "?0" or offset != span.total:
+                document = UploadProgress(sha256=sha256, offset=offset, bytes=span.total).model_dump()
+                return JSONResponse(document, status_code=202, headers={"Upload-Offset": str(offset)})
+            return _answer(await finish_pieces(services, caller, sha256), prefix)
         room = await in_thread(check_room, services, caller, sha256)
         with services.under_way.claim(caller, room, declared) as claim:
-            async with open_upload(services, claim) as upload:
-                received = await _receive_raw(request, services, upload, pace)
+            async with Upload(services, claim) as upload:
+                received = await _receive_raw(request, services, upload)
                 if received.sha256 != sha256 or digest not in (None, received.sha256):
                     raise Problem("DIGEST_MISMATCH")
                 taken = await store_upload(services, caller, upload, received)
@@ -147,12 +148,10 @@ async def put_field(
     responses={
         **_ANSWERS,
         **refusals(
-            *UPLOAD_REFUSALS,
-            *MULTIPART_REFUSALS,
-            *PIECE_REFUSALS[1:],
-            "MALFORMED_JSON",
-            "FIELD_DESCRIPTION_DIFFERS",
-            "INVALID_DESCRIPTION",
+            UPLOAD_REFUSALS,
+            MULTIPART_REFUSALS,
+            PIECE_REFUSALS,
+            "MALFORMED_JSON FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION",
         ),
     },
     openapi_extra={
@@ -178,31 +177,63 @@ async def post_field(
     An archive of a whole training run needs none of them. `upload` names a file whose pieces came by PUT.
     """
     if body.media_type(request).startswith("text/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.")
     digest = announced_digest(content_digest)
     in_parts = body.media_type(request) == "multipart/form-data"
     declared = body.declared_length(request, besides=2 * DESCRIPTION_BYTES if in_parts else 0)
-    pace = Pace(services.settings)
-    async with services.uploads.held(fair_key(request.scope, caller), pace), AsyncExitStack() as stack:
+    async with AsyncExitStack() as stack:
+        stack.enter_context(services.uploads.held(fair_key(request.scope, caller)))
         room = await in_thread(room_for_bytes, services, caller)
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
-        upload = await stack.enter_async_context(open_upload(services, claim))
+        upload = await stack.enter_async_context(Upload(services, claim))
         if in_parts:
-            files = {part: await stack.enter_async_context(open_settings(services, claim)) for part in _BESIDE}
-            received, beside = await _receive_parts(request, services, upload, files, pace, digest)
+            files = {part: await stack.enter_async_context(SettingsUpload(services, claim)) for part in _BESIDE}
+            received, beside = await _receive_parts(request, services, upload, files, digest)
             if isinstance(received, str):
                 return _answer(await finish_pieces(services, caller, received, beside), prefix)
         else:
-            received, beside = await _receive_raw(request, services, upload, pace), Beside()
+            received, beside = await _receive_raw(request, services, upload), Beside()
             if digest not in (None, received.sha256):
                 raise Problem("DIGEST_MISMATCH")
         taken = await store_upload(services, caller, upload, received, beside)
     return _answer(taken, prefix)
 
 
-async def _receive_raw(request: Request, services: Services, upload: Upload, pace: Pace) -> Received:
+async def _receive_piece(
+    request: Request, services: Services, caller: str, sha256: str, span: PieceRange, digest: str | None
+) -> FieldRecord | None:
+    """Read one piece to its end, and keep it if it is wanted; the field, if the caller has it already.
+
+    Raises Problem as ``check_piece``, UPLOAD_INCOMPLETE, DIGEST_MISMATCH.
+    """
+    room = await in_thread(check_room, services, caller, sha256)
+    known = await in_thread(held_field, services, caller, sha256)
+    if known is None:
+        await in_thread(check_piece, services, caller, sha256, span)
     body.refuse_encoding(request)
-    async for data in body.chunks(request, services.settings.max_upload_bytes, pace):
+    data = body.chunks(request, span.length, too_large="INVALID_HEADER")  # more than Content-Range says
+    if span.first is None:
+        async for _ in data:
+            pass
+        return known
+    with services.under_way.claim(caller, room, span.length) as claim:
+        async with PieceUpload(services, claim, span) as upload:
+            async for block in data:
+                await upload.feed(block)
+            received = await upload.finish()
+            if digest not in (None, received.sha256):
+                raise Problem("DIGEST_MISMATCH")
+            if known is None:
+                if received.bytes != span.length:
+                    raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.")
+                await in_thread(services.pieces.make_room, caller, sha256, span.first + received.bytes)
+                await upload.commit(services.pieces.key(caller, sha256, span.first, span.total))
+    return known
+
+
+async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
+    body.refuse_encoding(request)
+    async for data in body.chunks(request, services.settings.max_upload_bytes):
         await upload.feed(data)
     return await upload.finish()
 
@@ -212,20 +243,19 @@ async def _receive_parts(
     services: Services,
     upload: Upload,
     beside: Mapping[str, SettingsUpload],
-    pace: Pace,
     digest: str | None,
 ) -> tuple[Received | str, Beside]:
     """What came. In place of the file it may be the SHA-256 of one whose pieces came before."""
     body.refuse_encoding(request)
     limit = services.settings.max_upload_bytes + len(beside) * settings_limit(services) + 2 * DESCRIPTION_BYTES
-    data = body.chunks(request, limit, pace)
+    data = body.chunks(request, limit)
     if digest is not None:
         data = _compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES, "upload": _UPLOAD_BYTES}
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts)
     if ("file" in parts) == ("upload" in parts):
-        raise Problem("MISSING_PART", "Send the part `file`, or `upload` in its place.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `file`, or `upload` in its place.")
     description = read_description(parts.get("description"))
     settings, cameras = [await beside[part].received() for part in _BESIDE]
     if "file" in parts:
@@ -256,11 +286,6 @@ async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[by
         yield piece
     if found.hexdigest() != digest:
         raise Problem("DIGEST_MISMATCH")
-
-
-def _progress(piece: Piece, offset: int) -> JSONResponse:
-    document = UploadProgress(sha256=piece.sha256, offset=offset, bytes=piece.range.total)
-    return JSONResponse(document.model_dump(), status_code=202, headers={"Upload-Offset": str(offset)})
 
 
 def _answer(taken: StoredUpload, prefix: str) -> JSONResponse:

@@ -21,6 +21,7 @@ _Row = Annotated[list[_Component], Field(min_length=3, max_length=3)]
 _List = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[_Component], Field(min_length=4, max_length=4)]
 _Nothing = SkipJsonSchema[None]
+_IGNORED = Field(None, description="Of Open3D; ignored beside its names of the box's members.")
 
 
 class Point(Incoming):
@@ -61,6 +62,13 @@ class _Labeled(Incoming):
     score: Annotated[float, Field(ge=0, le=1)] | None = Field(None, description="The detector's confidence.")
 
 
+class _OfOpen3D(_Labeled):
+    color: Any = _IGNORED
+    class_name: Any = _IGNORED
+    version_major: Any = _IGNORED
+    version_minor: Any = _IGNORED
+
+
 def _one_of_each(*groups: tuple[str, ...]) -> ConfigDict:
     """A schema that requires one name of each group; what may be left out has no default to show."""
 
@@ -73,7 +81,7 @@ def _one_of_each(*groups: tuple[str, ...]) -> ConfigDict:
     return ConfigDict(json_schema_extra=change)
 
 
-class CenteredBox(_Labeled):
+class CenteredBox(_OfOpen3D):
     """A box by center, full edge lengths and rotation, which is the identity when left out. Open3D's
     OrientedBoundingBox, with `extent` and `R`, is taken as it is."""
 
@@ -88,13 +96,9 @@ class CenteredBox(_Labeled):
         None, description="Box axes to scene axes. Four bare numbers are refused: they do not say their order."
     )
     R: _Rotation | _Nothing = None
-    color: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
-    class_name: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
-    version_major: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
-    version_minor: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
 
 
-class CornerBox(_Labeled):
+class CornerBox(_OfOpen3D):
     """An axis-aligned box by its lowest and its highest corner. `min_bound` and `max_bound` are Open3D's names."""
 
     model_config = _one_of_each(("min", "min_bound"), ("max", "max_bound"))
@@ -103,10 +107,6 @@ class CornerBox(_Labeled):
     min_bound: _Point | _Nothing = None
     max: _Point | _Nothing = None
     max_bound: _Point | _Nothing = None
-    color: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
-    class_name: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
-    version_major: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
-    version_minor: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
 
 
 _Corners = Annotated[
@@ -117,7 +117,7 @@ _Corners = Annotated[
 
 def _read(value: Any) -> ParsedDetection:
     try:
-        return parse_detection(value)
+        return parse_detection(value).normal()
     except InvalidDetectionError as error:
         context = {"message": str(error), "hint": error.hint, "place": list(error.place)}
         raise PydanticCustomError(DETECTION_FAULT, "{message}", context) from error
@@ -126,5 +126,5 @@ def _read(value: Any) -> ParsedDetection:
 Detection = Annotated[
     ParsedDetection,
     PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | _Corners),
-    PlainSerializer(ParsedDetection.canonical, return_type=dict[str, Any]),
+    PlainSerializer(ParsedDetection.values, return_type=dict[str, Any]),
 ]

@@ -14,7 +14,7 @@ from regnf_service.http.query import NEXT_PAGE
 from regnf_service.http.schemas.results import Incoming, Label, Links, Moment, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
-from regnf_state.records import CANDIDATES, DRAWINGS, ORIGINAL_UNTIL, VIEWS, FieldRecord
+from regnf_state.records import CANDIDATES, FieldRecord
 
 
 class SettingsDocument(Outgoing):
@@ -110,18 +110,14 @@ def field_document(record: FieldRecord, prefix: str, queue_position: int | None 
     """The field as it travels; ``prefix`` is what the API's paths begin with."""
     address = f"{prefix}/fields/{sha256_of(record.sha256)}"
     return {
+        **{name: getattr(record, name) for name in ("state", "bytes", "label", "symmetry", "views")},
         "sha256": sha256_of(record.sha256),
-        "state": record.state,
-        "bytes": record.bytes,
-        "label": record.label,
         "description": record.said,
         "settings": None if record.settings is None else record.settings._asdict(),
         "cameras": None if record.cameras is None else record.cameras._asdict(),
-        "report": _plain(record.report),
-        "symmetry": record.symmetry,
+        "report": record.report,
         "library": None if record.library is None else {name: record.library[name] for name in ("name", "tags")},
         "queue_position": queue_position,
-        "views": record.views,
         "error": None if record.error is None else outgoing_problem(_error(record, address)),
         "kept_until": rfc3339(record.original_until),
         "created_at": rfc3339(record.created),
@@ -130,14 +126,8 @@ def field_document(record: FieldRecord, prefix: str, queue_position: int | None 
     }
 
 
-def _plain(said: dict[str, Any]) -> dict[str, Any]:
-    """A report or an error without what the document shows elsewhere."""
-    return {name: value for name, value in said.items() if name not in (ORIGINAL_UNTIL, VIEWS, DRAWINGS)}
-
-
 def _error(record: FieldRecord, address: str) -> dict[str, Any]:
-    """Why the field was rejected; pictures of candidates by their addresses."""
-    error = _plain(record.error or {})
+    error = record.error or {}
     if CANDIDATES not in error:
         return error
     pictures = [

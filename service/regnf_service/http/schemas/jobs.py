@@ -22,6 +22,9 @@ _PHASES = ["loading", "sampling", "initializing", "optimizing", "verifying", "ex
 # said in the contract alone: a record that an older version wrote is shown as it is
 _Phase = Annotated[str, WithJsonSchema({"type": "string", "enum": _PHASES})]
 _Verdict = Annotated[str, WithJsonSchema({"type": "string", "enum": list(get_args(Verdict))})]
+_AS_RECORDED = (
+    "id", "kind", "status", "phase", "progress", "cancel_requested", "engine", "verdict", "object_found"
+)  # fmt: skip
 _NOT_ASKED_AGAIN = frozenset({"version", "webhook"})
 
 
@@ -91,24 +94,13 @@ def job_document(
 ) -> dict[str, Any]:
     """The job as it travels. prefix: of the API's paths · deliveries: of all its webhooks, or none where not asked."""
     return {
-        "id": record.id,
-        "kind": record.kind,
-        "status": record.status,
-        "phase": record.phase,
-        "progress": record.progress,
+        **{name: getattr(record, name) for name in _AS_RECORDED},
+        **{f"{name}_at": rfc3339(getattr(record, name)) for name in ("created", "updated", "started", "finished")},
         "queue_position": queue_position,
         "attempts": record.attempt,
-        "cancel_requested": record.cancel_requested,
-        "created_at": rfc3339(record.created),
-        "updated_at": rfc3339(record.updated),
-        "started_at": rfc3339(record.started),
-        "finished_at": rfc3339(record.finished),
         "expires_at": None if record.finished is None else rfc3339(record.finished + retention_s),
         "inputs": {name: value for name, value in record.inputs.items() if name != WARNINGS},
-        "engine": record.engine,
         "warnings": record.inputs.get(WARNINGS) or {},
-        "verdict": record.verdict,
-        "object_found": record.object_found,
         "error": outgoing_problem(record.error),
         "webhooks": [_webhook(url, one) for url, one in zip_longest(record.webhooks, deliveries)],
         "links": _links(record, f"{prefix}/jobs/{record.id}"),

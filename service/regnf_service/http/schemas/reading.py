@@ -13,7 +13,7 @@ from regnf_core.errors import suggestion
 from regnf_core.options import UNKNOWN_OPTION, did_you_mean
 from regnf_service.http.schemas.detections import DETECTION_FAULT
 from regnf_service.http.schemas.library import BY_DIGEST, BY_LIBRARY
-from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
+from regnf_service.http.schemas.registrations import PRESET_FAULT
 from regnf_service.http.schemas.registrations import SPELLINGS as TRANSFORM_SPELLINGS
 from regnf_service.http.schemas.scenes import KINDS as EDIT_KINDS
 from regnf_service.http.strict_json import MOST_VALUES, parse_json
@@ -68,10 +68,6 @@ _REASONS_WITHIN = {
     "detection": "INVALID_DETECTION",
 }
 """Of members that lie deeper: they go before those of the whole."""
-_REASONS_OF_FAULTS = {
-    START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED",
-    SEARCH_UNSUPPORTED: "LIBRARY_SEARCH_UNSUPPORTED",
-}
 _FIELDS = frozenset({"scene", "object", "candidates", "replacement"})
 _TAGS = TRANSFORM_SPELLINGS | EDIT_KINDS | {BY_DIGEST, BY_LIBRARY}
 """Parts of places that no body has: which model of several was taken."""
@@ -81,8 +77,6 @@ _Model = TypeVar("_Model")
 
 
 class _Fault(NamedTuple):
-    """One fault of a body."""
-
     kind: str
     place: tuple[str | int, ...]
     detail: str
@@ -136,8 +130,8 @@ def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
 
 def _reason(fault: _Fault) -> str | None:
     """The reason of a fault: the one that its kind has, or the place."""
-    if fault.kind in _REASONS_OF_FAULTS or not fault.place:
-        return _REASONS_OF_FAULTS.get(fault.kind)
+    if fault.kind == PRESET_FAULT or not fault.place:
+        return "PRESET_UNSUITABLE" if fault.place else None
     within = next((_REASONS_WITHIN[str(part)] for part in fault.place[1:] if part in _REASONS_WITHIN), None)
     return within or _REASONS.get(str(fault.place[0]))
 
@@ -166,7 +160,6 @@ def _meant(place: Sequence[str | int], model: Any) -> str | None:
 
 
 def _hash_fault(text: str) -> str:
-    """What is wrong with a field's name, without repeating it."""
     expected = f"expected {_HASH_DIGITS} lower-case hexadecimal digits"
     if len(text) == _HASH_DIGITS and text.lower() != text:
         return f"It has upper-case letters, {expected}."

@@ -35,7 +35,7 @@ from regnf_service.http.schemas.library import (
     Selected,
 )
 from regnf_service.http.schemas.results import Coordinate, Incoming
-from regnf_state.registration_request import RegistrationRequest, recorded_detection
+from regnf_state.registration_request import RegistrationRequest
 
 # Similarity transforms as clients send them: a bare 4x4, or the transform object that results carry.
 
@@ -67,31 +67,21 @@ class TransformObject(Incoming):
 
     @model_validator(mode="after")
     def _agrees(self) -> TransformObject:
-        if not (self._same_scale() and self._same_rotation() and self._same_translation()):
+        scale = math.sqrt(sum(value * value for row in self.matrix[:3] for value in row[:3]) / 3)
+        agrees = self.scale is None or math.isclose(self.scale, scale, rel_tol=_AGREE)
+        if self.translation is not None:
+            agrees = agrees and _close(self.translation, [row[3] for row in self.matrix[:3]])
+        if self.rotation_quaternion_xyzw is not None:
+            agrees = agrees and any(self.rotation_quaternion_xyzw) and self._is_turned(scale)
+        if not agrees:
             raise ValueError("scale, rotation_quaternion_xyzw or translation contradict the matrix")
         return self
 
-    def _matrix_scale(self) -> float:
-        return math.sqrt(sum(value * value for row in self.matrix[:3] for value in row[:3]) / 3)
-
-    def _same_scale(self) -> bool:
-        return self.scale is None or math.isclose(self.scale, self._matrix_scale(), rel_tol=_AGREE)
-
-    def _same_translation(self) -> bool:
-        return self.translation is None or _close(self.translation, [row[3] for row in self.matrix[:3]])
-
-    def _same_rotation(self) -> bool:
-        if self.rotation_quaternion_xyzw is None:
-            return True
-        if not any(self.rotation_quaternion_xyzw):
-            return False
-        scale = self._matrix_scale()
-        columns = rotation_columns(normal_quaternion(self.rotation_quaternion_xyzw))
-        turned = zip(*columns, strict=True)
-        return all(
-            _close(row, [value / scale for value in held[:3]])
-            for row, held in zip(turned, self.matrix[:3], strict=True)
-        )
+    def _is_turned(self, scale: float) -> bool:
+        assert self.rotation_quaternion_xyzw is not None
+        turned = zip(*rotation_columns(normal_quaternion(self.rotation_quaternion_xyzw)), strict=True)
+        held = ([value / scale for value in row[:3]] for row in self.matrix[:3])
+        return all(map(_close, turned, held))
 
 
 def _close(a: Sequence[float], b: Sequence[float]) -> bool:
@@ -166,8 +156,7 @@ def start_rows(start: Rows | TransformObject | ObjectPose) -> Rows:
     return start.rows if isinstance(start, ObjectPose) else rows_of(start)
 
 
-START_UNSUPPORTED = "initial_transform_unsupported"
-SEARCH_UNSUPPORTED = "library_search_unsupported"
+PRESET_FAULT = "preset_unsuitable"
 
 
 class FieldReference(Incoming):
@@ -237,7 +226,7 @@ class RegistrationSpec(Incoming):
     def _is_of_use(cls, start: Any, info: ValidationInfo) -> Any:
         options = info.data.get("options")  # absent when they were refused themselves
         if start is not None and options is not None and options.preset != "robust":
-            raise PydanticCustomError(START_UNSUPPORTED, "only the preset `robust` starts from a given transform")
+            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` starts from a given transform")
         return start
 
     def to_request(
@@ -252,7 +241,7 @@ class RegistrationSpec(Incoming):
             scene=scene,
             object=object_,
             candidates=None if candidates is None else tuple(sorted(candidates)),
-            detection=recorded_detection(self.detection.canonical()),
+            detection=self.detection,
             options=self.options,
             seed=self.seed,
             initial_transform=None if start is None else start_rows(start),
@@ -293,9 +282,9 @@ class RegisterRequest(RegistrationSpec):
             return None
         options = info.data.get("options")
         if options is not None and options.preset != "robust":
-            raise PydanticCustomError(SEARCH_UNSUPPORTED, "only the preset `robust` searches a library")
+            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` searches a library")
         if info.data.get("initial_transform") is not None:
-            raise PydanticCustomError(START_UNSUPPORTED, "a search of a library starts from no given transform")
+            raise PydanticCustomError(PRESET_FAULT, "a search of a library starts from no given transform")
         if info.data.get("ground_truth") is not None:
             raise ValueError("a ground truth applies to one object, not to several candidates")
         return names

@@ -22,8 +22,8 @@ export function geometryFromGlb(buffer) {
   const geometry = new BufferGeometry();
   for (const [name, number] of Object.entries(attributes)) if (NAMES[name]) geometry.setAttribute(NAMES[name], read(number));
   geometry.setIndex(read(indices));
-  const { translation } = document.nodes[0]; // of a mesh far from the origin
-  if (translation) geometry.translate(...translation);
+  const { matrix } = document.nodes[0]; // of a mesh far from the origin: a shift
+  if (matrix) geometry.translate(...matrix.slice(12, 15));
   geometry.computeBoundingSphere();
   geometry.computeBoundingBox();
   return geometry;

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.legacy_container import LegacyArchive, read_legacy
+from regnf_core.importing.containers.legacy_container import TorchArchive, read_legacy
 from regnf_core.importing.pickle.pickle_machine import Placeholder, TensorRef
 from regnf_core.importing.tensor_source import TensorSource
 from tests.core.importing.archives import assert_refused, integer, numbers, text
@@ -29,7 +29,7 @@ def saved(values: object) -> bytes:
     return buffer.getvalue()
 
 
-def read(data: bytes) -> tuple[Any, LegacyArchive]:
+def read(data: bytes) -> tuple[Any, TorchArchive]:
     return read_legacy(memoryview(data))
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
-from random import Random
 from typing import Any
 
 import numpy as np
 import pytest
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers import npz
 from regnf_core.importing.containers.npz import ArraySource
 from tests.core.importing.archives import assert_refused, central_header_at, patched, zip_bytes
@@ -89,50 +87,40 @@ def test_every_version_and_shape_of_header(version: tuple[int, int], array: Any)
     np.testing.assert_array_equal(read(npy(array, version=version)), array)
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }",
-        b"{'descr': '<f4', 'fortran_order': False, 'shape': (2,3)}  \n",
-    ],
-)
-def test_headers_as_other_writers_spell_them(header: bytes) -> None:
-    np.testing.assert_array_equal(read(npy_with(header)), NUMBERS)
+def npy_of(descr: str = "'<f4'", shape: str = "(2, 3)", order: str = "False", more: str = "") -> bytes:
+    """The six numbers behind a header of these words."""
+    return npy_with(f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}{more}}}".encode())
+
+
+def test_headers_as_other_writers_spell_them() -> None:
+    for shape, more in (("(2, 3)", ", "), ("(2,3)", "")):
+        np.testing.assert_array_equal(read(npy_of(shape=shape, more=more)), NUMBERS)
 
 
 @pytest.mark.parametrize(
     ("entry", "reason"),
     [
-        (b"", "NPY_MALFORMED"),
-        (b"\x93NUMPY\x01\x00", "NPY_MALFORMED"),
-        (b"\x93NUMPZ" + npy(NUMBERS)[6:], "NPY_MALFORMED"),
+        *((raw, "NPY_MALFORMED") for raw in (b"", b"\x93NUMPY\x01\x00", b"\x93NUMPZ" + npy(NUMBERS)[6:])),
         (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3)}", version=b"\x04\x00"), "NPY_MALFORMED"),
         (b"\x93NUMPY\x02\x00\xff\xff\xff\x7f" + bytes(64), "NPY_MALFORMED"),
-        (npy_with(b" " * 5000), "NPY_MALFORMED"),
-        (npy_with(b"__import__('os').system('true')"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), 'more': 1}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': 0, 'shape': (2, 3)}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-2, 3)}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3**9)}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': [('x', '<f4')], 'fortran_order': False, 'shape': (6,)}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (1,1,1,1,1,1,1,2,3)}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '>f4', 'fortran_order': False, 'shape': (2, 3)}"), "TENSOR_DTYPE"),
-        (npy_with(b"{'descr': '<c8', 'fortran_order': False, 'shape': (3,)}"), "TENSOR_DTYPE"),
-        (npy_with(b"{'descr': '|V24', 'fortran_order': False, 'shape': (1,)}"), "TENSOR_DTYPE"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 4)}"), "TENSOR_STORAGE_MISMATCH"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 2)}"), "TENSOR_STORAGE_MISMATCH"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999999, 99999999)}"), "TENSOR_TOO_LARGE"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (0, 999999999, 9999999999)}"), "TENSOR_SHAPE"),
+        *(
+            (npy_with(header), "NPY_MALFORMED")
+            for header in (b" " * 5000, b"__import__('os').system('true')", b"(" * 4000, b"-" * 4000 + b"1", b"{[]: 1}")
+        ),
+        *(
+            (npy_of(shape=shape), "NPY_MALFORMED")
+            for shape in ("(-2, 3)", "(2, 3**9)", "(1,1,1,1,1,1,1,2,3)", "(2, True)")
+        ),
+        *((npy_of(more=", 'more': 1"), "NPY_MALFORMED"), (npy_of(order="0"), "NPY_MALFORMED")),
+        (npy_of("[('x', '<f4')]", "(6,)"), "NPY_MALFORMED"),
+        *((npy_of("'>f4'"), "TENSOR_DTYPE"), (npy_of("'<c8'", "(3,)"), "TENSOR_DTYPE")),
+        *((npy_of("'|V24'", "(1,)"), "TENSOR_DTYPE"), (npy_of("'(2,)f4'", "(3,)"), "TENSOR_DTYPE")),
+        *((npy_of(shape=shape), "TENSOR_STORAGE_MISMATCH") for shape in ("(2, 4)", "(2, 2)")),
+        (npy_of(shape="(99999999, 99999999)"), "TENSOR_TOO_LARGE"),
+        (npy_of(shape="(0, 999999999, 9999999999)"), "TENSOR_SHAPE"),
         (npy(np.array([{}, []], dtype=object), allow_pickle=True), "NPY_OBJECT_ARRAY"),
-        (npy_with(b"(" * 4000), "NPY_MALFORMED"),
-        (npy_with(b"-" * 4000 + b"1"), "NPY_MALFORMED"),
-        (npy_with(b"{[]: 1}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, True)}"), "NPY_MALFORMED"),
-        (npy_with(b"{'descr': 'O,f4', 'fortran_order': False, 'shape': (2, 3)}"), "NPY_OBJECT_ARRAY"),
-        (npy_with(b"{'descr': '(2,)f4', 'fortran_order': False, 'shape': (3,)}"), "TENSOR_DTYPE"),
-        (npy(np.arange(6)), "TENSOR_DTYPE"),
-        (npy(np.array([1.0, np.inf])), "TENSOR_NOT_FINITE"),
-        (npy(np.array([1e300])), "TENSOR_NOT_FINITE"),
+        *((npy_of("'O,f4'"), "NPY_OBJECT_ARRAY"), (npy(np.arange(6)), "TENSOR_DTYPE")),
+        *((npy(np.array([number])), "TENSOR_NOT_FINITE") for number in (np.inf, 1e300)),
     ],
 )
 def test_faulty_arrays_are_refused(entry: bytes, reason: str) -> None:
@@ -146,10 +134,7 @@ def test_whole_numbers_are_no_real_ones_nor_the_other_way_round() -> None:
     for name in ("r", "u", "b"):
         assert_refused(lambda name=name: arrays.integers(name), "TENSOR_DTYPE")
     assert_refused(lambda: arrays.numbers("b"), "TENSOR_DTYPE")
-
-
-def test_few_numbers_are_few() -> None:
-    assert_refused(lambda: source(savez(a=np.zeros(65))).numbers("a"), "TENSOR_SHAPE")
+    assert_refused(lambda: source(savez(a=np.zeros(65))).numbers("a"), "TENSOR_SHAPE")  # a few are expected
 
 
 def test_the_budget_counts_what_is_asked_for() -> None:
@@ -220,19 +205,3 @@ def test_the_container_is_as_strict_as_torchs() -> None:
     for end in range(1, len(data), 17):
         assert_refused(lambda end=end: source(data[:end]), "FILE_TRUNCATED")
     assert_refused(lambda: source(patched(data, 6, b"\x01\x00")), "ARCHIVE_HEADER_MISMATCH")
-
-
-def test_damage_anywhere_is_refused_or_does_no_harm() -> None:
-    random = Random(3)
-    refused = 0
-    for number in range(600):
-        data = bytearray(savez(number % 2 == 1, a=NUMBERS, b=np.arange(40)))
-        for _ in range(random.randint(1, 4)):
-            data[random.randrange(len(data))] = random.choice((random.randrange(256), 0, 255))
-        try:
-            arrays = source(bytes(data))
-            arrays.array("a")
-            arrays.integers("b")
-        except FieldFormatError:
-            refused += 1
-    assert 500 < refused < 600

@@ -11,10 +11,11 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.onnx import graph
-from regnf_core.importing.cost.onnx_work import onnx_bytes
+from regnf_core.importing.cost.mesh_work import Calls
+from regnf_core.importing.cost.onnx_work import onnx_needs
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import MIB, ImportLimits
-from regnf_core.schema.kinds import last_uses
+from regnf_core.schema.kinds import OnnxDescription, last_uses
 from tests.core.importing.archives import saved
 from tests.core.importing.cost.test_onnx_work import HALF, LAST, SPHERE, chain, described, ints
 from tests.core.importing.onnx_models import model
@@ -25,6 +26,10 @@ MADE = [f"c{n} = ConstantOfShape wide" for n in range(COUNT)]
 SUMMED = [f"d{n} = ReduceSum c{n} keepdims:0" for n in range(COUNT)]
 ADDED = ["e0 = Add d0 d1", *(f"e{n} = Add e{n - 1} d{n + 1}" for n in range(1, COUNT - 1)), f"z = Tanh e{COUNT - 2}"]
 WIDE = HALF | {"wide": ints(1 << 24)}
+
+
+def onnx_bytes(description: OnnxDescription, tensors: dict[str, Any]) -> int:
+    return onnx_needs(description, tensors, Calls((1,), ()))[1]
 
 
 def graph_of(steps: list[str]) -> Any:
@@ -86,14 +91,11 @@ def test_a_value_is_let_go_of_after_its_last_use(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_last_use_is_the_last() -> None:
-    description, _ = described(
-        model("a = Neg x; b = Neg a; c = Add a b; r = ReduceL2 c axes keepdims:1; y = Sub r half", HALF)
-    )
+    body = "a = Neg x; b = Neg a; c = Add a b; r = ReduceL2 c axes keepdims:1; y = Sub r half"
+    description, _ = described(model(body, HALF))
     uses = [set(names) for names in last_uses(description.nodes, description.output)]
     first, second, third, fourth, _ = (node.outputs[0] for node in description.nodes)
-    assert uses[0] == {description.input}
-    assert uses[1] == set()
-    assert uses[2] == {first, second}
+    assert uses[:3] == [{description.input}, set(), {first, second}]
     assert third in uses[3]
     assert fourth in uses[4]
     assert description.output not in set().union(*uses)

@@ -6,19 +6,14 @@ import struct
 import zlib
 from dataclasses import dataclass, field, replace
 from random import Random
+from typing import Any
 
 from tests.core.importing.fuzzing.byte_mutations import NUMBERS, little
 
 _LOCAL_FIELDS = {"version": 2, "flags": 2, "method": 2, "time": 2, "date": 2, "crc": 4, "packed": 4, "size": 4}
 _CENTRAL_FIELDS = {"made_by": 2, **_LOCAL_FIELDS}
 _NAMES: tuple[bytes, ...] = (
-    b"archive/../x",
-    b"/x",
-    b"x",
-    b"archive/data.pkl",
-    b"archive/data/0",
-    b"archive/code/x.py",
-    b"other/y",
+    *(b"archive/../x", b"/x", b"x", b"archive/data.pkl", b"archive/data/0", b"archive/code/x.py", b"other/y"),
 )
 _NAMES += (b"archive/\xff", b"archive/a\0b", b"archive/" + b"n" * 600, b"archive/byteorder", b"archive/constants.pkl")
 
@@ -130,46 +125,27 @@ def _lied_ending(random: Random, ending: Ending) -> Ending:
     key = random.choice(("disk", "start_disk", "here", "count", "size", "offset", "comment_length"))
     wide_key = random.choice(("record", "disk", "here", "count", "size", "offset", "at", "disks", "locator_disk"))
     value = random.choice(NUMBERS)
-    match random.randrange(6):
-        case 0 | 1:
-            return replace(ending, claims=ending.claims | {key: value})
-        case 2:
-            return replace(ending, wide=True)
-        case 3:
-            return replace(ending, wide=True, wide_claims=ending.wide_claims | {wide_key: value})
-        case 4:
-            return replace(ending, comment=random.randbytes(random.randrange(1, 9)))
-        case _:
-            return replace(ending, tail=random.randbytes(random.randrange(1, 40)))
+    changes: tuple[dict[str, Any], ...] = (
+        *({"claims": ending.claims | {key: value}}, {"claims": ending.claims | {key: value}}, {"wide": True}),
+        {"wide": True, "wide_claims": ending.wide_claims | {wide_key: value}},
+        *({"comment": random.randbytes(random.randrange(1, 9))}, {"tail": random.randbytes(random.randrange(1, 40))}),
+    )
+    return replace(ending, **random.choice(changes))
 
 
 def _lied_record(random: Random, record: Record, others: list[Record]) -> list[Record]:
     key = random.choice([*_CENTRAL_FIELDS, "offset", "name_length", "comment_length", "disk"])
     value = random.choice((*NUMBERS, len(record.data) - 1, len(record.data) + 1, 1, 8, 0x0808, 0x0001, 0x2000))
-    match random.randrange(12):
-        case 0 | 1:
-            return [replace(record, central=record.central | {key: value})]
-        case 2:
-            return [replace(record, local=record.local | {key: value})]
-        case 3:
-            return [replace(record, central=record.central | {key: value}, local=record.local | {key: value})]
-        case 4:
-            return [replace(record, name=random.choice(_NAMES), local_name=random.choice((None, record.name)))]
-        case 5:
-            return [record, random.choice(others)]
-        case 6:
-            return [replace(record, in_directory=False)]
-        case 7:
-            return [replace(record, gap=random.randbytes(random.randrange(1, 9)))]
-        case 8:
-            return [replace(record, descriptor=random.choice(("", "32", "64", "bare")))]
-        case 9:
-            return [_compressed(record)]
-        case 10:
-            return [_widened(random, record)]
-        case _:
-            extra = random.randbytes(random.randrange(1, 60))
-            return [replace(record, local_extra=extra, central_extra=random.choice((b"", extra)))]
+    central, local, extra = record.central | {key: value}, record.local | {key: value}, random.randbytes(9)
+    changes: tuple[dict[str, Any], ...] = (
+        *({"central": central}, {"central": central}, {"local": local}, {"central": central, "local": local}),
+        {"name": random.choice(_NAMES), "local_name": random.choice((None, record.name))},
+        *({"in_directory": False}, {"gap": extra}, {"descriptor": random.choice(("", "32", "64", "bare"))}),
+        {"local_extra": extra, "central_extra": random.choice((b"", extra))},
+    )
+    if random.random() < 0.75:
+        return [replace(record, **random.choice(changes))]
+    return random.choice(([record, random.choice(others)], [_compressed(record)], [_widened(random, record)]))
 
 
 def _compressed(record: Record) -> Record:

@@ -9,8 +9,7 @@ from tests.core.importing.fuzzing.archive_model import Ending, archive_bytes, li
 from tests.core.importing.fuzzing.byte_mutations import damaged
 from tests.core.importing.fuzzing.container_mutations import SPOILERS
 from tests.core.importing.fuzzing.header_mutations import rewritten
-from tests.core.importing.fuzzing.pickle_grammar import Grammar, contiguous
-from tests.core.importing.fuzzing.pickle_mutations import opcodes_of, respelt
+from tests.core.importing.fuzzing.pickle_grammar import Grammar, contiguous, opcodes_of, respelt
 from tests.core.importing.fuzzing.seeds import EMPTY, Seeds
 
 STAGES = ("container", "pickle", "tensors", "header", "file", *SPOILERS)
@@ -26,18 +25,12 @@ def make_case(random: Random, stage: str, seeds: Seeds, finds: list[bytes]) -> b
     """One case. ``finds`` are earlier cases of the stage that reached new code: some cases build upon them."""
     if finds and random.random() < 0.4:
         return damaged(random, random.choice(finds), random.choice(finds))
-    match stage:
-        case "container":
-            return _container(random, seeds)
-        case "pickle":
-            return _pickle(random, seeds)
-        case "tensors":
-            return _tensors(random, seeds)
-        case "header":
-            return _header(random, seeds)
-    if stage in SPOILERS:
-        return _other(random, stage, seeds)
-    return random.choice((_container, _tensors, _tensors, _header, _header, _head))(random, seeds)
+    make = {"container": _container, "pickle": _pickle, "tensors": _tensors, "header": _header}.get(stage)
+    if make is None and stage in SPOILERS:
+        files = list(seeds.others[stage].values())
+        return SPOILERS[stage](random, random.choice(files), random.choice(files))
+    make = make or random.choice((_container, _tensors, _tensors, _header, _header, _head))
+    return make(random, seeds)
 
 
 def _container(random: Random, seeds: Seeds) -> bytes:
@@ -52,13 +45,12 @@ def _container(random: Random, seeds: Seeds) -> bytes:
 
 def _pickle(random: Random, seeds: Seeds) -> bytes:
     first, second = random.choice(seeds.pickles), random.choice(seeds.pickles)
-    match random.randrange(4):
-        case 0:
-            return respelt(random, opcodes_of(first), opcodes_of(second))
-        case 1:
-            return damaged(random, first, second)
-    grammar = Grammar(random)
-    return grammar.pickle(grammar.value(6))
+    if random.random() < 0.5:
+        grammar = Grammar(random)
+        return grammar.pickle(grammar.value(6))
+    if random.random() < 0.5:
+        return damaged(random, first, second)
+    return respelt(random, opcodes_of(first), opcodes_of(second))
 
 
 def _tensors(random: Random, seeds: Seeds) -> bytes:
@@ -102,11 +94,6 @@ def _entry(random: Random, name: str, key: str, shape: tuple[int, ...]) -> bytes
 
 def _header(random: Random, seeds: Seeds) -> bytes:
     return damaged(random, seeds.field_file) if random.random() < 0.2 else rewritten(random, seeds.field_file)
-
-
-def _other(random: Random, stage: str, seeds: Seeds) -> bytes:
-    files = list(seeds.others[stage].values())
-    return SPOILERS[stage](random, random.choice(files), random.choice(files))
 
 
 def _head(random: Random, seeds: Seeds) -> bytes:

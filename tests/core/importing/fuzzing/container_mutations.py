@@ -5,46 +5,37 @@ from __future__ import annotations
 import io
 import json
 import pickletools
-import re
 import sqlite3
 import zipfile
 from collections.abc import Callable
 from random import Random
 
 from tests.core.importing.fuzzing.archive_model import Ending, Record, archive_bytes, lied
-from tests.core.importing.fuzzing.byte_mutations import NUMBERS, damaged, little, number
+from tests.core.importing.fuzzing.byte_mutations import NUMBERS, damaged, little, number, reworded
 from tests.core.importing.fuzzing.header_mutations import altered
-from tests.core.importing.fuzzing.pickle_mutations import opcodes_of, respelt
+from tests.core.importing.fuzzing.pickle_grammar import opcodes_of, respelt
 from tests.core.importing.fuzzing.run_mutations import repacked, spoilt_settings
 from tests.core.importing.fuzzing.wire_mutations import rewired
 
-_WORDS: tuple[bytes, ...] = (
-    *(b"nan", b"-inf", b"1e400", b"1e-400", b"-1", b"0", b"3000000000", b"9" * 30, b"0x10", b"1_0", b"", b"\xff"),
-    *(b"list", b"uchar", b"double", b"vertex", b"face", b"property", b"element", b"end_header", b"comment", b"ascii"),
-    *(b"binary_big_endian", b"f", b"v", b"-1/2/3", b"1//1", b"call", b"csh", b"facet", b"endsolid", b"\\"),
-    *(b"'|O'", b"'>f8'", b"'<f2'", b"'<i8'", b"(0,)", b"(9, 9, 9, 1)", b"(1152921504606846976,)", b"(,)", b"True"),
+_WORDS = (
+    *b"nan -inf 1e400 1e-400 -1 0 3000000000 0x10 1_0 \xff list uchar double vertex face property element".split(b" "),
+    *b"end_header comment ascii binary_big_endian f v -1/2/3 1//1 call csh facet endsolid \\ True '|O' '>f8'".split(
+        b" "
+    ),
+    *(b"'<f2'", b"'<i8'", b"(0,)", b"(9, 9, 9, 1)", b"(1152921504606846976,)", b"(,)", b"", b"9" * 30),
 )
 _LEGACY_PICKLES = 5
 _HEADER_END = b"end_header\n"
 _STATEMENTS = (
-    "DELETE FROM {table} WHERE rowid % 2",
-    "DELETE FROM {table}",
-    "INSERT INTO {table} SELECT * FROM {table}",
-    "INSERT INTO {table} SELECT * FROM {table} LIMIT 1",
-    "UPDATE {table} SET {column} = {value}",
-    "UPDATE {table} SET {column} = {value} WHERE rowid = 1",
-    "ALTER TABLE {table} RENAME COLUMN {column} TO odd",
-    "ALTER TABLE {table} DROP COLUMN {column}",
-    "ALTER TABLE {table} RENAME TO odd",
-    "ALTER TABLE {table} ADD COLUMN {column}_more",
-    "CREATE VIEW odd AS SELECT * FROM {table}",
+    *("DELETE FROM {table} WHERE rowid % 2", "DELETE FROM {table}", "INSERT INTO {table} SELECT * FROM {table}"),
+    *("INSERT INTO {table} SELECT * FROM {table} LIMIT 1", "UPDATE {table} SET {column} = {value}"),
+    *("UPDATE {table} SET {column} = {value} WHERE rowid = 1", "ALTER TABLE {table} RENAME COLUMN {column} TO odd"),
+    *("ALTER TABLE {table} DROP COLUMN {column}", "ALTER TABLE {table} RENAME TO odd"),
+    *("ALTER TABLE {table} ADD COLUMN {column}_more", "CREATE VIEW odd AS SELECT * FROM {table}"),
     "CREATE TABLE occupancy_layer_data AS SELECT * FROM {table}",
-    "CREATE TABLE other_tsdf_layer_data AS SELECT * FROM {table}",
-    "CREATE INDEX odd ON {table}({column})",
-    "CREATE TRIGGER odd AFTER INSERT ON {table} BEGIN DELETE FROM {table}; END",
-    "PRAGMA user_version = {value}",
-    "PRAGMA application_id = {value}",
-    "PRAGMA auto_vacuum = 1",
+    *("CREATE TABLE other_tsdf_layer_data AS SELECT * FROM {table}", "CREATE INDEX odd ON {table}({column})"),
+    *("CREATE TRIGGER odd AFTER INSERT ON {table} BEGIN DELETE FROM {table}; END", "PRAGMA user_version = {value}"),
+    *("PRAGMA application_id = {value}", "PRAGMA auto_vacuum = 1"),
 )
 _BLOB = "a block"
 _VALUES: tuple[str, ...] = (
@@ -126,7 +117,7 @@ def spoilt_arrays(random: Random, file: bytes, other: bytes) -> bytes:
 def _reheaded(random: Random, array: bytes) -> bytes:
     """An array with other words in its header, whose length is mostly told as it is."""
     length = int.from_bytes(array[8:10], "little")
-    text = reworded(random, array[10 : 10 + length])
+    text = reworded(random, array[10 : 10 + length], _WORDS)
     told = random.choice(NUMBERS) if random.random() < 0.1 else len(text)
     return array[:8] + little(told, 2) + text + array[10 + length :]
 
@@ -140,11 +131,11 @@ def spoilt_mesh(random: Random, file: bytes, other: bytes) -> bytes:
     header, end, body = file.partition(_HEADER_END)
     if file.startswith(b"ply") and b"ascii" not in header:
         if random.random() < 0.6:
-            return reworded(random, header + end) + body
+            return reworded(random, header + end, _WORDS) + body
         return header + end + damaged(random, body)
     if not _is_text(file):  # a binary stl: a count, then triangles
         return file[:80] + (damaged(random, file[80:]) if random.random() < 0.7 else number(random, 4) + file[84:])
-    return reworded(random, file)
+    return reworded(random, file, _WORDS)
 
 
 def _is_text(file: bytes) -> bool:
@@ -163,27 +154,6 @@ def _spoilt_glb(random: Random, file: bytes, other: bytes) -> bytes:
     text += b" " * (-len(text) % 4)
     head = b"glTF" + little(2, 4) + little(20 + len(text) + len(rest), 4) + little(len(text), 4) + b"JSON"
     return (damaged(random, head) if random.random() < 0.05 else head) + text + rest
-
-
-def reworded(random: Random, text: bytes) -> bytes:
-    """Text after one to four of its words, or lines, were replaced, dropped, doubled or moved."""
-    for _ in range(random.choice((1, 1, 2, 4))):
-        separator = random.choice((rb"([ ,:]+)", rb"(\s+)", rb"(\n)"))
-        words = re.split(separator, text)
-        at = random.randrange((len(words) + 1) // 2) * 2  # the odd ones are what stands between
-        match random.randrange(5):
-            case 0:
-                words[at] = b""
-            case 1:
-                words[at : at + 1] = [words[at], b"\n" if separator == rb"(\n)" else b" "] * random.choice((1, 2, 300))
-            case 2:
-                words[at] = random.choice(words)
-            case 3:
-                del words[at : at + 2]
-            case _:
-                words[at] = random.choice(_WORDS)
-        text = b"".join(words)
-    return text
 
 
 def spoilt_model(random: Random, file: bytes, other: bytes) -> bytes:

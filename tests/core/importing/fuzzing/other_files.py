@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import base64
+import bz2
+import gzip
 import io
+import json
+import lzma
 import tempfile
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
 
-from tests.core.importing import (
-    onnx_models,
-    test_nvblox,
-    test_pin_slam,
-    test_voxel_block_grid,
-)
+from tests.core.importing import onnx_models, test_nvblox, test_pin_slam, test_voxel_block_grid
 from tests.core.importing import small_families as small
+from tests.core.importing.archives import zip_bytes
 from tests.core.importing.checkpoints import checkpoint
-from tests.core.importing.fuzzing.run_files import make_runs, make_settings
 from tests.core.importing.meshes import mesh_files, test_point_clouds
-from tests.core.importing.networks.cases import FAMILIES
+from tests.core.importing.settings import configurations
+from tests.gate.bad_runs import tar_bytes
 
 
 def make_others() -> dict[str, dict[str, bytes]]:
@@ -34,7 +35,7 @@ def make_others() -> dict[str, dict[str, bytes]]:
         "onnx": _models(),
         "other": _checkpoints(),
         "run": _runs(),
-        "settings": make_settings(),
+        "settings": _settings(),
     }
 
 
@@ -80,8 +81,6 @@ def _checkpoints() -> dict[str, bytes]:
     files = {"pin_slam": _saved(test_pin_slam.floor())}
     for make in (small.neus, small.siren, small.deepsdf, small.instant_nsr_pl):
         files[make.__name__] = _saved(make().checkpoint)
-    rng = np.random.default_rng(4)
-    files |= {family: _saved(FAMILIES[family](rng, 0).checkpoint) for family in ("idr, volsdf", "igr", "plain_network")}
     return files
 
 
@@ -89,7 +88,43 @@ def _runs() -> dict[str, bytes]:
     whole = small.deepsdf().checkpoint
     network = {name: value for name, value in whole.items() if name != "latent_codes"}
     scaling = _arrays(offset=np.zeros(3, np.float32), scale=np.array([0.5], np.float32))
-    return make_runs(_saved(network), _saved({"epoch": 1, "latent_codes": whole["latent_codes"]}, legacy=True), scaling)
+    return _packed_runs(
+        _saved(network), _saved({"epoch": 1, "latent_codes": whole["latent_codes"]}, legacy=True), scaling
+    )
+
+
+def _packed_runs(deepsdf: bytes, codes: bytes, scaling: bytes) -> dict[str, bytes]:
+    """Archives of a DeepSDF's run: its network, its latent codes, and how its shape was scaled."""
+    specs = {"NetworkSpecs": {"latent_in": [2]}, "CodeLength": 5}
+    members = [
+        ("run/specs.json", json.dumps(specs).encode()),
+        ("run/ModelParameters/1.pth", deepsdf),
+        ("run/LatentCodes/1.pth", codes),
+        ("run/data/NormalizationParameters/a.npz", scaling),
+    ]
+    tar = tar_bytes(members)
+    packed = {"gzip": gzip.compress(tar, 1, mtime=0), "bzip2": bz2.compress(tar, 1), "xz": lzma.compress(tar, preset=0)}
+    return {"zip": zip_bytes(members, zipfile.ZIP_DEFLATED), "stored": zip_bytes(members), "tar": tar, **packed}
+
+
+def _settings() -> dict[str, bytes]:
+    """Files of settings, each behind a line with its name."""
+    files = {
+        "sdfstudio": ("config.yml", configurations.studio(False)),
+        "nerfstudio": ("config.yml", configurations.studio(True)),
+        "nsr": ("parsed.yaml", configurations.nsr("ProgressiveBandHashGrid", configurations.BAND)),
+        "angelo": ("config.yaml", configurations.ANGELO % ("True", 4)),
+        "neus": ("a.conf", configurations.NEUS_CONF.format(scale=3.0, layers=8, skip=4)),
+        "volsdf": (
+            "a.conf",
+            "model { scene_bounding_sphere = 3.0\n implicit_network\n { dims = [ 8, 8 ]\n multires = 6 } }",
+        ),
+        "deepsdf": ("specs.json", json.dumps(configurations.SPECS)),
+        "pin_slam": ("run.yaml", "neuralpoints: {voxel_size_m: 0.3}\nloss: {sigma_sigmoid_m: 0.1}\n"),
+        "sines": ("config.yaml", "model: {omega_0: 30.0}\n"),
+        "fusion": ("config.yaml", "integrate: {voxel_size: 0.01, trunc_voxel_multiplier: 8}\n"),
+    }
+    return {kind: f"{name}\n{text}".encode() for kind, (name, text) in files.items()}
 
 
 def _bytes(data: bytes | str) -> bytes:

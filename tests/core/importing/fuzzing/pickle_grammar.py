@@ -1,62 +1,26 @@
-"""Pickles that mostly make sense: values written by a grammar of opcodes, with now and then one that does not fit."""
+"""Pickles that mostly make sense: written by a grammar of opcodes, or taken apart and put together otherwise."""
 
 from __future__ import annotations
 
+import pickletools
 from collections.abc import Callable
 from random import Random
 
 from tests.core.importing.archives import integer, storage, tensor, text
-from tests.core.importing.fuzzing.byte_mutations import NUMBERS, double, little
+from tests.core.importing.fuzzing.byte_mutations import NUMBERS, double, little, rearranged
 
-GLOBALS = (
-    ("torch._utils", "_rebuild_tensor_v2"),
-    ("torch._utils", "_rebuild_tensor"),
-    ("torch._utils", "_rebuild_parameter"),
-    ("torch._utils", "_rebuild_parameter_with_state"),
-    ("torch._utils", "_rebuild_sparse_tensor"),
-    ("torch._utils", "_rebuild_qtensor"),
-    ("torch.storage", "_load_from_bytes"),
-    ("torch", "Size"),
-    ("torch", "FloatStorage"),
-    ("collections", "OrderedDict"),
-    ("collections", "Counter"),
-    ("collections", "defaultdict"),
-    ("builtins", "dict"),
-    ("__builtin__", "list"),
-    ("builtins", "set"),
-    ("builtins", "eval"),
-    ("builtins", "getattr"),
-    ("_codecs", "encode"),
-    ("numpy", "dtype"),
-    ("numpy.core.multiarray", "scalar"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy.core.multiarray", "_reconstruct"),
-    ("copyreg", "_reconstructor"),
-    ("os", "system"),
-    ("posix", "system"),
-    ("this", "s"),
-    ("antigravity", "webbrowser"),
-    ("functools", "partial"),
-    ("operator", "attrgetter"),
-    ("pkgutil", "resolve_name"),
-    ("tests.core.importing.nowhere", "thing"),
-)
+_NAMES = """
+torch._utils._rebuild_tensor_v2 torch._utils._rebuild_tensor torch._utils._rebuild_parameter torch.Size
+torch._utils._rebuild_parameter_with_state torch._utils._rebuild_sparse_tensor torch._utils._rebuild_qtensor
+torch.storage._load_from_bytes torch.FloatStorage collections.OrderedDict collections.Counter collections.defaultdict
+builtins.dict __builtin__.list builtins.set builtins.eval builtins.getattr _codecs.encode numpy.dtype
+numpy.core.multiarray.scalar numpy._core.multiarray.scalar numpy.core.multiarray._reconstruct copyreg._reconstructor
+os.system posix.system this.s antigravity.webbrowser functools.partial operator.attrgetter pkgutil.resolve_name
+tests.core.importing.nowhere.thing
+"""
 """Among them modules that nothing has loaded yet: an import of one would show."""
 TEXTS: tuple[str, ...] = (
-    "",
-    "storage",
-    "cpu",
-    "cuda:0",
-    "meta",
-    "0",
-    "1",
-    "latin1",
-    "pipeline",
-    "f8",
-    "<f4",
-    "u1",
-    "O8",
-    "x" * 300,
+    *("", "storage", "cpu", "cuda:0", "meta", "0", "1", "latin1", "pipeline", "f8", "<f4", "u1", "O8", "x" * 300),
 )
 TEXTS += ("_model.field.glin0.weight_v", "_model.field.aabb", "../0", "a\0b", "\u202e", "state_dict", "99999")
 _RARE = (*(bytes([code]) for code in range(256)), b"\x95" + bytes(8), b"(ios\nsystem\n", b"(cos\nsystem\no")
@@ -95,18 +59,11 @@ class Grammar:
         raw = random.randbytes(random.choice((0, 1, 8, 9, 31, 33, 200)))
         choices = (
             *(b"N", b"\x88", b"\x89", b")", b"]", b"}", b"\x8f"),
-            b"K" + little(wide, 1),
-            b"M" + little(wide, 2),
-            b"J" + little(wide, 4),
-            integer(wide if wide < 1 << 63 else -wide),
-            b"\x8a" + bytes([len(raw)]) + raw,
+            *(b"K" + little(wide, 1), b"M" + little(wide, 2), b"J" + little(wide, 4)),
+            *(integer(wide if wide < 1 << 63 else -wide), b"\x8a" + bytes([len(raw)]) + raw),
             b"G" + double(random.choice((0.0, -1.5, 1e308, float("nan"), float("inf")))),
-            text(random.choice(TEXTS)),
-            text(random.choice(TEXTS)),
-            b"\x8c" + bytes([len(raw)]) + raw,
-            b"C" + bytes([len(raw)]) + raw,
-            b"B" + little(len(raw), 4) + raw,
-            b"\x8e" + little(len(raw), 8) + raw,
+            *(text(random.choice(TEXTS)), text(random.choice(TEXTS)), b"\x8c" + bytes([len(raw)]) + raw),
+            *(b"C" + bytes([len(raw)]) + raw, b"B" + little(len(raw), 4) + raw, b"\x8e" + little(len(raw), 8) + raw),
             b"\x96" + little(len(raw), 8) + raw,
         )
         return random.choice(choices)
@@ -144,7 +101,7 @@ class Grammar:
         return b"h" + little(index, 1) if index < 256 else b"j" + little(index, 4)
 
     def global_name(self) -> bytes:
-        module, name = self.random.choice(GLOBALS)
+        module, _, name = self.random.choice(_NAMES.split()).rpartition(".")
         if self.random.random() < 0.3:
             return text(module) + text(name) + b"\x93"
         return f"c{module}\n{name}\n".encode()
@@ -189,3 +146,31 @@ def contiguous(shape: tuple[int, ...]) -> tuple[int, ...]:
         strides.append(step)
         step *= max(extent, 1)
     return tuple(reversed(strides))
+
+
+_LENGTHS = dict.fromkeys((b"\x8c", b"C", b"\x8a", b"h", b"q"), 1) | dict.fromkeys((b"\x8d", b"\x8e", b"\x95"), 8)
+_LENGTHS |= dict.fromkeys((b"X", b"B", b"\x8b", b"j", b"r", b"J"), 4)
+"""Width of the length, index or number that an opcode begins with."""
+
+
+def opcodes_of(pickle: bytes) -> list[bytes]:
+    """A sound pickle's opcodes, one after the other, with their arguments."""
+    starts = [position for _, _, position in pickletools.genops(pickle) if position is not None]
+    return [pickle[start:end] for start, end in zip(starts, [*starts[1:], len(pickle)], strict=True)]
+
+
+def respelt(random: Random, opcodes: list[bytes], others: list[bytes]) -> bytes:
+    """The pickle after one to four changes to its opcodes, the first of which stays."""
+    first, *rest = opcodes
+    for _ in range(random.choice((1, 1, 2, 4))):
+        rest = rearranged(random, rest or [b"."], others, lambda code: _odd_opcode(random, code))
+    return first + b"".join(rest)
+
+
+def _odd_opcode(random: Random, code: bytes) -> bytes:
+    """Another value in its place or before it, another length, or another opcode."""
+    if code[:1] in _LENGTHS and random.random() < 0.4:
+        width = _LENGTHS[code[:1]]
+        return code[:1] + little(random.choice((*NUMBERS, len(code), len(code) - 1)), width) + code[1 + width :]
+    value = Grammar(random).value(3)
+    return random.choice((value, value + b"0" + code, bytes([random.randrange(256)]) + code[1:]))

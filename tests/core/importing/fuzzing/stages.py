@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +32,7 @@ PARTS = ("container", "pickle", "tensors", "header", "settings")
 _TAKEN = "taken"
 _LIMITS = ImportLimits(wall_s=100, tensor_bytes=BUDGET)
 _QUIET = (
-    "object.",
-    "sys._getframe",
-    "code.__new__",
-    "builtins.id",
-    "gc.",
-    "tempfile.",
-    "time.",
-    "sys.",
-    "mmap.",
+    *("object.", "sys._getframe", "code.__new__", "builtins.id", "gc.", "tempfile.", "time.", "sys.", "mmap."),
     "sqlite3.",
 )
 """Beginnings of the audit events that mean nothing here."""
@@ -83,7 +75,9 @@ def run_stage(stage: str, data: bytes, folder: Path) -> str:
     try:
         match stage:
             case "container":
-                _container(data)
+                archive = read_archive(memoryview(data))
+                for name in archive.entries:
+                    archive.read(name)
             case "pickle":
                 read_pickle(memoryview(data))
             case "tensors":
@@ -99,29 +93,15 @@ def run_stage(stage: str, data: bytes, folder: Path) -> str:
     return _TAKEN
 
 
-def _container(data: bytes) -> None:
-    archive = read_archive(memoryview(data))
-    for name in archive.entries:
-        archive.read(name)
-
-
 def _tensors(data: bytes) -> None:
     archive = read_archive(memoryview(data))
     value = read_pickle(archive.read("data.pkl"))
-    refusals = []
-    for name, found in _values(value):
-        try:
-            TensorSource(archive, BUDGET).array(name, found)
-        except FieldFormatError as error:
-            refusals.append(error)
-    convert_checkpoint(value, TensorSource(archive, BUDGET), UploadDescription())
-
-
-def _values(value: Any) -> list[tuple[str, Any]]:
-    """The values of the checkpoint's state, whatever they are."""
     state = value.get("pipeline", value) if isinstance(value, dict) else {"value": value}
-    members = state.items() if isinstance(state, dict) else [("state", state)]
-    return [(key if isinstance(key, str) else "odd", found) for key, found in members][:100]
+    members = list(state.items()) if isinstance(state, dict) else [("state", state)]
+    for key, found in members[:100]:  # whatever they are
+        with suppress(FieldFormatError):
+            TensorSource(archive, BUDGET).array(key if isinstance(key, str) else "odd", found)
+    convert_checkpoint(value, TensorSource(archive, BUDGET), UploadDescription())
 
 
 def _settings(data: bytes) -> None:

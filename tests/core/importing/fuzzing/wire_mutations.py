@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from tests.core.importing.fuzzing.byte_mutations import NUMBERS, damaged
+from tests.core.importing.fuzzing.byte_mutations import NUMBERS, damaged, rearranged
 
 _VARINT, _WIDE, _BYTES, _NARROW = 0, 1, 2, 5
 _NAMES = (b"", b"x", b"y", b"Loop", b"If", b"Scan", b"Gemm", b"Reshape", b"Expand", b"ConstantOfShape", b"../weights")
@@ -13,41 +13,26 @@ Field = tuple[int, int, int | bytes]
 """Number, wire type, value."""
 
 
-def rewired(random: Random, message: bytes) -> bytes:
+def rewired(random: Random, message: bytes, depth: int = 6) -> bytes:
     """The message after one to three changes to its fields, at any depth."""
-    for _ in range(random.choice((1, 1, 2, 3))):
-        message = _changed(random, message, depth=6)
+    for _ in range(random.choice((1, 1, 2, 3)) if depth == 6 else 1):
+        fields = _fields(message)
+        if not fields:
+            return damaged(random, message)
+        message = b"".join(map(_spelled, rearranged(random, fields, fields, lambda field: _odd(random, field, depth))))
     return message
 
 
-def _changed(random: Random, message: bytes, depth: int) -> bytes:
-    fields = _fields(message)
-    if not fields:
-        return damaged(random, message)
-    at = random.randrange(len(fields))
-    key, wire, value = fields[at]
-    if isinstance(value, bytes) and wire == _BYTES and depth and random.random() < 0.8 and _fields(value):
-        fields[at] = (key, wire, _changed(random, value, depth - 1))
-        return b"".join(map(_spelled, fields))
-    match random.randrange(6):
-        case 0:
-            del fields[at]
-        case 1:
-            fields[at : at + 1] = [fields[at]] * random.choice((2, 3, 300))
-        case 2:
-            fields.insert(random.randrange(len(fields)), random.choice(fields))
-        case 3:
-            fields[at] = (random.choice((1, 2, 3, 4, 5, 7, 8, 13, 14, 20, 1 << 28)), wire, value)
-        case _:
-            fields[at] = (key, wire, _other_value(random, value))
-    return b"".join(map(_spelled, fields))
-
-
-def _other_value(random: Random, value: int | bytes) -> int | bytes:
+def _odd(random: Random, field: Field, depth: int) -> Field:
+    key, wire, value = field
     if isinstance(value, int):
-        number: int = random.choice((*range(12), *NUMBERS, value + 1, (1 << 64) - 1))
-        return number
-    return random.choice((damaged(random, value), random.choice(_NAMES), value * 2, value[:-1], bytes(len(value))))
+        return key, wire, random.choice((*range(12), *NUMBERS, value + 1, (1 << 64) - 1))
+    if depth and wire == _BYTES and random.random() < 0.8 and _fields(value):
+        return key, wire, rewired(random, value, depth - 1)
+    if random.random() < 0.15:
+        return random.choice((1, 2, 3, 4, 5, 7, 8, 13, 14, 20, 1 << 28)), wire, value
+    odd = (damaged(random, value), random.choice(_NAMES), value * 2, value[:-1], bytes(len(value)))
+    return key, wire, random.choice(odd)
 
 
 def _fields(message: bytes) -> list[Field]:

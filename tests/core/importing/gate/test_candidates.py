@@ -12,22 +12,20 @@ import torch
 from PIL import Image
 
 from regnf_core.errors import MOST_CANDIDATES, Candidate, FieldFormatError
-from regnf_core.importing.families.converted import Reading
-from regnf_core.importing.gate.candidate_pictures import draw_candidates
+from regnf_core.importing.families.converted import AmbiguousError, OpenCandidate, Reading
+from regnf_core.importing.gate.convert import draw_asked
 from regnf_core.importing.gate.gate import import_field, read_candidates
 from regnf_core.importing.gate.picture import CANDIDATE_BYTES, candidate_name
-from regnf_core.importing.gate.readings_beside import AmbiguousError, OpenCandidate
 from regnf_core.viewing.field_picture import SMALL
+from tests.core.importing import small_families as small
 from tests.core.importing.gate.test_picture import png
 
 ONE = {"output_tanh": 1}
 
 
-def octahedron(folder: Path) -> Path:
-    """A network that is |x| + |y| + |z| less a half if its activation is relu; nothing in the file says so."""
-    state = {"a.weight": torch.cat((torch.eye(3), -torch.eye(3))), "a.bias": torch.zeros(6)}
-    state |= {"b.weight": torch.full((1, 6), 3.0**-0.5), "b.bias": torch.tensor([-0.5])}
-    torch.save(state, folder / "upload")
+def two_scales(folder: Path) -> Path:
+    """A network whose file does not say at which scale it was trained."""
+    torch.save(small.neus().checkpoint, folder / "upload")
     return folder / "upload"
 
 
@@ -44,25 +42,21 @@ def candidate(radius: float) -> OpenCandidate:
     return OpenCandidate(f"radius {radius}", ONE, lambda: reading(radius))
 
 
-@pytest.mark.parametrize("picture", [True, False])
-def test_a_file_of_several_functions_is_refused_with_each_of_them(picture: bool, tmp_path: Path) -> None:
-    upload, out = octahedron(tmp_path), tmp_path / "out"
+def test_a_file_of_several_functions_is_refused_with_each_of_them(tmp_path: Path) -> None:
+    """Without pictures: test_instant_nsr_pl.py."""
+    upload, out = two_scales(tmp_path), tmp_path / "out"
     with pytest.raises(FieldFormatError) as caught:
-        import_field(upload, out, {"output_tanh": 0}, picture=picture)
+        import_field(upload, out, {"label": "pot"}, picture=True)
     assert caught.value.reason == "LAYOUT_AMBIGUOUS"
     assert list(out.iterdir()) == []
     asked = caught.value.candidates
-    assert 2 <= len(asked) <= MOST_CANDIDATES
-    assert len({str(one.description) for one in asked}) == len(asked)
-    assert any(one.picture is not None for one in asked) == picture
-    (relu,) = (one for one in asked if one.description.get("activation") == "relu")
-    report = import_field(upload, out, relu.added_to({"output_tanh": 0}))
-    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=1e-3)
+    assert [one.description for one in asked] == [{"input_scale": 1.0}, {"input_scale": 3.0}]
+    assert all(one.picture is not None for one in asked)
 
 
 def test_each_is_drawn(tmp_path: Path) -> None:
     """One that has no surface has no picture, and keeps none from the others."""
-    draw_candidates([candidate(0.3), candidate(-1.0), candidate(0.8)], tmp_path, 1e6)
+    draw_asked([candidate(0.3), candidate(-1.0), candidate(0.8)], tmp_path, 1e6)
     assert {path.name for path in tmp_path.iterdir()} == {candidate_name(1), candidate_name(3)}
     orange = []
     for number in (1, 3):
@@ -74,7 +68,7 @@ def test_each_is_drawn(tmp_path: Path) -> None:
 
 
 def test_without_time_none_is_drawn(tmp_path: Path) -> None:
-    draw_candidates([candidate(0.3)], tmp_path, -1.0)
+    draw_asked([candidate(0.3)], tmp_path, -1.0)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -114,17 +108,8 @@ def test_what_the_child_says_is_checked(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [
-        None,
-        "ab",
-        {},
-        [1],
-        [{"name": "a"}],
-        [{"name": 1, "description": ONE}],
-        [{"name": "a", "description": {"no_entry": 1}}],
-        [{"name": "a", "description": {"output_tanh": 7}}],
-        [{"name": "a", "description": {"output_tanh": None}}],
-    ],
+    [None, "ab", {}, [1], [{"name": "a"}], [{"name": 1, "description": ONE}]]
+    + [[{"name": "a", "description": said}] for said in ({"no_entry": 1}, {"output_tanh": 7}, {"output_tanh": None})],
 )
 def test_what_is_no_candidate_is_left_out(value: Any, tmp_path: Path) -> None:
     assert read_candidates(value, tmp_path) == ()

@@ -10,10 +10,9 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
-from regnf_core.importing.families.converted import ConvertedField, converted_of
+from regnf_core.importing.families.converted import AmbiguousError, ConvertedField, converted_of
 from regnf_core.importing.families.grid_search import grid_readings
-from regnf_core.importing.gate.choice import choose_reading
-from regnf_core.importing.gate.readings_beside import AmbiguousError
+from regnf_core.importing.gate.choice import settled
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import parse_description
 from tests.core.importing.grids import Array, ball_table, passing_network
@@ -40,15 +39,13 @@ def converted(table: Array, *grids: HashGridConfig) -> ConvertedField:
     return converted_of("somebody's", ("keys",), grid_readings(table, grids, layers, entries))
 
 
-def test_the_doubtful_level_is_one_of_two() -> None:
-    assert (USUAL.level_strides()[2], OTHER.level_strides()[2]) == (33, 32)
-    assert USUAL.level_entries() == OTHER.level_entries()
-
-
 @pytest.mark.parametrize("truth", [USUAL, OTHER], ids=["as laid out", "otherwise"])
 def test_the_stride_it_was_trained_with_is_found(truth: HashGridConfig) -> None:
-    chosen = choose_reading(converted(ball_table(truth, 2), USUAL, OTHER))
+    assert (USUAL.level_strides()[2], OTHER.level_strides()[2]) == (33, 32)
+    assert USUAL.level_entries() == OTHER.level_entries()
+    chosen = settled(converted(ball_table(truth, 2), USUAL, OTHER))
     assert chosen.description["hash"]["strides"] == truth.strides
+    assert settled(converted(ball_table(truth, 2), OTHER, USUAL)).description == chosen.description
     assert chosen.warnings == ()
     assert chosen.readings == ()
     assert "2 layouts" in chosen.why[-1]
@@ -59,14 +56,9 @@ def test_the_stride_it_was_trained_with_is_found(truth: HashGridConfig) -> None:
     torch.testing.assert_close(distance, points.norm(dim=-1) - 0.5, rtol=0, atol=5e-3)
 
 
-def test_the_order_does_not_matter_where_the_evidence_is_clear() -> None:
-    chosen = choose_reading(converted(ball_table(OTHER, 2), OTHER, USUAL))
-    assert chosen.description["hash"]["strides"] == OTHER.strides
-
-
 def test_layouts_that_are_one_function_are_not_asked_about() -> None:
     """Only level 0 has anything in it, and that is the same in both."""
-    chosen = choose_reading(converted(ball_table(COARSE, 0), FINE, COARSE))
+    chosen = settled(converted(ball_table(COARSE, 0), FINE, COARSE))
     assert chosen.description["hash"]["per_level_scale"] == FINE.per_level_scale
     assert "all are the same function" in chosen.why[-1]
 
@@ -75,18 +67,15 @@ def test_layouts_that_differ_and_fit_alike_are_asked_about() -> None:
     """A table of noise fits no layout better than another."""
     noise = np.random.default_rng(0).uniform(-1.0, 1.0, FINE.entries).astype(np.float32)
     with pytest.raises(FieldFormatError) as caught:
-        choose_reading(converted(noise, FINE, COARSE))
+        settled(converted(noise, FINE, COARSE))
     assert caught.value.reason == "LAYOUT_AMBIGUOUS"
 
 
 def test_where_none_has_a_surface_the_most_usual_one_stays_and_plausibility_decides() -> None:
-    chosen = choose_reading(converted(ball_table(USUAL, 2, radius=-1.0), USUAL, OTHER))
+    chosen = settled(converted(ball_table(USUAL, 2, radius=-1.0), USUAL, OTHER))
     assert chosen.description["hash"]["strides"] is None
-
-
-def test_without_doubt_nothing_is_tried() -> None:
     plain = converted(ball_table(USUAL, 2), USUAL)
-    assert choose_reading(plain) is plain
+    assert settled(plain) is plain, "without doubt nothing is tried"
 
 
 def test_whoever_is_asked_for_the_interpolation_says_the_layout_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -96,7 +85,7 @@ def test_whoever_is_asked_for_the_interpolation_says_the_layout_too(monkeypatch:
     said = {"levels": 5, "base_resolution": 16}
     readings = tuple(replace(one, interpolation="open", say={"hash": said}) for one in found.readings)
     with pytest.raises(AmbiguousError) as caught:
-        choose_reading(replace(found, readings=readings))
+        settled(replace(found, readings=readings))
     asked = [candidate.say for candidate in caught.value.asked]
     assert asked == [{"hash": {**said, "interpolation": kind}} for kind in ("linear", "smoothstep")]
     assert '"levels": 5' in str(caught.value)

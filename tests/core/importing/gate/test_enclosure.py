@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible
 from tests.core.importing.gate.test_plausibility import _Field, sphere
+
+Formula = Callable[[Tensor], Tensor]
 
 
 def box(points: Tensor, half: tuple[float, float, float], center: tuple[float, float, float] = (0, 0, 0)) -> Tensor:
@@ -49,82 +52,78 @@ def shell(points: Tensor) -> Tensor:
     return torch.minimum(box(points, (0.8, 0.8, 0.7)).abs() - 0.03, chair(points))
 
 
-def judged(field: _Field, sign: int | None = 1) -> str | None:
-    """None, or what is said against it."""
-    measured, _, _ = check_plausibility(field)
-    try:
-        require_plausible(measured, sign)
-    except FieldFormatError as error:
-        return f"{error.reason} {error}"
-    return None
+def frame(points: Tensor) -> Tensor:
+    """Four thin bars at the bounds, nothing in the middle, free space all round."""
+    bars = [box(points, (0.97, 0.02, 0.9), (0, y, 0)) for y in (-0.96, 0.96)]
+    bars += [box(points, (0.02, 0.97, 0.9), (x, 0, 0)) for x in (-0.96, 0.96)]
+    return torch.stack(bars).amin(dim=0)
+
+
+def empty_room(points: Tensor) -> Tensor:
+    """Its bounds cut it just behind the walls."""
+    return -box(points, (0.98, 0.98, 0.98))
+
+
+def judged(formula: Formula, *signs: int | None) -> list[str | None]:
+    """For each sign that may be said: None, or what is said against it."""
+    measured, _, _ = check_plausibility(_Field(formula))
+    said: list[str | None] = []
+    for sign in signs:
+        try:
+            require_plausible(measured, sign)
+            said.append(None)
+        except FieldFormatError as error:
+            said.append(f"{error.reason} {error}")
+    return said
+
+
+SOUND: dict[str, Formula] = {
+    "room": room,
+    "bent": bent_room,
+    "shell": shell,
+    "chair": chair,
+    "turned": lambda p: room(turned(p)),
+    "bent and turned": lambda p: bent_room(turned(p)),
+    "ground": lambda p: p[:, 2] + 0.7,
+    "plane": lambda p: p[:, 2],  # has no hull
+    "frame": frame,
+    "a solid that fills its bounds": lambda p: box(p, (0.98, 0.98, 0.98)),
+    "a small thing in a room": lambda p: torch.minimum(empty_room(p), box(p, (0.05, 0.05, 0.05), (0.3, 0.2, -0.5))),
+}
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_rooms_and_things_are_sound(name: str) -> None:
+    assert judged(SOUND[name], 1) == [None]
+
+
+@pytest.mark.parametrize("formula", [chair, shell, lambda p: chair(turned(p)), lambda p: p.norm(dim=-1) - 0.5])
+def test_a_thing_turned_inside_out_is_refused(formula: Formula) -> None:
+    *refused, accepted = judged(lambda points: -formula(points), 1, -1, None)
+    for said, other in zip(refused, (-1, 1), strict=True):
+        assert said is not None
+        assert said.startswith("FIELD_IMPLAUSIBLE")
+        assert "inside out" in said
+        assert f"say sign {other} to turn it round" in said
+    assert accepted is None
 
 
 @pytest.mark.parametrize(
-    "formula",
-    [room, bent_room, shell, chair, lambda p: room(turned(p)), lambda p: bent_room(turned(p)), lambda p: p[:, 2] + 0.7],
-    ids=["room", "bent", "shell", "chair", "turned", "bent and turned", "ground"],
+    ("formula", "words"),
+    [(empty_room, "at its bounds only"), (lambda points: points.norm(dim=-1) - 1.65, "everything is inside")],
 )
-def test_rooms_and_things_are_sound(formula: object) -> None:
-    assert judged(_Field(formula)) is None  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("formula", [chair, shell, lambda p: chair(turned(p)), lambda p: p.norm(dim=-1) - 0.5])
-def test_a_thing_turned_inside_out_is_refused(formula: object, sign: int) -> None:
-    field = _Field(lambda points: -formula(points))  # type: ignore[operator]
-    said = judged(field, sign)
+def test_where_nothing_could_be_found_it_is_refused(formula: Formula, words: str) -> None:
+    """The second: all but the corners."""
+    (said,) = judged(formula, None)
     assert said is not None
-    assert said.startswith("FIELD_IMPLAUSIBLE")
-    assert "inside out" in said
-    assert f"say sign {-sign} to turn it round" in said
-    assert judged(field, None) is None
-
-
-def test_a_frame_at_the_bounds_is_a_thing() -> None:
-    """Four thin bars, nowhere in the middle, with free space all round."""
-
-    def frame(points: Tensor) -> Tensor:
-        return torch.stack(
-            [
-                *(box(points, (0.97, 0.02, 0.9), (0, y, 0)) for y in (-0.96, 0.96)),
-                *(box(points, (0.02, 0.97, 0.9), (x, 0, 0)) for x in (-0.96, 0.96)),
-            ]
-        ).amin(dim=0)
-
-    assert judged(_Field(frame)) is None
-
-
-def test_a_surface_at_the_bounds_only_is_refused() -> None:
-    """An empty room that its bounds cut just behind the walls: nothing is in it that could be found."""
-    empty = _Field(lambda points: -box(points, (0.98, 0.98, 0.98)))
-    said = judged(empty, None)
-    assert said is not None
-    assert "at its bounds only" in said
-    small = _Field(
-        lambda points: torch.minimum(empty.formula(points), box(points, (0.05, 0.05, 0.05), (0.3, 0.2, -0.5)))
-    )
-    assert judged(small) is None
-
-
-def test_where_all_is_inside_but_the_corners_it_is_refused() -> None:
-    field = _Field(lambda points: points.norm(dim=-1) - 1.65)
-    said = judged(field, None)
-    assert said is not None
-    assert "everything is inside" in said
-
-
-def test_a_solid_that_fills_its_bounds_is_a_thing() -> None:
-    assert judged(_Field(lambda points: box(points, (0.98, 0.98, 0.98)))) is None
-
-
-def test_a_flat_surface_has_no_hull() -> None:
-    assert judged(_Field(lambda points: points[:, 2])) is None
+    assert words in said
 
 
 def test_no_surface_says_what_there_is() -> None:
-    with pytest.raises(FieldFormatError) as caught:
-        check_plausibility(_Field(lambda points: points[:, 0] - 3.0))
-    assert caught.value.reason == "NO_ZERO_LEVEL"
-    assert "all is inside matter, with values from -4 to -2" in str(caught.value)
-    with pytest.raises(FieldFormatError, match="all is free"):
-        check_plausibility(sphere(-0.1))
+    for field, words in (
+        (_Field(lambda points: points[:, 0] - 3.0), "all is inside matter, with values from -4 to -2"),
+        (sphere(-0.1), "all is free"),
+    ):
+        with pytest.raises(FieldFormatError, match=words) as caught:
+            check_plausibility(field)
+        assert caught.value.reason == "NO_ZERO_LEVEL"

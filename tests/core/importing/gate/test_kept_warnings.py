@@ -13,7 +13,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.field_notes import kept_warnings
 from regnf_core.field_source import find_source
 from regnf_core.fields.build import open_field as open_safe_field
-from regnf_core.importing.gate.gate import FIELD_NAME, import_field
+from regnf_core.importing.gate.gate import FIELD_NAME
 from regnf_core.in_memory import FieldWarning
 from regnf_core.loading import open_field, safe_field
 from regnf_core.schema.safe_format import add_to_source, read_description, write_safe_field
@@ -29,21 +29,17 @@ def ball(folder: Path, factor: float = 3.0, name: str = "ball.npz") -> Path:
 
 
 def test_a_field_file_keeps_the_warnings_of_its_import(tmp_path: Path) -> None:
-    report = import_field(ball(tmp_path), tmp_path / "out")
-    assert [one.partition(":")[0] for one in report.warnings] == ["GRADIENT_NOT_UNIT"]
+    warned = tuple(convert(ball(tmp_path), tmp_path / "out")["warnings"])
+    assert [one.partition(":")[0] for one in warned] == ["GRADIENT_NOT_UNIT"]
     kept = tmp_path / "out" / FIELD_NAME
-    assert safe_field(find_source(kept)).notes.warnings == report.warnings
+    assert safe_field(find_source(kept)).notes.warnings == warned
     with pytest.warns(FieldWarning, match="GRADIENT_NOT_UNIT"):
         open_field(kept)
-    assert tuple(convert(kept, tmp_path / "again")["warnings"]) == report.warnings
+    assert tuple(convert(kept, tmp_path / "again")["warnings"]) == warned
+    convert(ball(tmp_path, 1.0, "true.npz"), tmp_path / "true")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        open_field(_imported(tmp_path))
-
-
-def _imported(folder: Path) -> Path:
-    convert(ball(folder, 1.0, "true.npz"), folder / "true")
-    return folder / "true" / FIELD_NAME
+        open_field(tmp_path / "true" / FIELD_NAME)
 
 
 def test_notes_are_added_in_place(tmp_path: Path) -> None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import math
 
-import pytest
 import torch
 from torch import Tensor
 
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.gate.choice import told_interpolation
 from regnf_core.importing.gate.evidence import LevelGains, Trial, level_gains
-from regnf_core.importing.gate.readings_beside import readings_beside, readings_written_near
-from regnf_core.schema.hash_grid_config import HashGridConfig
 
 POINTS = 4000
 
@@ -30,30 +27,25 @@ def gains_of(rest: Tensor, levels: Tensor, cells: float = 64.0) -> LevelGains:
     return LevelGains(level_gains(rest, levels), torch.full((len(levels),), cells), places)
 
 
-def test_a_level_that_corrects_the_others_gains() -> None:
+def in_errors(gains: LevelGains) -> list[float]:
+    """Each level's mean in standard errors."""
+    levels = zip(gains.gains, gains.scales, strict=True)
+    told = [LevelGains(gain[None], scale[None], gains.places).support() for gain, scale in levels]
+    return [math.copysign(math.sqrt(2.0 * abs(one)), one) for one in told]
+
+
+def test_a_level_gains_where_it_corrects_the_others() -> None:
+    """Not where it is read from the wrong rows; and a fine level's noise does not hide what a coarse one does."""
     unit, error = unit_and_noise(0)
-    (gain,) = gains_of(unit - error, error[None]).in_errors().tolist()
-    assert gain > 20.0
-
-
-def test_a_level_that_is_read_from_the_wrong_rows_gains_nothing() -> None:
-    unit, error = unit_and_noise(1)
     elsewhere = error[torch.randperm(POINTS, generator=torch.Generator().manual_seed(2))]
-    (gain,) = gains_of(unit - error, elsewhere[None]).in_errors().tolist()
-    assert abs(gain) < 4.0
-
-
-def test_a_fine_levels_noise_does_not_hide_what_a_coarse_one_does() -> None:
-    unit, error = unit_and_noise(3)
-    noise = 10.0 * unit_and_noise(4)[1]
-    coarse, fine = gains_of(unit - error, torch.stack((error, noise))).in_errors().tolist()
-    assert coarse > 20.0
-    assert abs(fine) < 4.0
-
-
-def test_a_level_that_hardly_counts_says_nothing() -> None:
-    unit, _ = unit_and_noise(5)
-    assert level_gains(unit, 1e-5 * unit[None]).abs().max() == 0.0
+    corrects, wrong, noise = (
+        in_errors(gains_of(unit - error, levels))
+        for levels in (error[None], elsewhere[None], torch.stack((error, 10.0 * unit_and_noise(4)[1])))
+    )
+    assert corrects[0] > 20.0
+    assert noise[0] > 20.0
+    assert max(abs(wrong[0]), abs(noise[1])) < 4.0
+    assert level_gains(unit, 1e-5 * unit[None]).abs().max() == 0.0, "a level that hardly counts says nothing"
 
 
 def test_a_level_of_few_cells_says_little_however_many_points_there_are() -> None:
@@ -64,7 +56,7 @@ def test_a_level_of_few_cells_says_little_however_many_points_there_are() -> Non
     for _ in range(200):
         block = (places * 2).long() @ torch.tensor([4, 2, 1])
         gains = torch.randn(8, generator=generator)[block]
-        said.append(float(LevelGains(gains[None], torch.tensor([4.0]), places).in_errors()))
+        said += in_errors(LevelGains(gains[None], torch.tensor([4.0]), places))
     assert max(map(abs, said)) < 4.5
     assert abs(sum(said)) / 200 < 0.5
 
@@ -73,7 +65,7 @@ def test_of_as_many_cells_as_points_each_point_counts() -> None:
     generator = torch.Generator().manual_seed(31)
     gains = 0.1 + torch.randn(1, POINTS, generator=generator)
     places = torch.rand(POINTS, 3, generator=generator)
-    (told,) = LevelGains(gains, torch.tensor([1000.0]), places).in_errors().tolist()
+    (told,) = in_errors(LevelGains(gains, torch.tensor([1000.0]), places))
     assert abs(told - float(gains.mean() / gains.std()) * POINTS**0.5) < 0.2
 
 
@@ -83,51 +75,13 @@ def trial(level: Tensor, rest: Tensor) -> Trial:
     return Trial(reading, gradient[:, 0], gradient, gradient.norm(dim=-1), gains_of(rest, level[None]))
 
 
-def test_the_interpolation_under_which_the_level_corrects_is_told() -> None:
+def test_levels_alone_do_not_tell_the_interpolation_but_contradict_a_wrong_one() -> None:
     unit, error = unit_and_noise(6)
-    within = torch.rand(POINTS, 1, generator=torch.Generator().manual_seed(7))
-    smoothly = error * 6.0 * within * (1.0 - within)
-    for truth, other, name in ((error, smoothly, "linear"), (smoothly, error, "smoothstep")):
-        right, wrong = trial(truth, unit - truth), trial(other, unit - truth)
-        pair = (right, wrong) if name == "linear" else (wrong, right)
-        assert told_interpolation(*pair) == name
-
-
-def test_an_untrained_level_leaves_the_interpolation_open() -> None:
-    unit, error = unit_and_noise(8)
     elsewhere = error[torch.randperm(POINTS, generator=torch.Generator().manual_seed(9))]
-    within = torch.rand(POINTS, 1, generator=torch.Generator().manual_seed(10))
-    smoothly = elsewhere * 6.0 * within * (1.0 - within)
-    assert told_interpolation(trial(elsewhere, unit - error), trial(smoothly, unit - error)) is None
-
-
-def flat(misfit: float, levels: LevelGains | None) -> Trial:
-    """A reading whose gradient's norm is off by ``misfit`` on average."""
-    values = misfit + 0.01 * torch.randn(POINTS, generator=torch.Generator().manual_seed(11))
-    return Trial(Reading("somebody's", {}, {}), values, values, values, levels)
-
-
-def test_no_grid_stands_beside_a_grid_whose_levels_say_nothing() -> None:
-    unit, error = unit_and_noise(12)
-    elsewhere = error[torch.randperm(POINTS, generator=torch.Generator().manual_seed(13))]
-    noise, told = gains_of(unit - error, elsewhere[None]), gains_of(unit - error, error[None])
-    assert flat(0.05, None).beats(flat(0.2, noise))
-    assert not flat(0.05, None).beats(flat(0.05, noise))
-    assert not flat(0.05, None).beats(flat(0.2, told))
-
-
-def test_without_a_grid_the_misfit_speaks() -> None:
-    assert flat(0.05, None).beats(flat(0.2, None))
-    assert not flat(0.2, None).beats(flat(0.05, None))
-
-
-def test_numbers_that_somebody_would_write_are_near_those_that_nobody_would() -> None:
-    small = {"levels": 16, "features_per_level": 2, "log2_table_size": 10, "base_resolution": 16}
-    grid = asdict(HashGridConfig.from_top_resolution(1611, **small))
-    reading = Reading("a grid", {"hash": grid}, {}, {"hash": {"levels": 16}})
-    near = {one.say["hash"]["top_resolution"]: one for one in readings_written_near(reading, 0)}
-    assert {1500, 1536, 1600, 1700} <= set(near)
-    assert 1611 not in near
-    assert all(one.is_written and one.tier == 1 for one in near.values())
-    assert HashGridConfig(**near[1500].description["hash"]).per_level_scale == pytest.approx((1500 / 16) ** (1 / 15))
-    assert not any(one.is_written for one in readings_beside(reading, 0))
+    within = 6.0 * torch.rand(POINTS, 1, generator=torch.Generator().manual_seed(7))
+    within = within * (1.0 - within / 6.0)
+    for truth, other in ((error, error * within), (error * within, error), (elsewhere, elsewhere * within)):
+        right, wrong = trial(truth, unit - truth), trial(other, unit - truth)
+        assert told_interpolation(right, wrong) != "smoothstep"
+        assert told_interpolation(wrong, right) != "linear"
+    assert told_interpolation(trial(elsewhere, unit - error), trial(elsewhere * within, unit - error)) is None

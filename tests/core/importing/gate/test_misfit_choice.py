@@ -35,31 +35,23 @@ class Again:
         return next(trial for trial in self.trials if trial.reading is reading)
 
 
-def chosen(*trials: Trial) -> str | None:
-    found, fitting = chosen_by_misfit(trials, Again(list(trials)))  # type: ignore[arg-type]
-    assert found is None or fitting[0] is found
-    return None if found is None else found.reading.name
-
-
-def test_what_fits_clearly_best_is_chosen() -> None:
-    assert chosen(trial("far", 0.3), trial("near", 0.1), trial("farther", 0.5)) == "near"
-
-
-def test_a_usual_number_among_others_close_to_it_is_no_accident() -> None:
-    others = trial("500", 0.1, 1, 500.0), trial("530", 0.1, 1, 530.0)
-    assert chosen(trial("512", 0.1), *others) == "512"
+NEIGHBORS = trial("500", 0.1, 1, 500.0), trial("530", 0.1, 1, 530.0)
 
 
 @pytest.mark.parametrize(
-    "other", [trial("as usual", 0.1, 0), trial("far from it", 0.1, 1, 1024.0), trial("of no size", 0.1, 1, None)]
+    ("trials", "name"),
+    [
+        ((trial("far", 0.3), trial("near", 0.1), trial("farther", 0.5)), "near"),
+        ((trial("512", 0.1), *NEIGHBORS), "512"),  # a usual number among others close to it is no accident
+        (NEIGHBORS, None),
+        *(
+            ((trial("512", 0.1), trial(f"{tier} {top}", 0.1, tier, top)), None)
+            for tier, top in ((0, 512.0), (1, 1024.0), (1, None))
+        ),
+        ((trial("far", 0.9), trial("less far", 0.6)), None),  # the best is no distance: it speaks against no other
+    ],
 )
-def test_it_is_left_open_otherwise(other: Trial) -> None:
-    assert chosen(trial("512", 0.1), other) is None
-
-
-def test_unusual_numbers_alone_are_left_open() -> None:
-    assert chosen(trial("500", 0.1, 1, 500.0), trial("530", 0.1, 1, 530.0)) is None
-
-
-def test_a_best_one_that_is_no_distance_speaks_against_no_other() -> None:
-    assert chosen(trial("far", 0.9), trial("less far", 0.6)) is None
+def test_what_is_chosen_or_left_open(trials: tuple[Trial, ...], name: str | None) -> None:
+    found, fitting = chosen_by_misfit(trials, Again(list(trials)))  # type: ignore[arg-type]
+    assert found is None or fitting[0] is found
+    assert (None if found is None else found.reading.name) == name

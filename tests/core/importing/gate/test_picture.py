@@ -18,7 +18,7 @@ from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.picture import PICTURE_NAME, is_sound_picture
 from regnf_core.viewing.field_picture import PANEL, field_picture
 from tests.core.importing.archives import saved
-from tests.core.surface.test_isosurface import Formula, ball
+from tests.core.surface.test_isosurface import ball, field_of
 
 
 def png(mode: str = "RGB", size: tuple[int, int] = (8, 4)) -> bytes:
@@ -28,7 +28,7 @@ def png(mode: str = "RGB", size: tuple[int, int] = (8, 4)) -> bytes:
 
 
 def test_a_ball_looks_like_a_ball() -> None:
-    sheet = np.asarray(field_picture(Formula(ball)))
+    sheet = np.asarray(field_picture(field_of(ball)))
     assert sheet.shape == (PANEL, 3 * PANEL, 3)
     left, right, section = (sheet[:, PANEL * i : PANEL * (i + 1)].astype(int) for i in range(3))
     for view in (left, right):
@@ -42,7 +42,9 @@ def test_a_ball_looks_like_a_ball() -> None:
 def test_the_gate_leaves_a_picture_when_asked(tmp_path: Path) -> None:
     """And none otherwise, as test_gate.py shows."""
     upload = saved(tmp_path, trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(file_type="stl"))
-    import_field(upload, tmp_path / "with", picture=True)
+    report = import_field(upload, tmp_path / "with", {"label": "ball"}, picture=True)
+    assert (report.family, report.label) == ("mesh", "ball")
+    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=1e-3)
     assert {path.name for path in (tmp_path / "with").iterdir()} == {gate.FIELD_NAME, PICTURE_NAME}
     with Image.open(tmp_path / "with" / PICTURE_NAME) as picture:
         assert picture.size == (3 * PANEL, PANEL)
@@ -68,12 +70,12 @@ def with_chunk(data: bytes) -> bytes:
     ],
 )
 def test_what_is_no_plain_picture_is_none(change: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    assert is_sound_picture(saved(tmp_path, png(), "good"))
     assert not is_sound_picture(saved(tmp_path, change(png()), "bad"))
 
 
 def test_links_and_folders_are_no_pictures(tmp_path: Path) -> None:
     good = saved(tmp_path, png(), "good")
+    assert is_sound_picture(good)
     (tmp_path / "link").symlink_to(good)
     assert not is_sound_picture(tmp_path / "link")
     os.link(good, tmp_path / "twin")

@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 import trimesh
 
+from regnf_core.fields.build import build_field
 from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import MESH_READERS
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.safe_format import parse_description
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 FACES = BALL.faces.tolist()
@@ -27,6 +30,12 @@ def converted(data: bytes, **said: Any) -> ConvertedField:
     format_ = sniff_format(data[:HEAD_BYTES])
     assert format_ in MESH_READERS
     return convert_mesh(format_, memoryview(data), UploadDescription.from_dict(said))
+
+
+def field_of(found: ConvertedField) -> Any:
+    """As its file would be opened."""
+    tensors = {name: torch.from_numpy(np.array(array)) for name, array in found.tensors.items()}
+    return build_field(parse_description(found.description), tensors)
 
 
 def exported(kind: str, **options: Any) -> bytes:

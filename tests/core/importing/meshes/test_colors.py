@@ -10,10 +10,8 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.fields.build import build_field
 from regnf_core.fields.observation import has_color
-from regnf_core.schema.safe_format import parse_description
-from tests.core.importing.meshes.mesh_files import BALL, FACES, converted
+from tests.core.importing.meshes.mesh_files import BALL, FACES, converted, field_of
 
 PAINT = np.random.default_rng(3).integers(0, 256, (len(BALL.vertices), 3))
 """R, G, B of the ball's vertices, up to 255."""
@@ -45,12 +43,6 @@ def obj(top: float) -> bytes:
     return "\n".join([*rows, *(f"f {a + 1} {b + 1} {c + 1}" for a, b, c in FACES)]).encode()
 
 
-def field_of(data: bytes, **said: Any) -> Any:
-    made = converted(data, **said)
-    tensors = {name: torch.from_numpy(np.array(array)) for name, array in made.tensors.items()}
-    return build_field(parse_description(made.description), tensors)
-
-
 def color_at(field: Any, points: NDArray[np.float64]) -> NDArray[np.float32]:
     places = torch.from_numpy(points).float()
     found: NDArray[np.float32] = field.color(places, torch.tensor([[0.0, 0.0, 1.0]]).expand(len(places), 3)).numpy()
@@ -69,7 +61,7 @@ FILES = {
 
 @pytest.mark.parametrize("data", FILES.values(), ids=FILES.keys())
 def test_vertices_have_the_colors_of_the_file(data: bytes) -> None:
-    field = field_of(data)
+    field = field_of(converted(data))
     assert has_color(field)
     np.testing.assert_allclose(color_at(field, BALL.vertices), PAINT / 255.0, rtol=0, atol=1e-3)
 
@@ -79,7 +71,7 @@ def test_gltf_has_linear_light() -> None:
     linear = np.full_like(PAINT, round(0.2140 * 255))
     ball = BALL.copy()
     ball.visual = trimesh.visual.ColorVisuals(ball, vertex_colors=np.column_stack((linear, np.full(len(PAINT), 255))))
-    found = color_at(field_of(bytes(ball.export(file_type="glb"))), BALL.vertices)
+    found = color_at(field_of(converted(ball.export(file_type="glb"))), BALL.vertices)
     np.testing.assert_allclose(found, 0.5, rtol=0, atol=4e-3)
 
 
@@ -87,12 +79,12 @@ def test_gltf_has_the_color_of_a_material() -> None:
     ball = BALL.copy()
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 0, 255])
     ball.visual = trimesh.visual.TextureVisuals(material=material)
-    found = color_at(field_of(bytes(ball.export(file_type="glb"))), BALL.vertices)
+    found = color_at(field_of(converted(ball.export(file_type="glb"))), BALL.vertices)
     np.testing.assert_allclose(found, [[1.0, 0.0, 0.0]] * len(found), rtol=0, atol=1e-3)
 
 
 def test_between_vertices_and_off_the_surface_the_closest_point_counts() -> None:
-    field = field_of(ply())
+    field = field_of(converted(ply()))
     corners = BALL.vertices[BALL.faces[7]]
     shares = np.array([0.2, 0.5, 0.3])
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
@@ -109,12 +101,12 @@ def test_between_vertices_and_off_the_surface_the_closest_point_counts() -> None
     ],
 )
 def test_a_mesh_without_three_numbers_a_vertex_has_no_color(data: bytes) -> None:
-    assert not has_color(field_of(data))
+    assert not has_color(field_of(converted(data)))
 
 
 def test_colors_change_nothing_about_the_distance() -> None:
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    colored, plain = field_of(ply()), field_of(ply(), color={"keep": False})
+    colored, plain = field_of(converted(ply())), field_of(converted(ply(), color={"keep": False}))
     assert not has_color(plain)
     for one, other in zip(
         colored.signed_distance_and_gradient(points), plain.signed_distance_and_gradient(points), strict=True

@@ -11,11 +11,11 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.triangles import mesh_field
 from regnf_core.importing.meshes.triangle_files import Geometry
 from regnf_core.importing.upload_description import UploadDescription
+from tests.core.importing.meshes.mesh_files import field_of
 
 ROOM = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.5]])
 TABLE = [([1.0, 1.0, 0.7], [2.0, 1.8, 0.76])] + [
@@ -53,11 +53,8 @@ def converted(mesh: trimesh.Trimesh, **said: Any) -> ConvertedField:
 
 
 def distance(found: ConvertedField, points: NDArray[np.float64]) -> NDArray[np.float32]:
-    description = found.description
-    field = MeshField(
-        found.tensors["vertices"], found.tensors["faces"], inside_above=float(description["inside_above"])
-    )
-    return field.signed_distance(torch.from_numpy(points)).numpy()
+    values: NDArray[np.float32] = field_of(found).signed_distance(torch.from_numpy(points)).numpy()
+    return values
 
 
 def without(mesh: trimesh.Trimesh, gone: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> trimesh.Trimesh:

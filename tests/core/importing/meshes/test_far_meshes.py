@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +11,14 @@ import torch
 import trimesh
 
 import regnf
-from regnf_core.fields.build import open_field
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.dense_grid import convert as convert_grid
+from regnf_core.importing.mesh_file import load_mesh
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.surface.exporting import write_mesh
 from tests.core.importing.archives import saved
 from tests.core.importing.in_process import convert
-from tests.core.importing.meshes.mesh_files import BALL, converted, pcd
+from tests.core.importing.meshes.mesh_files import BALL, converted, field_of, pcd
 
 UTM, ECEF, NEARBY = (500_000.25, 5_000_000.5, 100.0), (4_000_000.3, 3_100_000.1, 2_200_000.7), (60_000.0, 0.0, 0.0)
 DOUBLE_PLY = (
@@ -54,44 +55,41 @@ def glb(shift: tuple[float, float, float]) -> bytes:
     return bytes(trimesh.exchange.gltf.export_glb(scene))  # type: ignore[no-untyped-call]
 
 
-def distances(folder: Path, name: str, data: bytes, shift: tuple[float, float, float]) -> torch.Tensor:
+def distances(data: bytes, shift: tuple[float, float, float]) -> torch.Tensor:
     """At places round the shape, which is moved by ``shift``."""
-    folder = folder / name
-    folder.mkdir()
-    convert(saved(folder, data), folder / "out")
-    places = torch.from_numpy(np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3)))
-    field = open_field(folder / "out" / "field.safetensors")
+    found = converted(data)
+    assert [warning for warning in found.warnings if not warning.startswith("SURFACE_RECONSTRUCTED")] == []
+    field = field_of(found)
     low, high = field.bounds
     assert (low < torch.tensor(shift)).all()
     assert (high > torch.tensor(shift)).all()
+    places = torch.from_numpy(np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3)))
     return field.signed_distance(places + torch.tensor(shift, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("shift", [UTM, ECEF, NEARBY], ids=["utm", "ecef", "60 km"])
+POINTS, POINTS_FACES = trimesh.sample.sample_surface(BALL, 1500, seed=1)
+
+
+def cloud(shift: tuple[float, float, float]) -> bytes:
+    return pcd(POINTS + np.array(shift), BALL.face_normals[POINTS_FACES], "ascii")
+
+
 @pytest.mark.parametrize(
-    "write",
-    [obj, glb, lambda s: ply(s, "ascii"), lambda s: ply(s, "binary_little_endian")],
-    ids=["obj", "glb", "ply text", "ply"],
+    ("write", "shift", "tolerance"),
+    [
+        *((obj, UTM, 1e-6), (glb, ECEF, 1e-6), (lambda s: ply(s, "ascii"), NEARBY, 1e-6)),
+        *((lambda s: ply(s, "binary_little_endian"), UTM, 1e-6), (cloud, ECEF, 2e-4)),
+    ],
+    ids=["obj", "glb", "ply text", "ply", "cloud"],
 )
-def test_a_mesh_keeps_its_digits(write, shift: tuple[float, float, float], tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    here = distances(tmp_path, "here", write((0.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
-    there = distances(tmp_path, "there", write(shift), shift)
-    torch.testing.assert_close(there, here, rtol=0, atol=1e-6)
-    found = converted(write(shift))
-    assert len(found.tensors["faces"]) == len(BALL.faces)
-    assert found.warnings == ()
+def test_a_shape_keeps_its_digits(write: Any, shift: tuple[float, float, float], tolerance: float) -> None:
+    here = distances(write((0.0, 0.0, 0.0)), (0.0, 0.0, 0.0))
+    torch.testing.assert_close(distances(write(shift), shift), here, rtol=0, atol=tolerance)
 
 
-def test_a_cloud_in_doubles_keeps_its_digits(tmp_path: Path) -> None:
-    points, face = trimesh.sample.sample_surface(BALL, 3000, seed=1)
-    normals = BALL.face_normals[face]
-    for name, shift in (("here", (0.0, 0.0, 0.0)), ("there", ECEF)):
-        (tmp_path / name).mkdir()
-        convert(saved(tmp_path / name, pcd(points + np.array(shift), normals, "ascii")), tmp_path / name / "out")
-    places = torch.from_numpy(np.random.default_rng(0).uniform(-0.6, 0.6, (100, 3)))
-    here, there = (open_field(tmp_path / name / "out" / "field.safetensors") for name in ("here", "there"))
-    moved = there.signed_distance(places + torch.tensor(ECEF, dtype=torch.float64))
-    torch.testing.assert_close(moved, here.signed_distance(places), rtol=0, atol=2e-4)
+def test_a_mesh_goes_through_the_gate_where_it_is(tmp_path: Path) -> None:
+    report = convert(saved(tmp_path, glb(ECEF)), tmp_path / "out")
+    np.testing.assert_allclose(np.mean(report["bounds"], axis=0), ECEF, rtol=0, atol=0.01)
 
 
 def test_a_dense_grid_keeps_its_digits(tmp_path: Path) -> None:
@@ -118,8 +116,8 @@ def test_single_precision_far_away_is_said_with_how_much() -> None:
 def test_a_mesh_written_from_afar_is_read_where_it_was(tmp_path: Path) -> None:
     field = regnf.from_mesh(at(UTM), BALL.faces)
     for kind in ("glb", "ply"):
-        write_mesh(field, tmp_path / f"far.{kind}", 32)
-        low, high = regnf.open_field(tmp_path / f"far.{kind}", cache_dir=tmp_path).bounds
+        write_mesh(field, tmp_path / f"far.{kind}", 16)
+        low, high = load_mesh(tmp_path / f"far.{kind}").bounds
         torch.testing.assert_close((low + high) / 2, torch.tensor(UTM, dtype=torch.float64), rtol=0, atol=1e-3)
 
 
@@ -133,15 +131,12 @@ def test_a_pose_far_away_is_that_at_the_origin(tmp_path: Path) -> None:
     placed = thing.copy().apply_transform(T)
     room = trimesh.util.concatenate([placed, trimesh.creation.box((3.0, 3.0, 0.1), _moved(0.0, 0.0, -0.06))])
     box = np.array([placed.bounds[0] - 0.05, placed.bounds[1] + 0.05])
-    poses = []
-    for scene, own in (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), (UTM, ECEF)):
-        fields = [regnf.from_mesh(one.vertices + by, one.faces) for one, by in ((room, scene), (thing, own))]
-        found = regnf.register(*fields, box + np.array(scene))
-        assert found.verdict == "registered"
-        poses.append(_moved(*(-np.array(own))) @ found.T_object_scene.matrix().numpy() @ _moved(*scene))
-        assert np.abs(found.scene_samples.points.numpy() - np.array(scene)).max() < 3.0
-    np.testing.assert_allclose(np.linalg.inv(poses[1]), T, rtol=0, atol=5e-6)
-    np.testing.assert_allclose(poses[1], poses[0], rtol=0, atol=1e-5)
+    fields = [regnf.from_mesh(one.vertices + by, one.faces) for one, by in ((room, UTM), (thing, ECEF))]
+    found = regnf.register(*fields, box + np.array(UTM))
+    assert found.verdict == "registered"
+    pose = _moved(*(-np.array(ECEF))) @ found.T_object_scene.matrix().numpy() @ _moved(*UTM)
+    assert np.abs(found.scene_samples.points.numpy() - np.array(UTM)).max() < 3.0
+    np.testing.assert_allclose(np.linalg.inv(pose), T, rtol=0, atol=5e-6)
     found.save(tmp_path / "out")
     header, _, body = (tmp_path / "out" / "scene_points.ply").read_bytes().partition(b"end_header\n")
     assert b"property double x" in header

@@ -1,56 +1,15 @@
-"""Mesh fields against closed forms, and against a slow evaluation of point and triangle of its own."""
+"""Mesh fields against a slow evaluation of point and triangle of its own."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.fields.mesh import MeshField
-from tests.core.importing.meshes.test_facing import FURNISHED, converted
+from tests.core.importing.meshes.test_facing import FURNISHED, converted, distance
 
 Points = NDArray[np.float64]
-
-
-def evaluated(mesh: trimesh.Trimesh, points: Points, **said: str) -> NDArray[np.float32]:
-    found = converted(mesh, **said)
-    level = float(found.description["inside_above"])
-    field = MeshField(found.tensors["vertices"], found.tensors["faces"], inside_above=level)
-    return field.signed_distance(torch.from_numpy(points)).numpy()
-
-
-def to_ball(points: Points) -> Points:
-    return np.asarray(np.linalg.norm(points, axis=1) - 0.8)
-
-
-def to_box(points: Points) -> Points:
-    beyond = np.abs(points) - np.array([0.5, 0.4, 0.7])
-    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
-
-
-def to_torus(points: Points) -> Points:
-    return np.asarray(np.hypot(np.hypot(points[:, 0], points[:, 1]) - 0.7, points[:, 2]) - 0.2)
-
-
-@pytest.mark.parametrize("inverted", [False, True])
-@pytest.mark.parametrize(
-    ("mesh", "expected", "facets"),
-    [
-        (trimesh.creation.icosphere(4, 0.8), to_ball, 2e-3),
-        (trimesh.creation.box((1.0, 0.8, 1.4)), to_box, 1e-6),
-        (trimesh.creation.torus(0.7, 0.2, 256, 128), to_torus, 2e-4),
-    ],
-    ids=["ball", "box", "torus"],
-)
-def test_closed_forms(mesh: trimesh.Trimesh, expected: object, facets: float, inverted: bool) -> None:
-    """``facets``: how far the triangles lie beneath the smooth surface."""
-    assert callable(expected)
-    points = np.random.default_rng(2).uniform(-1.0, 1.0, (500, 3))
-    faces = mesh.faces[:, ::-1] if inverted else mesh.faces
-    turned = trimesh.Trimesh(mesh.vertices, faces, process=False)
-    np.testing.assert_allclose(evaluated(turned, points, **{"as": "object"}), expected(points), rtol=0, atol=facets)
 
 
 def distance_to(point: Points, triangles: Points) -> float:
@@ -80,9 +39,10 @@ def test_distances_and_solid_angles_by_hand() -> None:
     """A room with a hole in its wall: the nearest triangle, and all their solid angles added up."""
     kept = np.linalg.norm(FURNISHED.triangles_center - [2.0, 0.0, 1.5], axis=1) > 0.5
     room = trimesh.Trimesh(FURNISHED.vertices, FURNISHED.faces[kept], process=False)
-    level = float(converted(room, **{"as": "scene"}).description["inside_above"])
+    scene = converted(room, **{"as": "scene"})
+    level = float(scene.description["inside_above"])
     points = np.random.default_rng(3).uniform([-0.2, -0.2, -0.2], [4.2, 3.2, 2.7], (12, 3))
-    found = evaluated(room, points, **{"as": "scene"})
+    found = distance(scene, points)
     for point, value in zip(points, found, strict=True):
         winding = solid_angle(point, room.triangles) / (4.0 * np.pi)
         nearest = distance_to(point, room.triangles)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 import trimesh
@@ -21,7 +19,7 @@ from tests.core.importing.meshes.test_facing import (
     words,
 )
 
-PROBES = np.random.default_rng(0).uniform([0.8, 0.8, -0.2], [2.2, 2.0, 1.0], size=(2_000, 3))
+PROBES = np.random.default_rng(0).uniform([0.8, 0.8, -0.2], [2.2, 2.0, 1.0], size=(600, 3))
 
 
 def table(inverted: tuple[int, ...] = ()) -> trimesh.Trimesh:
@@ -32,13 +30,13 @@ def table(inverted: tuple[int, ...] = ()) -> trimesh.Trimesh:
     return together(*pieces)
 
 
-@pytest.mark.parametrize("inverted", [one for count in (1, 2, 3) for one in combinations(range(5), count)])
-def test_any_parts_may_be_inside_out(inverted: tuple[int, ...]) -> None:
-    found = converted(table(inverted), **{"as": "object"})
+def test_any_parts_may_be_inside_out() -> None:
     expected = distance(converted(table()), PROBES)
-    assert (expected < 0.0).sum() > 50
-    np.testing.assert_allclose(distance(found, PROBES), expected, atol=1e-6)
-    assert any("turned round" in why for why in found.why)
+    assert (expected < 0.0).sum() > 15
+    for inverted in (*((number,) for number in range(5)), (0, 1, 2), (0, 3, 4), (1, 2, 4)):
+        found = converted(table(inverted), **{"as": "object"})
+        np.testing.assert_allclose(distance(found, PROBES), expected, atol=1e-6)
+        assert any("turned round" in why for why in found.why)
 
 
 def test_the_parts_of_another_part_are_told_when_that_one_is_right() -> None:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
-from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.gate.gate import import_field
-from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.archives import assert_refused
 from tests.core.importing.meshes.mesh_files import BALL, converted, exported
 from tests.devdata import dev_data
 
@@ -36,11 +33,7 @@ def assert_same_distance(found: ConvertedField, mesh: MeshField) -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        exported("ply"),
-        exported("ply", encoding="ascii"),
-        exported("stl"),
-        exported("stl_ascii"),
-        exported("obj"),
+        *(exported("ply"), exported("ply", encoding="ascii"), exported("stl"), exported("stl_ascii"), exported("obj")),
         exported("glb"),
     ],
     ids=["ply", "ply text", "stl", "stl text", "obj", "glb"],
@@ -102,13 +95,6 @@ def test_obj_counts_from_either_end_and_passes_over_the_rest() -> None:
     assert (inside, outside) == pytest.approx((-0.1, 0.5), abs=1e-6)
 
 
-def test_inverted_faces_are_turned_round() -> None:
-    inverted = trimesh.Trimesh(BALL.vertices, BALL.faces[:, ::-1], process=False)
-    found = converted(inverted.export(file_type="stl"))
-    assert [warning.split(":")[0] for warning in found.warnings] == ["MESH_INSIDE_OUT"]
-    assert field_of(found).signed_distance(torch.zeros(1, 3)).item() < -0.4
-
-
 def test_holes_are_reported_and_have_an_inside_nonetheless() -> None:
     found = converted(trimesh.Trimesh(BALL.vertices, BALL.faces[16:], process=False).export(file_type="ply"))
     assert found.why[1].startswith("not watertight, ")
@@ -126,11 +112,3 @@ def test_what_is_said_goes_before() -> None:
     assert found.description["bounds"][1][0] == pytest.approx(0.001 * (0.5 + 0.05 * 3**0.5), rel=0.02)
     assert_refused(lambda: converted(exported("stl"), level_mask=3), "INVALID_DESCRIPTION")
     assert_refused(lambda: converted(exported("stl"), family="neus"), "FAMILY_NOT_SUPPORTED")
-
-
-def test_a_mesh_goes_through_the_gate(tmp_path: Path) -> None:
-    report = import_field(saved(tmp_path, exported("glb")), tmp_path / "out", {"label": "ball"})
-    assert (report.family, report.label) == ("mesh", "ball")
-    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=1e-3)
-    field = open_field(tmp_path / "out" / "field.safetensors")
-    assert field.signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.48, abs=0.03)

@@ -20,6 +20,7 @@ from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import saved
+from tests.core.importing.in_process import convert
 
 DIAGONAL = 3**0.5
 
@@ -62,12 +63,12 @@ def test_points_at_one_place_are_compared_once(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_points_on_a_sphere_are_a_sphere(tmp_path: Path) -> None:
-    around = directions(4000)
+    around = directions(3000)
     upload = saved(tmp_path, ply(100.0 + 0.5 * around, 3.0 * around))  # elsewhere, with normals of any length
-    report = import_field(upload, tmp_path / "out", {"label": "ball"})
-    assert (report.family, report.label) == ("point_cloud", "ball")
-    assert report.why[0] == "a ply file: 4000 points with normals"
-    assert [warning.split(":")[0] for warning in report.warnings] == ["SURFACE_RECONSTRUCTED"]
+    report = convert(upload, tmp_path / "out", {"label": "ball"})
+    assert (report["family"], report["label"]) == ("point_cloud", "ball")
+    assert report["why"][0] == "a ply file: 3000 points with normals"
+    assert [warning.split(":")[0] for warning in report["warnings"]] == ["SURFACE_RECONSTRUCTED"]
     points = 100.0 + torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * 1.4 - 0.7
     distance, gradient = open_field(tmp_path / "out" / "field.safetensors").signed_distance_and_gradient(points)
     radius = (points - 100.0).norm(dim=1)
@@ -77,16 +78,16 @@ def test_points_on_a_sphere_are_a_sphere(tmp_path: Path) -> None:
 
 def test_where_no_points_are_there_is_no_surface() -> None:
     """Poisson's surface is closed; the half of it that nobody measured is cut away."""
-    around = directions(8000)
+    around = directions(3000)
     seen = around[around[:, 2] > 0]
     field = field_of(converted(ply(0.5 * seen, seen)))
     far = torch.tensor([[0.0, 0.0, -0.5], [0.0, 0.0, -0.3]])
     assert (field.signed_distance(far).abs() > 0.25).all()
-    assert field.signed_distance(torch.tensor([[0.0, 0.0, 0.5]])).abs().item() < 0.003
+    assert field.signed_distance(torch.tensor([[0.0, 0.0, 0.5]])).abs().item() < 0.005
 
 
 LINE = np.linspace(0.0, 1.0, 500)[:, None] * [1.0, 2.0, 3.0]
-HALF_ZERO = np.where(np.arange(4000)[:, None] % 2 == 0, directions(4000), 0.0)
+HALF_ZERO = np.where(np.arange(2000)[:, None] % 2 == 0, directions(2000), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -119,8 +120,8 @@ def test_clouds_of_no_surface(
 
 
 def test_points_without_a_normal_are_left_out_and_counted() -> None:
-    found = converted(ply(directions(4000), HALF_ZERO))
-    assert "ignored: 2000 points whose normals are zero" in found.why
+    found = converted(ply(directions(2000), HALF_ZERO))
+    assert "ignored: 1000 points whose normals are zero" in found.why
 
 
 def boxes(*sizes: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
@@ -169,14 +170,11 @@ def test_clouds_whose_normals_are_turned_in_patches_are_refused(
     assert "orient_normals" in (caught.value.hint or "")
 
 
-@pytest.mark.parametrize("spacings", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("spacings", [0.0, 1.0])
 @pytest.mark.parametrize(
     "cloud",
     [
-        (BALL, BALL),
-        (-BALL, BALL),
-        BOARDS[:2],
-        boxes((1.0, 1.0, 0.02))[:2],
+        *((BALL, BALL), (-BALL, BALL), BOARDS[:2], boxes((1.0, 1.0, 0.02))[:2]),
         (CROSS[0] - 2.0 * (CROSS[2] // 6)[:, None] * [1, 0, 0], CROSS[1]),
     ],
     ids=["ball", "hollow", "boards", "board", "boards that cross"],

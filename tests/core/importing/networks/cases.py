@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from tests.core.importing.networks import slow_network as slow
-from tests.core.importing.networks.shapes import random_shape
-from tests.core.importing.networks.trained import Decoder, Implicit, Plain, Sines, split
-from tests.core.importing.networks.training import in_ball, in_cube, train
+from tests.core.importing.networks.trained import Decoder, Implicit, Sines, split
+from tests.core.importing.networks.training import in_ball, in_cube, random_shape, train
 
 Array = NDArray[np.float64]
 State = dict[str, Any]
@@ -36,17 +34,12 @@ def _numbers(state: State) -> State:
 
 
 def _trained(
-    network: torch.nn.Module,
-    rng: np.random.Generator,
-    steps: int,
-    ball: bool,
-    clamp: float | None = None,
-    rate: float = 2e-3,
+    network: torch.nn.Module, rng: np.random.Generator, steps: int, ball: bool, clamp: float | None = None
 ) -> None:
     """Trained for so many steps; or, for none, at random with about as much of the cube inside as outside."""
     if steps:
         sampler, seed = in_ball(1.0) if ball else in_cube(1.0), int(rng.integers(1 << 30))
-        train(network, list(network.parameters()), random_shape(rng), sampler, seed, steps, rate, clamp)
+        train(network, list(network.parameters()), random_shape(rng), sampler, seed, steps, 2e-3, clamp)
         return
     generator = torch.Generator().manual_seed(int(rng.integers(1 << 30)))
     with torch.no_grad():
@@ -62,11 +55,8 @@ def _trained(
 
 
 def neus(rng: np.random.Generator, steps: int) -> Case:
-    degree, scale, layers = (
-        int(rng.integers(0, 7)),
-        float(rng.choice([1.0, 1.0, 1.0, 3.0, 2.0])),
-        int(rng.integers(4, 7)),
-    )
+    degree, scale = int(rng.integers(0, 7)), float(rng.choice([1.0, 1.0, 1.0, 3.0, 2.0]))
+    layers = int(rng.integers(4, 7))
     skips = (layers // 2,) if rng.random() < 0.7 else ()
     network = Implicit(rng, degree, 48, layers, skips, scale, results=int(rng.choice([1, 9])))
     _trained(network, rng, steps, ball=True)
@@ -78,42 +68,6 @@ def neus(rng: np.random.Generator, steps: int) -> Case:
         {},
         lambda x: float(slow.implicit(saved, x, degree, scale)[0]),
         f"degree {degree}, scale {scale:g}, {layers} layers, skips {skips}",
-    )
-
-
-def implicit(rng: np.random.Generator, steps: int) -> Case:
-    degree, layers = int(rng.integers(0, 7)), int(rng.integers(4, 8))
-    skips = (layers // 2,) if rng.random() < 0.7 else ()
-    network = Implicit(rng, degree, 48, layers, skips, results=int(rng.choice([1, 17])))
-    _trained(network, rng, min(steps, 1), ball=True)
-    state = _numbers(network.state_dict())
-    saved = split(state, [f"lin{i}" for i in range(layers)]) if rng.random() < 0.7 else state
-    prefix = str(rng.choice(["", "module.", "model."])) + "implicit_network."
-    named = {prefix + name: value for name, value in saved.items()}
-    if rng.random() < 0.5:
-        named["density.beta"] = torch.tensor(0.1)
-    return Case(
-        {"epoch": 2000, "model_state_dict": named},
-        {},
-        {},
-        lambda x: float(slow.implicit(saved, x, degree)[0]),
-        f"degree {degree}, {layers} layers, skips {skips}",
-    )
-
-
-def igr(rng: np.random.Generator, steps: int) -> Case:
-    layers = int(rng.integers(4, 8))
-    skips = (layers // 2,) if rng.random() < 0.7 else ()
-    network = Implicit(rng, 0, 48, layers, skips)
-    _trained(network, rng, steps, ball=False)
-    state = _numbers(network.state_dict())
-    prefix = str(rng.choice(["", "module."]))
-    return Case(
-        {"epoch": 9, "model_state_dict": {prefix + name: value for name, value in state.items()}},
-        {"family": "igr"},
-        {},
-        lambda x: float(slow.implicit(state, x, 0)[0]),
-        f"{layers} layers, skips {skips}",
     )
 
 
@@ -152,39 +106,4 @@ def siren(rng: np.random.Generator, steps: int) -> Case:
     )
 
 
-def plain(rng: np.random.Generator, steps: int) -> Case:
-    name = str(rng.choice(list(slow.ACTIVATIONS)))
-    scale = {"softplus": float(rng.choice([1.0, 10.0, 100.0])), "sine": 30.0, "leaky_relu": 0.1}.get(name)
-    degree = 0 if name == "sine" else int(rng.choice([0, 0, 2, 4]))
-    layers, tanh = int(rng.integers(3, 6)), bool(rng.random() < 0.3)
-    skip = int(rng.integers(1, layers)) if rng.random() < 0.3 else None
-    factor = float(rng.choice([1.0, math.sqrt(0.5)]))
-    network = Plain(rng, (name, scale, tanh), degree, 40, layers, (skip, factor))
-    rate = 2e-3 if name == "sine" else 1e-2  # no initialization of its own: it begins far from any distance
-    _trained(network, rng, 2 * steps, ball=False, rate=rate)
-    state = _numbers(network.state_dict())
-    said: dict[str, Any] = {
-        "activation": name,
-        "output_tanh": int(tanh),
-        "skip_factor": factor,
-        "skip_order": "hidden_first",
-    }
-    said |= {"activation_scale": scale} if scale is not None else {}
-    said["positional_encoding"] = {"order": "frequency", "base_frequency": 1.0} if degree else {}
-    return Case(
-        {"model": state, "step": 5},
-        said,
-        {},
-        lambda x: slow.plain(state, x, degree, name, scale or 1.0, skip, factor, tanh),
-        f"{name} {scale}, degree {degree}, {layers} layers, skip {skip}, tanh {tanh}",
-    )
-
-
-FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {
-    "neus": neus,
-    "idr, volsdf": implicit,
-    "igr": igr,
-    "deepsdf": deepsdf,
-    "siren": siren,
-    "plain_network": plain,
-}
+FAMILIES: dict[str, Callable[[np.random.Generator, int], Case]] = {"neus": neus, "deepsdf": deepsdf, "siren": siren}

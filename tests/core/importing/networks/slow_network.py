@@ -3,29 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.fields.color_head import _ICOSAHEDRON
-
 Array = NDArray[np.float64]
 State = Mapping[str, Any]
-ICOSAHEDRON = _ICOSAHEDRON
-"""The directions of mip-NeRF 360's matrix P: numbers of the paper's, not worth a second table."""
-
-ACTIVATIONS: dict[str, Callable[[Array, float], Array]] = {
-    "relu": lambda a, _: np.maximum(a, 0.0),
-    "softplus": lambda a, beta: np.logaddexp(beta * a, 0.0) / beta,
-    "sine": lambda a, omega: np.sin(omega * a),
-    "tanh": lambda a, _: np.tanh(a),
-    "elu": lambda a, _: np.where(a > 0.0, a, np.expm1(np.minimum(a, 0.0))),
-    "gelu": lambda a, _: a * np.array([0.5 * math.erfc(-each / math.sqrt(2.0)) for each in a]),
-    "silu": lambda a, _: a / (1.0 + np.exp(-np.maximum(a, -700.0))),
-    "leaky_relu": lambda a, slope: np.where(a > 0.0, a, slope * a),
-}
 
 
 def array(state: State, name: str) -> Array:
@@ -52,7 +37,7 @@ def waves(x: Array, degree: int) -> Array:
 
 
 def implicit(state: State, x: Array, degree: int, scale: float = 1.0, beta: float = 100.0) -> Array:
-    """NeuS, IDR, VolSDF, IGR: all results, at one point. Where a layer is too wide it sees [h, input] / sqrt 2."""
+    """NeuS's network: all results, at one point. Where a layer is too wide it sees [h, input] / sqrt 2."""
     given = h = waves(scale * x, degree)
     count = sum(1 for name in state if name.endswith(".bias"))
     for i in range(count):
@@ -61,7 +46,7 @@ def implicit(state: State, x: Array, degree: int, scale: float = 1.0, beta: floa
             h = np.concatenate((h, given)) / math.sqrt(2.0)
         h = linear(state, f"lin{i}", h)
         if i < count - 1:
-            h = ACTIVATIONS["softplus"](h, beta)
+            h = np.logaddexp(beta * h, 0.0) / beta
     return h / scale
 
 
@@ -89,17 +74,3 @@ def siren(state: State, x: Array, omega: float, first: float | None = None) -> f
         a = linear(state, f"net.net.{i}.0", h)
         h = np.sin((first or omega if i == 0 else omega) * a)
     return float(linear(state, f"net.net.{count - 1}.0", h)[0])
-
-
-def plain(
-    state: State, x: Array, degree: int, activation: str, scale: float, skip: int | None, factor: float, tanh: bool
-) -> float:
-    given = h = waves(x, degree)
-    count = len(state) // 2
-    for i in range(count):
-        if i == skip:
-            h = factor * np.concatenate((h, given))
-        h = linear(state, f"layers.{i}", h)
-        if i < count - 1:
-            h = ACTIVATIONS[activation](h, scale)
-    return math.tanh(h[0]) if tanh else float(h[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ State = OrderedDict[str, Tensor]
 
 
 class Implicit(nn.Module):
-    """The network of NeuS, IDR, VolSDF and IGR, with the geometric initialization."""
+    """NeuS's, with the geometric initialization."""
 
     def __init__(
         self,
@@ -130,55 +129,6 @@ class Sines(nn.Module):
             h = torch.sin(self.omega * self.net[i](h))
         value: Tensor = self.net[self.count - 1](h)[:, 0]
         return value
-
-
-class Plain(nn.Module):
-    """A network as people write their own."""
-
-    def __init__(
-        self,
-        rng: np.random.Generator,
-        form: tuple[str, float | None, bool],
-        degree: int,
-        hidden: int,
-        layers: int,
-        skip: tuple[int | None, float],
-    ) -> None:
-        super().__init__()
-        torch.manual_seed(int(rng.integers(1 << 30)))
-        name, scale, self.tanh = form
-        self.degree, (self.skip, self.factor) = degree, skip
-        made: dict[str, Callable[[Tensor], Tensor]] = {
-            "relu": torch.relu,
-            "softplus": nn.Softplus(beta=scale or 1.0),
-            "sine": lambda a: torch.sin((scale or 1.0) * a),
-            "tanh": torch.tanh,
-            "elu": nn.ELU(),
-            "gelu": nn.GELU(),
-            "silu": nn.SiLU(),
-            "leaky_relu": nn.LeakyReLU(scale or 0.01),
-        }
-        self.activation = made[name]
-        width = 3 + 6 * degree
-        self.layers = nn.ModuleList(
-            nn.Linear(width if i == 0 else hidden + (width if i == self.skip else 0), 1 if i == layers - 1 else hidden)
-            for i in range(layers)
-        )
-        if name == "sine":
-            for i, layer in enumerate(self.layers):
-                limit = 1 / 3 if i == 0 else math.sqrt(6.0 / hidden) / (scale or 1.0)
-                for weight in list(layer.parameters())[:1]:
-                    nn.init.uniform_(weight, -limit, limit)
-
-    def forward(self, x: Tensor) -> Tensor:
-        given = h = torch.cat([x] + [f(2.0**k * x) for k in range(self.degree) for f in (torch.sin, torch.cos)], dim=-1)
-        for i, layer in enumerate(self.layers):
-            if i == self.skip:
-                h = self.factor * torch.cat((h, given), dim=-1)
-            h = layer(h)
-            if i < len(self.layers) - 1:
-                h = self.activation(h)
-        return torch.tanh(h[:, 0]) if self.tanh else h[:, 0]
 
 
 def split(state: dict[str, Tensor], names: list[str]) -> State:

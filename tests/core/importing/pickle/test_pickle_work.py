@@ -14,37 +14,29 @@ from tests.core.importing.archives import assert_refused, text
 PROTO = b"\x80\x02"
 
 
-def assert_too_much(body: bytes) -> None:
-    """The body asks for more than a hundred opcodes' work, or for more than ten remembered values."""
-    limits = PickleLimits(opcodes=100, memo=10)
-    assert_refused(lambda: read_pickle(memoryview(PROTO + body + b"."), limits), "PICKLE_TOO_COMPLEX")
-
-
-def test_opcodes_and_remembered_values_are_counted() -> None:
-    assert_too_much(b"N0" * 60 + b"N")
-    assert_too_much(b"N" + b"".join(b"q" + bytes([i]) for i in range(20)))
+PAIRS, NOTHINGS = b"(" + b"NN\x86" * 15 + b"l", b"(" + b"N" * 30 + b"t"
+STORAGE = b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + b"K\x01" + b"N" * 30 + b"t"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "call"),
+    "body",
     [
-        (b"(" + b"NN\x86" * 15 + b"l", b"ccollections\nOrderedDict\nh\x00\x85R0"),
-        (b"(" + b"NN\x86" * 15 + b"l", b"ccollections\ndefaultdict\nNh\x00\x86R0"),
-        (b"(" + b"N" * 30 + b"t", b"ctorch\nSize\nh\x00R0"),
-        (b"(" + b"N" * 30 + b"t", b"cos\nsystem\nh\x00\x810"),
+        b"N0" * 60 + b"N",
+        b"N" + b"".join(b"q" + bytes([i]) for i in range(20)),
+        PAIRS + b"q\x00" + b"ccollections\nOrderedDict\nh\x00\x85R0" * 5,
+        PAIRS + b"q\x00" + b"ccollections\ndefaultdict\nNh\x00\x86R0" * 5,
+        NOTHINGS + b"q\x00" + b"ctorch\nSize\nh\x00R0" * 5,
+        NOTHINGS + b"q\x00" + b"cos\nsystem\nh\x00\x810" * 5,
+        STORAGE + b"q\x00" + b"h\x00Q0" * 5,
     ],
-    ids=["pairs", "pairs of a defaultdict", "arguments", "arguments of a placeholder"],
+    ids=["opcodes", "memo", "pairs", "pairs of a defaultdict", "arguments", "of a placeholder", "persistent ids"],
 )
-def test_calls_cost_what_they_may_copy(arguments: bytes, call: bytes) -> None:
-    """Arguments that are remembered can be used again and again at the price of a few opcodes."""
-    assert_too_much(arguments + b"q\x00" + call * 5)
-
-
-def test_persistent_ids_cost_their_length() -> None:
-    identifier = (
-        b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + b"K\x01" + b"N" * 30 + b"t"
-    )
-    assert_too_much(identifier + b"q\x00" + b"h\x00Q0" * 5)
+def test_work_is_counted(body: bytes) -> None:
+    """Arguments that are remembered can be used again and again at the price of a few opcodes: they cost their length.
+    Each body asks for more than a hundred opcodes' work, or for more than ten remembered values.
+    """
+    limits = PickleLimits(opcodes=100, memo=10)
+    assert_refused(lambda: read_pickle(memoryview(PROTO + body + b"."), limits), "PICKLE_TOO_COMPLEX")
 
 
 def keys_of_one_hash(count: int) -> list[tuple[int, int]]:
@@ -74,13 +66,10 @@ def test_keys_that_share_one_hash_cost_more_than_others() -> None:
     assert_refused(lambda: read_pickle(memoryview(PROTO + as_argument)), "PICKLE_TOO_COMPLEX")
 
 
-def test_some_tuples_as_keys_are_taken() -> None:
+def test_some_tuples_as_keys_are_taken_and_tuples_of_tuples_of_tuples_refused() -> None:
+    """The latter, shared by reference, are short in the file and endless to hash."""
     pairs = b"".join(b"K" + bytes([i]) + b"K\x07\x86N" for i in range(200))
     assert len(read_pickle(memoryview(PROTO + b"}(" + pairs + b"u."))) == 200
-
-
-def test_tuples_of_tuples_of_tuples_as_keys_are_refused() -> None:
-    """Shared by reference they are short in the file and endless to hash."""
     nested = b"K\x01" + (b"q\x000(" + b"h\x00" * 16 + b"t") * 4
     assert_refused(lambda: read_pickle(memoryview(PROTO + b"}" + nested + b"Ns.")), "PICKLE_MALFORMED")
 

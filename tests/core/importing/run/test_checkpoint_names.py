@@ -21,12 +21,9 @@ from tests.core.importing.archives import assert_refused
         (["checkpoints/ModelParameters/500.pth", "checkpoints/SchedulerParameters/500.pth"], 0),
         (["checkpoints/model_epoch_0100.pth", "checkpoints/model_current.pth", "checkpoints/model_final.pth"], 2),
         (["checkpoints/ngp_ep0009.pth.tar", "checkpoints/ngp_ep0010.pth.tar", "checkpoints/ngp.pth.tar"], 1),
-        (["checkpoints/step_90.pth", "checkpoints/step_100.pth"], 1),
-        (["best_model.pth", "model_100.pth"], 1),
-        (["model/pin_map.pth", "mesh/mesh.ply", "map/neural_points.ply"], 0),
-        (["a.onnx", "a.ply"], 0),
-        (["scene.gltf", "scene.bin"], 0),
-        (["cameras_sphere.npz", "checkpoints/ckpt_10.pth"], 1),
+        *((["checkpoints/step_90.pth", "checkpoints/step_100.pth"], 1), (["best_model.pth", "model_100.pth"], 1)),
+        *((["model/pin_map.pth", "mesh/mesh.ply", "map/neural_points.ply"], 0), (["a.onnx", "a.ply"], 0)),
+        *((["scene.gltf", "scene.bin"], 0), (["cameras_sphere.npz", "checkpoints/ckpt_10.pth"], 1)),
         (["._a.pth", "__MACOSX/a.pth", "a.pth"], 2),
     ],
 )
@@ -52,12 +49,8 @@ def test_runs_without_one_checkpoint(names: list[str], reason: str) -> None:
 
 def test_the_nearest_settings_belong_to_the_checkpoint() -> None:
     names = [
-        "out/config.yml",
-        "out/a/config.yml",
-        "out/a/dataparser_transforms.json",
-        "out/b/config.yml",
-        "data/meta_data.json",
-        "out/a/notes.yml",
+        *("out/config.yml", "out/a/config.yml", "out/a/dataparser_transforms.json", "out/b/config.yml"),
+        *("data/meta_data.json", "out/a/notes.yml"),
     ]
     chosen = choose_settings(names, "out/a/nerfstudio_models/step-1.ckpt")
     assert set(chosen) == {"out/a/config.yml", "out/a/dataparser_transforms.json", "data/meta_data.json"}

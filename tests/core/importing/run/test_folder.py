@@ -37,15 +37,15 @@ def test_a_file_of_the_dataset_joins_the_settings_of_the_run(tmp_path: Path) -> 
     run = lay_out(tmp_path / "run", "config.yml", "meta_data.json", "sdfstudio_models/step-10.ckpt")
     torch.save({}, run / "sdfstudio_models/step-10.ckpt")
     data = lay_out(tmp_path / "data", "meta_data.json", "other.yml")
-    found = find_source(run, settings=data / "meta_data.json")
+    found = find_source(run, config=data / "meta_data.json")
     assert (found.settings, found.config) == ((run / "config.yml", data / "meta_data.json"), None)
     with found.packed_settings() as packed, tarfile.open(packed) as archive:
         assert archive.getnames() == ["run/config.yml", "data/meta_data.json"]
-    assert find_source(run, settings=data / "other.yml").settings == (data / "other.yml",)
-    assert find_source(run, settings=False).settings == ()
+    assert find_source(run, config=data / "other.yml").settings == (data / "other.yml",)
+    assert find_source(run, config=False).settings == ()
     (run / "config.yml").unlink()
     (run / "meta_data.json").unlink()
-    assert find_source(run, settings=data / "meta_data.json").settings == (data / "meta_data.json",)
+    assert find_source(run, config=data / "meta_data.json").settings == (data / "meta_data.json",)
 
 
 def test_settings_in_folders_of_their_own_are_found(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import io
 import lzma
 import tarfile
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,13 @@ import trimesh
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
+from regnf_core.importing.containers import zip_members
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.run.folder import find_run, pack_settings
+from regnf_core.importing.run.opened import open_upload
 from tests.core.importing.archives import assert_refused, zip_bytes
 from tests.core.importing.test_reference_checkpoints import assert_reproduces
 from tests.devdata import dev_data
@@ -32,6 +33,7 @@ FAMILIES = (
     *("deepsdf", "instant_nsr_pl", "neuralangelo", "neus", "nerfstudio_neus_facto"),
     *("sdfstudio_neus_facto", "sdfstudio_neus_facto_angelo", "sdfstudio_neus"),
 )
+IN_THE_DATASET = ("neuralangelo", "neus", "deepsdf", "nerfstudio_neus_facto")
 SAID: dict[str, dict[str, Any]] = {"deepsdf": {"latent_index": 1}}
 
 
@@ -57,37 +59,48 @@ def tarred(folder: Path) -> bytes:
     return buffer.getvalue()
 
 
-PACKINGS: dict[str, Callable[[Path], bytes]] = {
-    "zip": zipped,
-    "tar": tarred,
-    "tar.gz": lambda folder: gzip.compress(tarred(folder)),
-    "tar.bz2": lambda folder: bz2.compress(tarred(folder)),
-    "tar.xz": lambda folder: lzma.compress(tarred(folder), preset=0),
-}
-
-
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_run_with_its_settings_is_reproduced(tmp_path: Path, family: str) -> None:
-    folder = dev_data("formats", family)
-    report = with_settings(folder, tmp_path, SAID.get(family))
-    assert report["family"] == family
-    assert report["settings"]["used"]["family"] == family
+    """Where the dataset's frame is known, in that: the same values at the same places, in the dataset's unit."""
+    folder, placed = dev_data("formats", family), family in IN_THE_DATASET
+    report = with_settings(folder, tmp_path, SAID.get(family, {}) | ({"frame": "dataset"} if placed else {}))
+    assert report["family"] == report["settings"]["used"]["family"] == family
     warned = ["LEVEL_MASK_ASSUMED"] if family.endswith("angelo") and family.startswith("sdf") else []
     warned += ["COLOR_LEFT_OUT"] if family == "neuralangelo" else []
     assert [warning.partition(":")[0] for warning in report["warnings"]] == warned
-    assert_reproduces(tmp_path / FIELD_NAME, folder)
+    if not placed:
+        assert_reproduces(tmp_path / FIELD_NAME, folder)
+        return
+    world, own = (np.load(folder / name).astype(np.float64) for name in ("points_world.npy", "points.npy"))
+    unit = np.linalg.norm(world[1] - world[0]) / np.linalg.norm(own[1] - own[0])
+    distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(torch.from_numpy(world).float())
+    expected = unit * np.load(folder / "sdf.npy").reshape(-1)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
+    steepness = np.linalg.norm(np.load(folder / "gradient.npy"), axis=1)
+    np.testing.assert_allclose(gradient.norm(dim=1).numpy(), steepness, rtol=0, atol=1e-3)
+    if family == "neuralangelo":
+        np.testing.assert_allclose(report["bounds"], [[-1.55, -2.15, -0.65], [1.95, 1.35, 2.85]], atol=1e-6)
 
 
-@pytest.mark.parametrize("packing", PACKINGS)
-def test_a_whole_run_in_one_archive_is_reproduced(tmp_path: Path, packing: str) -> None:
-    folder = dev_data("formats", "instant_nsr_pl")
-    upload = tmp_path / f"run.{packing}"
-    upload.write_bytes(PACKINGS[packing](folder / "exp"))
+def test_a_whole_run_in_one_archive_is_reproduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However it is packed, the same is in it. A zip is listed once, and so is the checkpoint's own."""
+    folder, listed = dev_data("formats", "instant_nsr_pl"), []
+    inner = zip_members._directory_end
+    monkeypatch.setattr(zip_members, "_directory_end", lambda data: listed.append(len(data)) or inner(data))
+    upload = tmp_path / "run.zip"
+    upload.write_bytes(zipped(folder / "exp"))
     report = convert_file(upload, tmp_path, None, ImportLimits())
     assert report["settings"]["trainer"] == "instant-nsr-pl"
     assert report["why"][0].endswith("ckpt/epoch=0-step=20000.ckpt")
     assert_reproduces(tmp_path / FIELD_NAME, folder)
     assert sorted(path.name for path in tmp_path.iterdir()) == [FIELD_NAME, upload.name]
+    (checkpoint,) = (folder / "exp").rglob("epoch=0-step=20000.ckpt")
+    assert listed == [upload.stat().st_size, checkpoint.stat().st_size]
+    tar = tarred(folder / "exp")
+    for data in (tar, gzip.compress(tar, 1), bz2.compress(tar, 1), lzma.compress(tar, preset=0)):
+        opened = open_upload(memoryview(data), tmp_path, 1 << 30)
+        assert bytes(opened.data) == checkpoint.read_bytes()
+        assert [Path(file.name).name for file in opened.settings] == report["settings"]["files"]
 
 
 def test_a_run_through_the_gate_s_own_process(tmp_path: Path) -> None:
@@ -99,27 +112,9 @@ def test_a_run_through_the_gate_s_own_process(tmp_path: Path) -> None:
     report = import_field(upload, tmp_path / "packed", {"frame": "field"})
     assert report.settings is not None
     assert report.settings["files"] == ["config.yaml"]
-    run = find_run(folder)
-    packed = pack_settings(run, tmp_path)
-    report = import_field(run.checkpoint, tmp_path / "beside", settings=packed)
-    assert report.settings is not None
-    assert report.settings["files"] == ["config.yaml", sphere.name]
-    assert any("dataset's frame is known" in line for line in report.why)
-
-
-@pytest.mark.parametrize("family", ["neuralangelo", "neus", "deepsdf", "nerfstudio_neus_facto"])
-def test_a_field_in_its_dataset_s_frame(tmp_path: Path, family: str) -> None:
-    folder = dev_data("formats", family)
-    report = with_settings(folder, tmp_path, {"frame": "dataset", **SAID.get(family, {})})
-    world, own = (np.load(folder / name).astype(np.float64) for name in ("points_world.npy", "points.npy"))
-    unit = np.linalg.norm(world[1] - world[0]) / np.linalg.norm(own[1] - own[0])
-    distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(torch.from_numpy(world).float())
-    expected = unit * np.load(folder / "sdf.npy").reshape(-1)
-    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
-    steepness = np.linalg.norm(np.load(folder / "gradient.npy"), axis=1)
-    np.testing.assert_allclose(gradient.norm(dim=1).numpy(), steepness, rtol=0, atol=1e-3)
-    if family == "neuralangelo":
-        np.testing.assert_allclose(report["bounds"], [[-1.55, -2.15, -0.65], [1.95, 1.35, 2.85]], atol=1e-6)
+    beside = with_settings(folder, tmp_path)
+    assert beside["settings"]["files"] == ["config.yaml", sphere.name]
+    assert any("dataset's frame is known" in line for line in beside["why"])
 
 
 def test_world_scale_scales_the_dataset_s_unit(tmp_path: Path) -> None:

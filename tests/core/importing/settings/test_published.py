@@ -1,4 +1,4 @@
-"""The configurations that ten trainers publish, each translated to a description.
+"""The configurations that trainers publish, each translated to a description.
 
 ``published_configurations.json`` has what their repositories' files say of the geometry network, by file name.
 """
@@ -36,19 +36,6 @@ def test_neus(name: str, values: dict[str, Any]) -> None:
         "input_scale": values["scale"],
         "output_scale": 1 / values["scale"],
     }
-
-
-@pytest.mark.parametrize(("name", "values"), configurations("idr", "volsdf", "monosdf"))
-def test_implicit_networks(name: str, values: dict[str, Any]) -> None:
-    network, sphere = values["implicit_network"], values["scene_bounding_sphere"]
-    where = "" if sphere is None else f" scene_bounding_sphere = {sphere}\n"
-    text = f"model{{\n{where} implicit_network\n {{\n{hocon(network)}\n }}\n}}"
-    expected: dict[str, Any] = {"positional_encoding": {"degree": network["multires"]}}
-    if sphere is not None:
-        expected["bounds"] = [[-sphere] * 3, [sphere] * 3]
-    if network.get("inside_outside"):
-        expected["sign"] = 1  # a room, as it should be
-    assert translated({name: text}, facts({})).values == expected
 
 
 @pytest.mark.parametrize(("name", "values"), configurations("deepsdf"))

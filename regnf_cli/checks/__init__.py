@@ -1,1 +1,0 @@
-"""What `regnf doctor` looks at, one file a subject."""
