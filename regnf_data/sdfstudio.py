@@ -284,7 +284,7 @@ def _lost(pose: Any) -> bool:
 
 def _size(metadata: dict[str, Any], folder: Path, frames: list[dict[str, Any]]) -> Size:
     if metadata.get("height") is None or metadata.get("width") is None:
-        with _opened(resolve(folder, frames[0].get("rgb_path"), "rgb_path of frame 0")) as image:
+        with opened_image(resolve(folder, frames[0].get("rgb_path"), "rgb_path of frame 0")) as image:
             height, width = image.height, image.width
     else:
         height, width = (whole_number(metadata[name], name, _INVALID) for name in ("height", "width"))
