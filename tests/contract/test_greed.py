@@ -90,8 +90,10 @@ def test_a_number_of_jobs_that_was_set_holds_instead(shared: Callable[..., World
 
 def test_a_service_without_tokens_has_one_caller_who_may_have_all(worlds: Callable[..., World]) -> None:
     world = worlds(max_queued_jobs=30)
-    for seed in range(30):
-        world.submit(seed=seed)
+    request = world.valid_request()
+    answers = [world.client.post("/register", json=request | {"seed": seed}) for seed in range(31)]
+    assert [answer.status_code for answer in answers] == [202] * 30 + [503]
+    assert answers[-1].json()["reason"] == "QUEUE_FULL"
 
 
 def reject(world: World, caller: str, name: str, reason: str) -> None:

@@ -39,11 +39,12 @@ def environment(folder: Path) -> dict[str, str]:
     return plain | own | {"REGNF_STATE_DIR": str(folder / "state"), "XDG_CACHE_HOME": str(folder / "cache")}
 
 
-def runs(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> None:
+def ended(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> tuple[int, str]:
+    """The exit code of a block, and what to show of it where that is not 0."""
     done = subprocess.run(
         command, input=text, cwd=folder, env=variables, capture_output=True, text=True, timeout=280, check=False
     )
-    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+    return done.returncode, f"{text}\n{done.stdout}\n{done.stderr}"
 
 
 @contextmanager
@@ -84,11 +85,13 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
         for block in found:
             code = block.code.replace(ADDRESS, address)
             if block.language == "bash" and block.code != SERVE:
-                runs(["bash", "-euo", "pipefail"], code, tmp_path, variables)
+                status, shown = ended(["bash", "-euo", "pipefail"], code, tmp_path, variables)
+                assert status == 0, shown
             elif block.language == "python":
                 program += code
         if program:
-            runs([sys.executable, "-W", "error", "-"], program, tmp_path, variables)
+            status, shown = ended([sys.executable, "-W", "error", "-"], program, tmp_path, variables)
+            assert status == 0, shown
 
 
 def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:

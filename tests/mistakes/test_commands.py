@@ -105,7 +105,8 @@ def test_wrong_settings(
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_an_output_that_cannot_be_written(run: Run, folder: Path) -> None:
     (folder / "closed").mkdir(mode=0o500)
-    outcome = run(*REGISTER, "--output", "closed/out", code=2)
+    outcome = run(*REGISTER, "--output", "closed/out")
+    assert outcome.code == 2, outcome.stderr
     Case("", "", 2, "closed/out", "Permission denied", "Check who may write").check(outcome.stderr)
 
 

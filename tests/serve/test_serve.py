@@ -77,6 +77,7 @@ def test_a_signal_ends_everything_in_order(tmp_path: Path) -> None:
     with started(tmp_path / "state") as service:
         service.await_ready()
         ends_in_order(service)
+        assert service.process.returncode == 0
 
 
 def test_ctrl_c_reaches_the_supervisor_alone(shared: Service) -> None:

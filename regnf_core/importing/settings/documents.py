@@ -27,7 +27,7 @@ from regnf_core.importing.settings.keys import (
     unsafe,
 )
 
-# The part of HOCON that the .conf files of NeuS, IDR, VolSDF and MonoSDF use: objects, lists, numbers, words, texts.
+# The part of HOCON that the .conf files of NeuS use: objects, lists, numbers, words, texts.
 #
 # What reaches out of the file (``include``, ``${...}``) is refused by its own reason. See decision 11.
 

@@ -291,5 +291,8 @@ def test_a_box_outside_tells_how_far_and_what_may_be_wrong(
 
 def test_a_scene_without_bounds_refuses_nothing() -> None:
     far = Detection((9, 9, 9), (1, 1, 1))
-    require_in_scene(far, ([-math.inf] * 3, [math.inf] * 3))
-    require_in_scene(Detection((0, 0, 0), (30, 30, 30)), ROOM)  # nor does a room a box about itself
+    with pytest.raises(InvalidDetectionError):
+        require_in_scene(far, ROOM)
+    assert require_in_scene(far, ([-math.inf] * 3, [math.inf] * 3)) is None  # type: ignore[func-returns-value]
+    around = Detection((0, 0, 0), (30, 30, 30))
+    assert require_in_scene(around, ROOM) is None  # type: ignore[func-returns-value]

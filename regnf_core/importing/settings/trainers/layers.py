@@ -1,6 +1,4 @@
-"""Trainers of plain layers and maps: NeuS, IDR, VolSDF, MonoSDF, DeepSDF, PIN-SLAM, and settings of none in
-particular.
-"""
+"""Trainers of plain layers and maps: NeuS, DeepSDF, PIN-SLAM, and settings of none in particular."""
 
 from __future__ import annotations
 
@@ -35,13 +33,6 @@ def _agree_on_count(keys: Keys, path: str, dims: list[int] | None, layers: int) 
         raise contradiction(f"{keys.file}: {path}.dims", f"{len(dims)} hidden layers", layers - 1)
 
 
-def _network(keys: Keys, said: Said) -> None:
-    """What NeuS's and IDR's networks share."""
-    if keys.whole("d_in") not in (None, 3):
-        said.refuse(keys, "d_in")
-    said.take(keys, Keys.whole, {"positional_encoding.degree": "multires"})
-
-
 # NeuS: the .conf file of a run, of which ``model.sdf_network`` counts, and the cameras' file for the frame.
 
 NEUS_NETWORK = "model.sdf_network"
@@ -52,7 +43,9 @@ def neus(keys: Keys, said: Said) -> None:
     """Fill ``said``. Raises FieldFormatError: SETTINGS_MALFORMED, SETTINGS_CONTRADICT_TENSORS, FAMILY_NOT_SUPPORTED."""
     network = keys.below(NEUS_NETWORK)
     said.put("family", "neus", network, "d_hidden")
-    _network(network, said)
+    if network.whole("d_in") not in (None, 3):
+        said.refuse(network, "d_in")
+    said.take(network, Keys.whole, {"positional_encoding.degree": "multires"})
     scale = network.number("scale")
     if scale is not None:
         if scale <= 0:
