@@ -1,13 +1,11 @@
-"""Detections in images: masks, boxes in pixels and points, as detectors write them, lifted to boxes in space."""
+"""Detections in images, lifted to boxes in space."""
 
 from __future__ import annotations
 
 import base64
 import io
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,122 +15,20 @@ from PIL import Image, ImageDraw
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from regnf_core.detections.images import HINT, ImageDetection
 from regnf_core.errors import InvalidDetectionError
 from regnf_core.geometry.box import OrientedBox
 from regnf_data.recordings.camera import Array, Size
-from regnf_data.recordings.recording import MOST_PIXELS, Frame, mask_file
+from regnf_data.recordings.recording import MOST_PIXELS, Frame
 
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class ImageDetection:
-    """A thing in one image. One of mask, box and point is given; in pixels of the color image, of the depth image where
-    a frame has no color.
-
-    frame: its name or number · mask: (H, W), true on the thing · box: left, top, right, bottom · point: u, v.
-    """
-
-    frame: str | int = 0
-    mask: Mask | None = None
-    box: tuple[float, float, float, float] | None = None
-    point: tuple[float, float] | None = None
-    label: str | None = None
-    score: float | None = None
-
-    def __post_init__(self) -> None:
-        if sum(value is not None for value in (self.mask, self.box, self.point)) != 1:
-            raise InvalidDetectionError("a detection in an image has one of mask, box_2d and point_2d", hint=_HINT)
+_MASK_FORMATS = ("PNG", "JPEG", "BMP")
 
 
-_HINT = (
-    'Write for example {"frame": "000003", "box_2d": [left, top, right, bottom]}, {"mask": "mask.png"} or'
-    ' {"point_2d": [u, v]}, in pixels.'
-)
-
-
-def is_image_detection(values: Any) -> bool:
-    """Whether a detection's JSON is about an image: it has a mask, a box in pixels or a point."""
-    first = values[0] if isinstance(values, list) and values else values
-    return isinstance(first, Mapping) and any(
-        key in first for key in ("mask", "box_2d", "point_2d", "segmentation", "bbox", "segments", "box", "annotations")
-    )
-
-
-def read_image_detections(
-    values: Any, folder: Path | None = None, index: int | None = None
-) -> tuple[ImageDetection, ...]:
-    """The detections of one thing in a document: regnf's own form, COCO's annotations or results, ultralytics' export,
-    BOP's results. folder: of masks that are named as files · index: of a detector's list, which one; None: the only
-    one, of ours all, which are of one thing in several frames.
-
-    Raises InvalidDetectionError.
-    """
-    listed = values.get("annotations", values) if isinstance(values, Mapping) else values
-    entries = list(listed) if isinstance(listed, list) else [listed]
-    if not entries or not all(isinstance(entry, Mapping) for entry in entries):
-        raise InvalidDetectionError("no detection is listed", hint=_HINT)
-    ours = all(any(key in entry for key in ("mask", "box_2d", "point_2d")) for entry in entries)
-    if index is not None:
-        if not 0 <= index < len(entries):
-            raise InvalidDetectionError(f"there is no detection {index}: {len(entries)} are listed")
-        entries = [entries[index]]
-    elif not ours and len(entries) > 1:
-        known = ", ".join(f"{n}: {_name(entry)}" for n, entry in enumerate(entries[:8]))
-        raise InvalidDetectionError(
-            f"{len(entries)} detections are listed: say which ({known})", hint="Give --detection-index."
-        )
-    return tuple(_read(entry, folder) for entry in entries)
-
-
-def _name(entry: Mapping[str, Any]) -> str:
-    return str(next((entry[key] for key in ("label", "name", "category_id", "class") if key in entry), "no label"))[:40]
-
-
-def _read(entry: Mapping[str, Any], folder: Path | None) -> ImageDetection:
-    frame = next((entry[key] for key in ("frame", "image_id", "file_name", "image") if key in entry), 0)
-    score = next((entry[key] for key in ("score", "confidence") if key in entry), None)
-    label = next((str(entry[key]) for key in ("label", "name", "category_id", "class") if key in entry), None)
-    common = {"frame": frame, "label": label, "score": None if score is None else float(score)}
-    size = entry.get("size") or entry.get("image_size")
-    for key in ("mask", "segmentation"):
-        if entry.get(key) is not None:
-            return ImageDetection(mask=mask_of(entry[key], folder, size), **common)
-    segments = entry.get("segments")
-    if isinstance(segments, Mapping) and segments.get("x"):
-        polygon = np.stack([np.array(segments["x"], float), np.array(segments["y"], float)], axis=1)
-        return ImageDetection(mask=_polygon([polygon.ravel().tolist()], size), **common)
-    if entry.get("point_2d") is not None:
-        u, v = _numbers(entry["point_2d"], 2, "point_2d")
-        return ImageDetection(point=(u, v), **common)
-    if entry.get("box_2d") is not None:
-        corners = _numbers(entry["box_2d"], 4, "box_2d")
-    elif isinstance(entry.get("box"), Mapping):
-        corners = _numbers([entry["box"].get(key) for key in ("x1", "y1", "x2", "y2")], 4, "box")
-    elif entry.get("bbox") is not None:
-        left, top, width, height = _numbers(entry["bbox"], 4, "bbox")
-        corners = [left, top, left + width, top + height]
-    else:
-        raise InvalidDetectionError("a detection in an image has a mask, a box_2d or a point_2d", hint=_HINT)
-    if not (corners[0] < corners[2] and corners[1] < corners[3]):
-        raise InvalidDetectionError(
-            f"the box {corners} has no area: it is left, top, right, bottom in pixels", hint=_HINT
-        )
-    return ImageDetection(box=(corners[0], corners[1], corners[2], corners[3]), **common)
-
-
-def _numbers(value: Any, count: int, what: str) -> list[float]:
-    try:
-        numbers = [float(each) for each in value]
-    except (TypeError, ValueError):
-        numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise InvalidDetectionError(f"{what} is not {count} finite numbers", hint=_HINT)
-    return numbers
-
-
-def mask_of(value: Any, folder: Path | None = None, size: Any = None) -> Mask:
-    """(H, W): of a file's name, a PNG as base64, COCO's run lengths or polygons. size: height and width, for polygons.
+def mask_of(value: Any, size: Size | None = None) -> Mask:
+    """(H, W): of an array, an image as base64, COCO's run lengths or polygons. size: height and width, for polygons.
 
     Raises InvalidDetectionError.
     """
@@ -144,17 +40,15 @@ def mask_of(value: Any, folder: Path | None = None, size: Any = None) -> Mask:
         return _run_lengths(value)
     if isinstance(value, list):
         return _polygon(value, size)
-    if isinstance(value, str) and folder is not None and len(value) < 1000 and (folder / value).is_file():
-        return mask_file(folder / value)
     if isinstance(value, str) and len(value) > 64:
         try:
             data = base64.b64decode(value.partition("base64,")[2] or value, validate=True)
-            with Image.open(io.BytesIO(data)) as image:
+            with Image.open(io.BytesIO(data), formats=_MASK_FORMATS) as image:
                 if image.width * image.height <= MOST_PIXELS:
                     return np.asarray(image.convert("L")) > 0
         except (OSError, ValueError, SyntaxError) as error:
             raise InvalidDetectionError(f"the mask is no image as base64: {error}"[:200]) from error
-    raise InvalidDetectionError("the mask is no file, no image as base64 and no run lengths of COCO", hint=_HINT)
+    raise InvalidDetectionError("the mask is no file, no image as base64 and no run lengths of COCO", hint=HINT)
 
 
 def _run_lengths(value: Mapping[str, Any]) -> Mask:
@@ -195,9 +89,9 @@ def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
         reach = max(max(polygon) for polygon in flat)
         height, width = (int(side) for side in size) if size else (int(reach) + 2, int(reach) + 2)
     except (TypeError, ValueError) as error:
-        raise InvalidDetectionError("the mask's polygons are not lists of x, y, x, y ...", hint=_HINT) from error
+        raise InvalidDetectionError("the mask's polygons are not lists of x, y, x, y ...", hint=HINT) from error
     if any(len(polygon) < 6 or len(polygon) % 2 for polygon in flat) or not 0 < height * width <= MOST_PIXELS:
-        raise InvalidDetectionError("a mask's polygon has three corners at least", hint=_HINT)
+        raise InvalidDetectionError("a mask's polygon has three corners at least", hint=HINT)
     image = Image.new("1", (width, height))
     for polygon in flat:
         ImageDraw.Draw(image).polygon(polygon, fill=1)
@@ -251,7 +145,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         raise InvalidDetectionError(
             f"frame {frame.name}: {share} of the detection have a measured depth", reason="DETECTION_WITHOUT_DEPTH"
         )
-    if detection.point is not None and seed is not None and diameter is not None:
+    if detection.point_2d is not None and seed is not None and diameter is not None:
         # Nothing of a thing that was clicked on is farther from the click than its diameter.
         here = _points(frame, measured)
         rows, columns = np.nonzero(measured)
@@ -261,7 +155,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         measured = region.copy()
     if detection.mask is None:
         measured = _without_background(frame, region, measured)
-    pixels = _largest(frame.depth, measured, seed, detection.point is not None)
+    pixels = _largest(frame.depth, measured, seed, detection.point_2d is not None)
     camera_points = _points(frame, pixels)
     if diameter is not None and detection.mask is None:
         # Nothing of the thing is farther from its middle than its diameter.
@@ -286,26 +180,27 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
     """(H, W) of the depth image: the pixels that the detection is about, and the pixel (row, column) it points at."""
     given: Size = frame.depth.shape if frame.color is None else frame.color.shape[:2]  # type: ignore[assignment]
     height, width = given
-    mask, seed = detection.mask, None
-    if mask is not None:
-        if mask.shape != given:
+    mask, seed = None, None
+    if detection.mask is not None:
+        mask = mask_of(detection.mask, detection.size or given)
+        if mask.shape not in (given, frame.depth.shape):
             raise InvalidDetectionError(
                 f"frame {frame.name}: the mask has {mask.shape[1]} x {mask.shape[0]} pixels, not {width} x {height}"
             )
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the mask is empty")
-        return frame.registered(mask), None
+        return (mask if mask.shape == frame.depth.shape else frame.registered(mask)), None
     mask = np.zeros(given, dtype=np.bool_)
-    if detection.box is not None:
-        left, top, right, bottom = detection.box
+    if detection.box_2d is not None:
+        left, top, right, bottom = detection.box_2d
         columns, rows = (np.clip([a, b], 0, side) for a, b, side in ((left, right, width), (top, bottom, height)))
         mask[int(rows[0]) : int(np.ceil(rows[1])), int(columns[0]) : int(np.ceil(columns[1]))] = True
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the box lies outside the image, {width} x {height}")
         middle = ((rows[0] + rows[1]) / 2.0, (columns[0] + columns[1]) / 2.0)
     else:
-        assert detection.point is not None
-        u, v = detection.point
+        assert detection.point_2d is not None
+        u, v = detection.point_2d
         if not (0 <= u < width and 0 <= v < height):
             raise InvalidDetectionError(
                 f"frame {frame.name}: the point ({u:g}, {v:g}) lies outside the image of {width} x {height} pixels"
@@ -433,11 +328,3 @@ def _links(
         both = (number[here] >= 0) & (number[there] >= 0) & near
         yield number[here][both], number[there][both]
 
-
-def read_json_detections(path: Path, index: int | None = None) -> tuple[ImageDetection, ...]:
-    """Those of a file; masks that it names lie beside it. Raises InvalidDetectionError."""
-    try:
-        values = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise InvalidDetectionError(f"{path.name} is not JSON: {error}") from error
-    return read_image_detections(values, path.parent, index)

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from regnf_core.detections.images import ImageDetection, is_image_detection, read_image_detections
 from regnf_core.errors import InvalidDetectionError
 from regnf_data.recordings.camera import Camera
-from regnf_data.recordings.detection import ImageDetection, is_image_detection, lift, read_image_detections
+from regnf_data.recordings.detection import lift, mask_of
 from regnf_data.recordings.recording import Frame
 
 H, W = 120, 160
@@ -70,9 +71,8 @@ def png_of(mask: Any) -> str:
 def test_a_mask_is_read_however_it_is_written(given: dict[str, Any], tmp_path: Path) -> None:
     Image.fromarray(MASK.astype(np.uint8)).save(tmp_path / "mask.png")
     assert is_image_detection(given)
-    (found,) = read_image_detections(given, tmp_path)
-    assert found.mask is not None
-    np.testing.assert_array_equal(found.mask, MASK)
+    (found,) = read_image_detections(given)
+    np.testing.assert_array_equal(mask_of(found.beside(tmp_path).mask), MASK)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_mask_is_read_however_it_is_written(given: dict[str, Any], tmp_path: P
 def test_a_box_is_read_however_it_is_written(given: Any) -> None:
     assert is_image_detection(given)
     (found,) = read_image_detections(given)
-    assert found.box == (10.0, 20.0, 30.0, 60.0)
+    assert found.box_2d == (10.0, 20.0, 30.0, 60.0)
     assert found.score in (None, 0.5)
 
 
@@ -101,17 +101,28 @@ def test_of_several_detections_one_is_chosen() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"mask": {"size": [3, 4], "counts": [4, 2]}}, "runs have 6 pixels, its size 4 x 3"),
-        ({"mask": "no such file"}, "no file, no image"),
         ({"box_2d": [30, 20, 10, 60]}, "no area"),
         ({"box_2d": [1, 2, 3]}, "not 4 finite numbers"),
         ({"point_2d": ["a", 2]}, "not 2 finite numbers"),
         ({"label": "cup"}, "has a mask, a box_2d or a point_2d"),
     ],
 )
-def test_what_is_wrong_is_said(given: Any, said: str, tmp_path: Path) -> None:
+def test_what_is_wrong_is_said(given: Any, said: str) -> None:
     with pytest.raises(InvalidDetectionError, match=said):
-        read_image_detections(given, tmp_path)
+        read_image_detections(given)
+
+
+@pytest.mark.parametrize(
+    ("mask", "said"),
+    [
+        ({"size": [3, 4], "counts": [4, 2]}, "runs have 6 pixels, its size 4 x 3"),
+        ("no such file", "no file, no image"),
+        (np.zeros((3, 4, 3)), r"shape \(3, 4, 3\)"),
+    ],
+)
+def test_what_is_wrong_with_a_mask_is_said(mask: Any, said: str) -> None:
+    with pytest.raises(InvalidDetectionError, match=said):
+        mask_of(mask)
 
 
 @pytest.mark.parametrize("kind", ["mask", "mask grown", "mask shrunk", "box", "box loose", "point", "point beside"])
@@ -124,10 +135,10 @@ def test_a_thing_is_lifted_to_its_box(kind: str) -> None:
         "mask": ImageDetection(mask=shown),
         "mask grown": ImageDetection(mask=grown(shown, 4)),
         "mask shrunk": ImageDetection(mask=grown(shown, -3)),
-        "box": ImageDetection(box=tight),  # type: ignore[arg-type]
-        "box loose": ImageDetection(box=(tight[0] - 9, tight[1] - 9, tight[2] + 9, tight[3] + 9)),
-        "point": ImageDetection(point=middle),
-        "point beside": ImageDetection(point=(middle[0] + 8, middle[1] - 6)),
+        "box": ImageDetection(box_2d=tight),  # type: ignore[arg-type]
+        "box loose": ImageDetection(box_2d=(tight[0] - 9, tight[1] - 9, tight[2] + 9, tight[3] + 9)),
+        "point": ImageDetection(point_2d=middle),
+        "point beside": ImageDetection(point_2d=(middle[0] + 8, middle[1] - 6)),
     }[kind]
     found = lift(frame, detection, diameter=2.0 * RADIUS)
     # Nearly all pixels are the ball's, and most of the ball's are among them.
@@ -145,8 +156,8 @@ def test_a_thing_is_lifted_to_its_box(kind: str) -> None:
     [
         (ImageDetection(mask=np.zeros((H, W), np.bool_)), "frame 0: the mask is empty"),
         (ImageDetection(mask=np.ones((9, 9), np.bool_)), "frame 0: the mask has 9 x 9 pixels, not 160 x 120"),
-        (ImageDetection(box=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box lies outside the image"),
-        (ImageDetection(point=(-1.0, 5.0)), "frame 0: the point .* lies outside the image"),
+        (ImageDetection(box_2d=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box lies outside the image"),
+        (ImageDetection(point_2d=(-1.0, 5.0)), "frame 0: the point .* lies outside the image"),
     ],
 )
 def test_a_detection_beside_the_image_is_refused(detection: ImageDetection, said: str) -> None:
