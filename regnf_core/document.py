@@ -114,6 +114,16 @@ class ObjectSymmetry:
 
 
 @dataclass(frozen=True, eq=False)
+class CameraView:
+    """The camera of the image that a detection was made in. frame: its name · T_world_camera: its pose in the scene's
+    frame, OpenCV's axes, scale 1 · object_unit: meters of the object's unit, where it is known."""
+
+    frame: str
+    T_world_camera: Sim3
+    object_unit: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class RegistrationResult(_Posed):
     """The outcome of one registration. The object's pose in the scene is ``T_scene_object``.
 
@@ -123,7 +133,8 @@ class RegistrationResult(_Posed):
     object's surface · verdict_limit: the limit that a rejected pose does not keep, in words, with both numbers; "" if
     there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
     symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
-    viewers · surroundings: the scene's surface around the detection, for viewers.
+    viewers · surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection
+    was made in, where the scene is a recording.
     covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
     becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
     place of the scene's origin: the farther that is from the object, the larger are the entries of t, however well the
@@ -149,6 +160,12 @@ class RegistrationResult(_Posed):
     symmetry: ObjectSymmetry | None = None
     considered: Considered | None = None
     surroundings: SurfaceSamples | None = None
+    camera: CameraView | None = None
+
+    @property
+    def T_camera_object(self) -> Sim3 | None:
+        """The object's pose in the camera's frame (OpenCV's axes), of a scene that is a recording."""
+        return None if self.camera is None else self.camera.T_world_camera.inverse() @ self.T_scene_object
 
     @property
     def center_scene(self) -> Tensor:
@@ -292,6 +309,16 @@ class ArtifactEntry(Outgoing):
     url: Address
 
 
+class CameraDocument(Outgoing):
+    """The object in the frame of the camera whose image the detection was made in: x right, y down, z forward."""
+
+    frame: str = Field(description="The image's name.")
+    T_camera_object: TransformDocument = Field(description="Object to camera coordinates, meters.")
+    T_scene_camera: TransformDocument = Field(description="Camera to scene coordinates; the scene is the recording.")
+    center_camera: list[float] = Field(description="Where `center_object` is, camera frame, meters.")
+    object_unit_m: float | None = Field(default=None, description="Meters of the object's unit, where it is known.")
+
+
 class ResultDocument(Outgoing):
     """What a registration found. Transforms carry their direction in their name."""
 
@@ -328,6 +355,7 @@ class ResultDocument(Outgoing):
     )
     covariance_ordering: list[str] | None = Field(default=None, description="omega (3), t (3), log_s.")
     uncertainty: UncertaintyDocument | None = None
+    camera: CameraDocument | None = Field(default=None, description="Of a scene that is a recording.")
     symmetry: SymmetryDocument | None = Field(
         default=None, description="The object's own; null from the preset `paper`."
     )
@@ -400,6 +428,14 @@ def result_document(
         document["covariance"] = [[json_number(value) for value in row] for row in result.covariance.tolist()]
         document["covariance_ordering"] = list(COVARIANCE_ORDERING)
         document["uncertainty"] = uncertainty(result.covariance, T, center)
+    if result.camera is not None and (pose := result.T_camera_object) is not None:
+        document["camera"] = CameraDocument(
+            frame=result.camera.frame,
+            T_camera_object=TransformDocument(**pose.to_dict()),
+            T_scene_camera=TransformDocument(**result.camera.T_world_camera.to_dict()),
+            center_camera=pose.apply(center[None])[0].tolist(),
+            object_unit_m=result.camera.object_unit,
+        ).model_dump()
     if result.symmetry is not None:
         document["symmetry"] = SymmetryDocument(**asdict(result.symmetry)).model_dump()
     if fields is not None:

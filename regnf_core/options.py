@@ -15,6 +15,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.errors import InvalidOptionsError, nearest_name
 
+Unit = Literal["auto", "m", "cm", "mm", "in", "free"]
+METERS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Of the units that are known."""
+_UNIT_TOLERANCE = 0.03
+"""How far a scale that follows from a unit may be off: sensors' errors of scale are within."""
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
@@ -132,6 +137,10 @@ class RobustOptions:
     seen from one side only. null: unknown."""
     max_scale: _Scale = None
     """Maximum scale factor of T_object_scene; see ``min_scale``. Where both are the same number, the scale is fixed."""
+    object_unit: Unit = "auto"
+    """The unit of the object's file. Where the scene is metric, a recording or a field in meters, it tells the scale
+    within 3 %. `auto`: for recordings, the unit in which the object is as large as what was seen, else unknown.
+    `free`: unknown."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.5
     """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
     reliable and the pose less accurate."""
@@ -164,6 +173,14 @@ class RobustOptions:
     def __post_init__(self) -> None:
         if self.min_scale is not None and self.max_scale is not None and self.min_scale > self.max_scale:
             raise ValueError(f"min_scale {self.min_scale:g} is larger than max_scale {self.max_scale:g}")
+
+    @property
+    def scale_range(self) -> tuple[float | None, float | None]:
+        """The scale's range: as it is given, else as the object's unit tells it, for a scene in meters."""
+        if (self.min_scale, self.max_scale) != (None, None) or self.object_unit not in METERS:
+            return self.min_scale, self.max_scale
+        scale = 1.0 / METERS[self.object_unit]
+        return scale * (1.0 - _UNIT_TOLERANCE), scale * (1.0 + _UNIT_TOLERANCE)
 
 
 @dataclass(frozen=True)

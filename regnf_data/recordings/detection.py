@@ -327,4 +327,3 @@ def _links(
         near = np.abs(depth[here] - depth[there]) <= _JUMP * np.minimum(depth[here], depth[there])
         both = (number[here] >= 0) & (number[there] >= 0) & near
         yield number[here][both], number[there][both]
-

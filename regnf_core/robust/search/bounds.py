@@ -29,7 +29,7 @@ class ScaleBound:
     def of(cls, options: RobustOptions, scene_length: float, object_length: float) -> ScaleBound:
         """The options' bound between the working frames. lengths: of the working frames' units, fields' units."""
         unit = scene_length / object_length
-        low, high = options.min_scale, options.max_scale
+        low, high = options.scale_range
         return cls(0.0 if low is None else low * unit, math.inf if high is None else high * unit)
 
     @property

@@ -1,0 +1,192 @@
+"""A recording in one file of plain arrays: what a service keeps, and what is sent to it. No image is decoded from it.
+
+A safetensors file. depth: (N, H, W) uint16, steps of ``depth_unit`` meters along the camera's axis, 0 where nothing was
+measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4, 4) float64, OpenCV's axes · color:
+(N, H', W', 3) uint8 and color_K: (N, 3, 3), where the frames have colors. Its metadata: an entry ``recording``, JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from regnf_core.errors import DatasetError, atomic_path
+from regnf_data.recordings.camera import Array, Camera
+from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
+
+_KEY = "recording"
+_STEPS = 65_535
+_FINEST = 1e-4
+"""Meters a step of stored depths, where they reach no farther than 6.5 m; else as many as reach asks for."""
+
+
+def write_recording(recording: Recording, indices: Sequence[int], path: Path) -> list[str]:
+    """Write the frames of these numbers to ``path``; the names of those that were left out: of another size.
+
+    The most common sizes of depth and of color images are kept. Raises DatasetError as the frames' readers do.
+    """
+    frames = [recording.frames[index].read() for index in indices]
+    shape = _most_common([frame.depth.shape for frame in frames])
+    kept = [frame for frame in frames if frame.depth.shape == shape]
+    colored = [frame for frame in kept if frame.color is not None]
+    size = _most_common([frame.color.shape for frame in colored if frame.color is not None]) if colored else None
+    reach = max(float(frame.depth.max()) for frame in kept)
+    unit = max(_FINEST, reach / _STEPS)
+    arrays: dict[str, NDArray[Any]] = {
+        "depth": np.stack([np.round(frame.depth / unit).astype(np.uint16) for frame in kept]),
+        "K": np.stack([frame.camera.K for frame in kept]),
+        "T_world_camera": np.stack([frame.T_world_camera for frame in kept]),
+    }
+    if size is not None:
+        blank = np.zeros(size, np.uint8)
+        of_size = [frame.color is not None and frame.color.shape == size for frame in kept]
+        arrays["color"] = np.stack([f.color if ok else blank for f, ok in zip(kept, of_size, strict=True)])  # type: ignore[misc]
+        cameras = [(frame.color_camera or frame.camera) for frame in kept]
+        arrays["color_K"] = np.stack([c.K if ok else np.zeros((3, 3)) for c, ok in zip(cameras, of_size, strict=True)])
+    said = {
+        "names": [frame.name for frame in kept],
+        "depth_unit": unit,
+        "layout": recording.layout,
+        "notes": list(recording.notes),
+        "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
+    }
+    with atomic_path(path) as target:
+        save_file({name: np.ascontiguousarray(a) for name, a in arrays.items()}, target, {_KEY: json.dumps(said)})
+    return [frame.name for frame in frames if frame.depth.shape != shape]
+
+
+def is_stored(path: Path) -> bool:
+    """Whether a file is a stored recording."""
+    if path.suffix != ".safetensors" or not path.is_file():
+        return False
+    try:
+        with safe_open(path, "numpy") as file:
+            return _KEY in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
+def read_stored(path: Path, name: str | None = None) -> Recording:
+    """The recording; each frame's arrays are read when the frame is. Everything is checked: files come from others.
+
+    Raises DatasetError (DATASET_FILE_INVALID, and those of its cameras and poses).
+    """
+    try:
+        with safe_open(path, "numpy") as file:
+            said = json.loads((file.metadata() or {})[_KEY])
+            shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
+            K, poses = file.get_tensor("K"), file.get_tensor("T_world_camera")
+            color_K = file.get_tensor("color_K") if "color_K" in shapes else None
+        names, unit = [str(one)[:200] for one in said["names"]], float(said["depth_unit"])
+        count, height, width = shapes["depth"]
+        fits = K.shape == (count, 3, 3) and poses.shape == (count, 4, 4) and len(names) == count
+        color = shapes.get("color")
+        if color is not None and color_K is not None:
+            fits = fits and len(color) == 4 and (color[0], color[3]) == (count, 3) and color_K.shape == (count, 3, 3)
+        if not (fits and 0.0 < unit < 1.0):
+            raise ValueError("its arrays do not fit together")
+        metric = None if said.get("T_metric_world") is None else np.array(said["T_metric_world"], np.float64)
+        layout, notes = str(said["layout"])[:100], tuple(str(one)[:500] for one in said["notes"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        message = f"{path.name} is no recording of regnf: {error}"
+        raise DatasetError(message[:300], reason="DATASET_FILE_INVALID") from error
+    frames = []
+    for number in range(count):
+        pose = pose_of(poses[number], names[number])
+        if pose is None:
+            raise DatasetError(f"{names[number]}: the pose is not finite", reason="DATASET_POSE_NOT_RIGID")
+        colored = color is not None and color_K is not None and color_K[number].any()
+        frames.append(
+            StoredFrame(
+                names[number],
+                Camera(K[number].astype(np.float64), (height, width)),
+                pose,
+                partial(_depth, path, number, unit),
+                partial(_color, path, number) if colored else None,
+                Camera(color_K[number].astype(np.float64), color[1:3]) if colored else None,
+            )
+        )
+    return Recording(name or path.name, layout, tuple(frames), notes, metric)
+
+
+def _depth(path: Path, number: int, unit: float) -> NDArray[np.float32]:
+    with safe_open(path, "numpy") as file:
+        return np.asarray(file.get_slice("depth")[number].astype(np.float32) * np.float32(unit))
+
+
+def _color(path: Path, number: int) -> NDArray[np.uint8]:
+    with safe_open(path, "numpy") as file:
+        return np.asarray(file.get_slice("color")[number], dtype=np.uint8)
+
+
+def recording_of_frames(frames: Sequence[Frame], name: str = "frames", layout: str = "frames") -> Recording:
+    """Frames in memory as a recording."""
+
+    def held(frame: Frame) -> StoredFrame:
+        color: Callable[[], NDArray[np.uint8]] | None = None if frame.color is None else partial(_same, frame.color)
+        return StoredFrame(
+            frame.name, frame.camera, frame.T_world_camera, partial(_same, frame.depth), color, frame.color_camera
+        )
+
+    return Recording(name, layout, tuple(held(frame) for frame in frames))
+
+
+def _same(array: NDArray[Any]) -> NDArray[Any]:
+    return array
+
+
+def _most_common(values: Sequence[Any]) -> Any:
+    return max(set(values), key=values.count)
+
+
+def frame_of_arrays(
+    depth: NDArray[Any],
+    K: Any,
+    color: NDArray[Any] | None = None,
+    depth_unit: float | None = None,
+    T_world_camera: Any = None,
+    name: str = "0",
+) -> Frame:
+    """A frame of arrays in memory, as a camera's driver gives them.
+
+    depth: (H, W), meters along the camera's axis, or whole numbers of ``depth_unit`` meters (None: millimeters); 0 and
+    NaN are no measurement · K: (3, 3) or fx, fy, cx, cy, pixel centers at whole numbers, as OpenCV has them · color:
+    (H', W', 3) uint8, by the same camera · T_world_camera: (4, 4), OpenCV's axes; None: the camera is the world.
+    Raises DatasetError (DATASET_INTRINSICS_INVALID, DATASET_IMAGE_INVALID, DATASET_POSE_NOT_RIGID).
+    """
+    image = np.asarray(depth)
+    if image.ndim != 2 or image.dtype.kind not in "fiu":
+        raise DatasetError(f"the depth is {image.dtype} {image.shape}, expected (H, W)", reason="DATASET_IMAGE_INVALID")
+    whole = image.dtype.kind in "iu"
+    meters = image.astype(np.float32) * np.float32((depth_unit or 0.001) if whole else (depth_unit or 1.0))
+    limit = np.iinfo(image.dtype).max if whole else np.inf
+    meters[~((meters > 0.0) & (image < limit))] = 0.0
+    matrix: Array = np.array(K, np.float64)
+    if matrix.shape == (4,):
+        fx, fy, cx, cy = matrix
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    if matrix.shape != (3, 3):
+        raise DatasetError(
+            f"K has the shape {matrix.shape}, expected (3, 3) or fx, fy, cx, cy", reason="DATASET_INTRINSICS_INVALID"
+        )
+    matrix = matrix + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    pose = np.eye(4) if T_world_camera is None else pose_of(T_world_camera, name)
+    if pose is None:
+        raise DatasetError(f"{name}: the pose is not finite", reason="DATASET_POSE_NOT_RIGID")
+    height, width = meters.shape
+    camera = Camera(matrix, (height, width)).check(name)
+    if color is None:
+        return Frame(name, meters, camera, pose)
+    picture = np.asarray(color)
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+        message = f"the color is {picture.dtype} {picture.shape}, expected (H, W, 3) of uint8"
+        raise DatasetError(message, reason="DATASET_IMAGE_INVALID")
+    return Frame(name, meters, camera, pose, picture, camera.of_size((picture.shape[0], picture.shape[1]), name))
