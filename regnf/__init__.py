@@ -20,6 +20,7 @@ from regnf_core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from regnf.fitting import fit
+    from regnf.recordings import Frame, register, register_batch, search
     from regnf_client import AsyncClient, Client, Pair, PairResult
     from regnf_core import *  # noqa: F403 - every name that it lists
 
@@ -29,10 +30,11 @@ _HOMES = {
     "Pair": "regnf_client",
     "PairResult": "regnf_client",
     "fit": "regnf.fitting",
+    **dict.fromkeys(("Frame", "register", "register_batch", "search"), "regnf.recordings"),
 }
 """Every other name is regnf_core's."""
 
-__all__ = ["AsyncClient", "Client", "Pair", "PairResult", "fit"]
+__all__ = ["AsyncClient", "Client", "Frame", "Pair", "PairResult", "fit"]
 __all__ += regnf_core.__all__
 
 
