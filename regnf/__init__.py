@@ -20,9 +20,12 @@ from regnf_core.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from regnf.fitting import fit
-    from regnf.recordings import Frame, register, register_batch, search
+    from regnf.recordings import Frame
+    from regnf.recordings import register as register
+    from regnf.recordings import register_batch as register_batch
+    from regnf.recordings import search as search
     from regnf_client import AsyncClient, Client, Pair, PairResult
-    from regnf_core import *  # noqa: F403 - every name that it lists
+    from regnf_core import *  # type: ignore[assignment]  # noqa: F403 - every other name that it lists
 
 _HOMES = {
     "AsyncClient": "regnf_client",

@@ -22,7 +22,8 @@ from regnf_core.batch import BatchOutcome, ModeledObject
 from regnf_core.detections.images import AnyDetection, ImageDetection, is_image_detection, read_detection
 from regnf_core.detections.parsing import BoxLike
 from regnf_core.document import ProgressCallback
-from regnf_core.errors import InvalidDetectionError
+from regnf_core.errors import InvalidDetectionError, RegnfError
+from regnf_core.field_files import require_file
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
@@ -102,7 +103,7 @@ def search(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> Search:
-    """Which object stands there, and where: :func:`regnf_core.search`, with scenes and detections as of ``register``."""
+    """Which object stands there, and where: :func:`regnf_core.search`, scenes and detections as of ``register``."""
     recording = _recording(scene)
     if recording is None:
         return core.search(scene, objects, _box(detection), options, seed, progress, clouds)  # type: ignore[arg-type]
@@ -133,7 +134,7 @@ def register_batch(
         try:
             where = _detection(scene, detections[d])
             place = recorded_scene(recording, where, modeled[o].model.bounds.numpy(), chosen)
-        except core.RegnfError as error:
+        except RegnfError as error:
             outcomes.append(BatchOutcome[Registered](d, o, None, error))
             continue
         (one,) = core.register_batch(
@@ -192,7 +193,7 @@ def _detection(scene: Any, given: Any) -> OrientedBox | Sequence[ImageDetection]
     folder = None
     if isinstance(given, str | os.PathLike):
         folder = Path(given).parent
-        core.require_file(Path(given))
+        require_file(Path(given))
         given = json_value(Path(given).read_bytes(), f"detection {given}: ")
     if is_image_detection(given):
         found: AnyDetection = read_detection(given, None, folder)
