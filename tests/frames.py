@@ -110,4 +110,3 @@ def error_m(T: Any, truth: NDArray[np.float64], unit: float = 0.001) -> float:
     found, right = np.array(T, np.float64) @ np.diag([1 / unit, 1 / unit, 1 / unit, 1.0]), truth
     apart = vertices @ (found - right)[:3, :3].T + (found - right)[:3, 3]
     return float(np.linalg.norm(apart, axis=1).max())
-

@@ -9,25 +9,12 @@ from pathlib import Path
 
 from regnf_core.errors import DatasetError
 from regnf_data.recordings import documents, folders
-from regnf_data.recordings.camera import Camera
-from regnf_data.recordings.recording import Recording
+from regnf_data.recordings.recording import Given, Recording
 from regnf_data.recordings.stored import is_stored, read_stored
 
 _MOST_LISTED = 12
 _NEAR = 3
 """Folders below the one that was given in which recordings are looked for, to name them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Given:
-    """What a person says where a layout does not, or says it wrongly.
-
-    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in :data:`LAYOUTS`.
-    """
-
-    camera: Camera | None = None
-    depth_unit: float | None = None
-    layout: str | None = None
 
 
 @dataclass(frozen=True)
