@@ -154,7 +154,7 @@ class Recording:
 class Given:
     """What a person says where a layout does not, or says it wrongly.
 
-    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in :data:`regnf_data.recordings.opening.LAYOUTS`.
+    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in ``LAYOUTS``.
     """
 
     camera: Camera | None = None
