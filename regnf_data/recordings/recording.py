@@ -238,7 +238,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
         raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")
     if not np.isfinite(given).all():
         return None
-    pose = np.eye(4)
+    pose: Array = np.eye(4)
     pose[:3] = given[:3]
     rotation = pose[:3, :3]
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID:
@@ -257,7 +257,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
     pose[:3, :3] = u @ vt
     pose[:3, 3] *= unit
     if inverse:
-        pose = np.linalg.inv(pose)
+        pose = np.asarray(np.linalg.inv(pose), np.float64)
     if np.abs(pose[:3, 3]).max() > _FARTHEST:
         raise DatasetError(
             f"{name}: the camera is {np.abs(pose[:3, 3]).max():.3g} m from the origin", reason="DATASET_POSE_NOT_RIGID"
