@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import NO_TERMS, Terms
 from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array, Camera, Size
 from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
@@ -101,7 +102,7 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · terms: what its files call things.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Recording:
     frames: tuple[StoredFrame, ...]
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
+    terms: Terms = NO_TERMS
 
     def __len__(self) -> int:
         return len(self.frames)
