@@ -12,7 +12,7 @@ from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
-from regnf_state.ownership import reference_of
+from regnf_state.ownership import reference_of, sha256_of
 from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
 from regnf_state.room import delete_upload, original_key, settings_key
 
@@ -89,9 +89,17 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
 
 
 def held_field(services: Services, caller: str, sha256: str) -> FieldRecord | None:
-    """The caller's field of these bytes, unless it was rejected."""
+    """The caller's field of these bytes, unless it was rejected. Raises Problem FIELD_DESCRIPTION_DIFFERS."""
     known = _known(services, reference_of(caller, sha256))
-    return None if known is None or known.state == "rejected" else known
+    if known is None or known.state == "rejected":
+        return None
+    if known.is_recording:
+        raise _held_as_recording(sha256)
+    return known
+
+
+def _held_as_recording(sha256: str) -> Problem:
+    return Problem("FIELD_DESCRIPTION_DIFFERS", hint=f"It is stored as a recording: GET /recordings/{sha256}.")
 
 
 def room_for_bytes(services: Services, caller: str, again: FieldRecord | None = None) -> int | None:
@@ -166,6 +174,8 @@ async def store_upload(
 
 def keep_held(services: Services, known: FieldRecord, beside: Beside) -> StoredUpload:
     """A field that the caller has already. Raises Problem FIELD_DESCRIPTION_DIFFERS."""
+    if known.is_recording and beside.is_nothing:
+        raise _held_as_recording(sha256_of(known.sha256))
     if not beside.is_nothing and not beside.is_function_of(known):
         raise Problem("FIELD_DESCRIPTION_DIFFERS")
     if beside.label is not None and beside.label != known.label:

@@ -62,9 +62,16 @@ _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
 
 
 def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
+    return require_upload(services, caller, sha256, recording=False)
+
+
+def require_upload(services: Services, caller: str, sha256: str, recording: bool) -> FieldRecord:
+    """The caller's field, or recording, of this name. Raises Problem FIELD_NOT_FOUND, RECORDING_NOT_FOUND."""
     record = services.records.get_field(reference_of(caller, sha256)) if is_sha256(sha256) else None
-    if record is None:
-        raise Problem("FIELD_NOT_FOUND")
+    if record is None or record.is_recording != recording:
+        held = None if record is None else "a field" if recording else "a recording"
+        hint = held and f"It is {held}: GET /{held.split()[1]}s/{sha256}."
+        raise Problem("RECORDING_NOT_FOUND" if recording else "FIELD_NOT_FOUND", hint=hint)
     return record
 
 
@@ -222,7 +229,7 @@ def list_fields(
     """
     if wants_page(request.scope):
         return page("lists.html")
-    found = services.records.list_fields(label, limit, decode_token(page_token), caller)
+    found = services.records.list_fields(label, limit, decode_token(page_token), caller, recordings=False)
     documents = [field_document(record, prefix) for record in found.records]
     document = {"fields": documents, "next_page_token": encode_token(found.rest)}
     return JSONResponse(document, headers={"Vary": "Accept"})
@@ -308,7 +315,12 @@ def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Respo
         services.pieces.drop(caller, sha256)
         if services.records.get_field(reference_of(caller, sha256)) is None:
             return Response(status_code=204)
-    field = _require(services, caller, sha256)
+    forget(services, _require(services, caller, sha256))
+    return Response(status_code=204)
+
+
+def forget(services: Services, field: FieldRecord) -> None:
+    """Delete a field or a recording and its bytes. Raises Problem FIELD_IN_LIBRARY, FIELD_IN_USE."""
     reference = field.sha256
     if field.library is not None:
         raise Problem("FIELD_IN_LIBRARY")
@@ -317,4 +329,3 @@ def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Respo
     services.records.delete_field(reference)
     services.queue.drop_import(reference, field.attempt)
     services.blobs.delete_prefix(f"fields/{reference}")
-    return Response(status_code=204)

@@ -133,8 +133,8 @@ async def put_field(
         room = await in_thread(check_room, services, caller, sha256)
         with services.under_way.claim(caller, room, declared) as claim:
             async with Upload(services, claim) as upload:
-                received = await _receive_raw(request, services, upload)
-                if received.sha256 != sha256 or digest not in (None, received.sha256):
+                received = await receive_raw(request, services, upload, digest)
+                if received.sha256 != sha256:
                     raise Problem("DIGEST_MISMATCH")
                 taken = await store_upload(services, caller, upload, received)
     return _answer(taken, prefix)
@@ -192,9 +192,7 @@ async def post_field(
             if isinstance(received, str):
                 return _answer(await finish_pieces(services, caller, received, beside), prefix)
         else:
-            received, beside = await _receive_raw(request, services, upload), Beside()
-            if digest not in (None, received.sha256):
-                raise Problem("DIGEST_MISMATCH")
+            received, beside = await receive_raw(request, services, upload, digest), Beside()
         taken = await store_upload(services, caller, upload, received, beside)
     return _answer(taken, prefix)
 
@@ -231,11 +229,15 @@ async def _receive_piece(
     return known
 
 
-async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
+async def receive_raw(request: Request, services: Services, upload: Upload, digest: str | None) -> Received:
+    """A body that is one file, whole. Raises Problem, DIGEST_MISMATCH where it is not of the announced digest."""
     body.refuse_encoding(request)
     async for data in body.chunks(request, services.settings.max_upload_bytes):
         await upload.feed(data)
-    return await upload.finish()
+    received = await upload.finish()
+    if digest not in (None, received.sha256):
+        raise Problem("DIGEST_MISMATCH")
+    return received
 
 
 async def _receive_parts(
@@ -250,7 +252,7 @@ async def _receive_parts(
     limit = services.settings.max_upload_bytes + len(beside) * settings_limit(services) + 2 * DESCRIPTION_BYTES
     data = body.chunks(request, limit)
     if digest is not None:
-        data = _compared(data, digest)
+        data = compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES, "upload": _UPLOAD_BYTES}
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts)
@@ -278,7 +280,7 @@ def read_description(text: bytes | None) -> UploadDescription | None:
     )
 
 
-async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
+async def compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
     """The body as it comes. Raises Problem DIGEST_MISMATCH at its end: the digest is of the parts and all between."""
     found = hashlib.sha256()
     async for piece in data:
