@@ -17,7 +17,7 @@ from regnf_state.queue import Work
 from tests.contract.conftest import GOOD, PNG
 from tests.contract.test_bad_uploads import END, IN_PARTS, part
 from tests.contract.world import ALICE, BOB, BOX, TOKENS, World, assert_refused, put, sha256
-from tests.frames import CAMERA, COLOR, DEPTH, MASK, archive, frame_parts, stored
+from tests.frame_forms import CAMERA, COLOR, DEPTH, MASK, archive, frame_parts, stored
 
 FOLDER = archive(depth_png=DEPTH, camera_json=json.dumps(CAMERA).encode())
 MASKED = {"mask": base64.b64encode(MASK).decode(), "label": "mug"}
