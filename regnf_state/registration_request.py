@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from regnf_core.cost import Cost, estimate
 from regnf_core.detections import Detection
-from regnf_core.detections.images import ImageDetection, read_image_detections
+from regnf_core.detections.images import AnyDetection, read_image_detections
 from regnf_core.editing.request import EditRequest
 from regnf_core.options import RegistrationOptions
 from regnf_core.rendering import request as rendering_cost
@@ -37,7 +37,7 @@ class RegistrationRequest:
     scene: str
     object: str | None
     candidates: tuple[str, ...] | None
-    detection: Detection | tuple[ImageDetection, ...]
+    detection: AnyDetection
     """A box in the scene, or one thing in images of a scene that is a recording."""
     options: RegistrationOptions
     seed: int = 0
@@ -106,12 +106,12 @@ class RegistrationRequest:
         )
 
 
-def values_of(detection: Detection | tuple[ImageDetection, ...]) -> Any:
+def values_of(detection: AnyDetection) -> Any:
     """A detection as plain (JSON) values: a list of those in images."""
     return detection.values() if isinstance(detection, Detection) else [one.values() for one in detection]
 
 
-def _recorded(values: Any) -> Detection | tuple[ImageDetection, ...]:
+def _recorded(values: Any) -> AnyDetection:
     """The box of recorded values, as they are: to normalize the quaternion again might change its last bits."""
     if isinstance(values, list):
         return read_image_detections(values)

@@ -17,7 +17,6 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, expl
 from regnf_service.concurrency import Claim
 from regnf_service.fields.ingest import Beside
 from regnf_service.fields.uploads import Received, Upload
-from regnf_service.http.strict_json import parse_json
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.records import RECORDING
@@ -118,14 +117,9 @@ class FrameUpload(Upload):
         await self.feed(self._pipe.take())
 
     async def finish_frame(self, camera: bytes, also: Mapping[str, Any] | None = None) -> Received:
-        """The whole file. Raises Problem MALFORMED_MULTIPART, MALFORMED_JSON, RECORDING_NOT_RECOGNIZED and as ``feed``
-        does."""
-        if not self.parts["depth"].came:
-            raise Problem("MALFORMED_MULTIPART", "The part `depth` is missing.")
+        """The whole file. Raises Problem RECORDING_NOT_RECOGNIZED and as ``feed`` does."""
         for image in self.parts.values():
             image.check()
-        if not isinstance(parse_json(camera, what="The part `camera`"), dict):
-            raise Problem("MALFORMED_JSON", "The part `camera` is not an object.")
         texts = {"camera.json": camera} | ({} if also is None else {"frame.json": json.dumps(also).encode()})
         for name, text in texts.items():
             self.begin_file(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import AsyncExitStack
 from typing import Annotated, Any
 
@@ -42,6 +43,7 @@ from regnf_service.http.routes.fields import forget, require_upload
 from regnf_service.http.routes.uploads import compared, receive_raw
 from regnf_service.http.schemas.recordings import RecordingDocument, RecordingPage, recording_document
 from regnf_service.http.schemas.results import Label
+from regnf_service.http.strict_json import parse_json
 from regnf_service.problem import Problem
 from regnf_service.recordings.pictures import frame_picture
 from regnf_service.recordings.uploads import (
@@ -200,7 +202,14 @@ async def _receive_frame(
         raise Problem("MALFORMED_MULTIPART", f"The part `{missing[0]}` is missing.")
     if as_.said:
         as_ = AsRecording(name=as_.name, said={**as_.said, "frame": frame_name(parts["name"])})
-    return await frame.finish_frame(parts["camera"], as_.said or None), as_
+    return await frame.finish_frame(camera_of(parts), as_.said or None), as_
+
+
+def camera_of(parts: Mapping[str, bytes]) -> bytes:
+    """The part `camera`, which is a JSON object. Raises Problem MALFORMED_JSON."""
+    if not isinstance(parse_json(parts["camera"], what="The part `camera`"), dict):
+        raise Problem("MALFORMED_JSON", "The part `camera` is not an object.")
+    return parts["camera"]
 
 
 def _answer(taken: StoredUpload, prefix: str) -> JSONResponse:

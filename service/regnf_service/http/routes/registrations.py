@@ -41,7 +41,7 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
-from regnf_service.http.routes.recordings import FRAME_PARTS
+from regnf_service.http.routes.recordings import FRAME_PARTS, camera_of
 from regnf_service.http.routes.uploads import DESCRIPTION_BYTES, read_description
 from regnf_service.http.schemas.detections import mask_detection
 from regnf_service.http.schemas.jobs import JobDocument
@@ -238,7 +238,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
             beside = Beside(said, await configs[name].received(), role=name)
             uploads[name] = (files[name], await files[name].finish(), beside)
         if "depth" in parts:
-            uploads["scene"] = (frame, await frame.finish_frame(parts["camera"]), AsRecording())
+            uploads["scene"] = (frame, await frame.finish_frame(camera_of(parts)), AsRecording())
         asked, named = await _asked(
             services, caller, spec, {name: one[1].sha256 for name, one in uploads.items()}, parts
         )

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from regnf_core.detections import Detection as ParsedDetection
 from regnf_core.detections import parse_detection
+from regnf_core.detections.images import AnyDetection as BoxOrImages
 from regnf_core.detections.images import ImageDetection, is_image_detection, read_image_detections
 from regnf_core.errors import InvalidDetectionError
 from regnf_service.http.schemas.results import Coordinate, Incoming, Label
@@ -190,7 +191,7 @@ def mask_detection(png: bytes) -> tuple[ImageDetection, ...]:
         raise Problem(error.reason, str(error), hint=error.hint) from error
 
 
-def _read_any(value: Any) -> ParsedDetection | tuple[ImageDetection, ...]:
+def _read_any(value: Any) -> BoxOrImages:
     """A box in the scene, or a thing in images of a recording."""
     if not is_image_detection(value):
         return _read(value)
@@ -218,7 +219,7 @@ Detection = Annotated[
     PlainSerializer(ParsedDetection.values, return_type=dict[str, Any]),
 ]
 AnyDetection = Annotated[
-    ParsedDetection | tuple[ImageDetection, ...],
+    BoxOrImages,
     PlainValidator(
         _read_any,
         json_schema_input_type=CornerBox
