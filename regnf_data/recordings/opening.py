@@ -103,8 +103,8 @@ def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> 
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether a folder or file has the layout of a recording."""
-    return any(layout.fits(Path(path)) for layout in LAYOUTS)
+    """Whether there is a folder or file, and it has the layout of a recording."""
+    return Path(path).exists() and any(layout.fits(Path(path)) for layout in LAYOUTS)
 
 
 def _recordings_below(folder: Path) -> list[Path]:

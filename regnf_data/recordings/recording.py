@@ -132,16 +132,16 @@ class Recording:
 
     def posed_images(self, chosen: Sequence[int], bounds: Array) -> PosedImages:
         """The chosen frames as images of one size, the most common among them. bounds: (2, 3), world."""
-        frames = [self.frames[index].read() for index in chosen]
+        frames: list[Frame] = []
+        for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
+            frame = self.frames[index].read()
+            gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
+            frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
         shapes = [frame.depth.shape for frame in frames]
         shape = max(set(shapes), key=shapes.count)
         frames = [frame for frame in frames if frame.depth.shape == shape]
-        colors = [
-            np.full((*shape, 3), 128, np.uint8) if frame.color is None else frame.registered(frame.color)
-            for frame in frames
-        ]
         return PosedImages(
-            colors=np.stack(colors),
+            colors=np.stack([frame.color for frame in frames if frame.color is not None]),
             intrinsics=np.stack([frame.camera.K for frame in frames]),
             T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
             bounds=bounds,
