@@ -137,17 +137,24 @@ class Recording:
             frame = self.frames[index].read()
             gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
             frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
-        shapes = [frame.depth.shape for frame in frames]
-        shape = max(set(shapes), key=shapes.count)
-        frames = [frame for frame in frames if frame.depth.shape == shape]
-        return PosedImages(
-            colors=np.stack([frame.color for frame in frames if frame.color is not None]),
-            intrinsics=np.stack([frame.camera.K for frame in frames]),
-            T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
-            bounds=bounds,
-            depths=np.stack([frame.depth for frame in frames]),
-            T_metric_world=self.T_metric_world,
-        )
+        return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
+
+
+def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
+    """Frames as images of one size, the most common among them; gray where a frame has no color of that size. bounds:
+    (2, 3), world."""
+    shapes = [frame.depth.shape for frame in frames]
+    shape = max(set(shapes), key=shapes.count)
+    frames = [frame for frame in frames if frame.depth.shape == shape]
+    gray = np.full((*shape, 3), 128, np.uint8)
+    colors = [gray if one.color is None or one.color.shape[:2] != shape else one.color for one in frames]
+    return PosedImages(
+        colors=np.stack(colors),
+        intrinsics=np.stack([frame.camera.K for frame in frames]),
+        T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
+        bounds=bounds,
+        depths=np.stack([frame.depth for frame in frames]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +245,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
         raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")
     if not np.isfinite(given).all():
         return None
-    pose = np.eye(4)
+    pose: Array = np.eye(4)
     pose[:3] = given[:3]
     rotation = pose[:3, :3]
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID:
@@ -257,7 +264,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
     pose[:3, :3] = u @ vt
     pose[:3, 3] *= unit
     if inverse:
-        pose = np.linalg.inv(pose)
+        pose = np.asarray(np.linalg.inv(pose), np.float64)
     if np.abs(pose[:3, 3]).max() > _FARTHEST:
         raise DatasetError(
             f"{name}: the camera is {np.abs(pose[:3, 3]).max():.3g} m from the origin", reason="DATASET_POSE_NOT_RIGID"

@@ -140,11 +140,12 @@ def _down(frames: list[Frame]) -> Floats:
     normals *= np.sign(normals @ own)[:, None]
     normals = normals[normals @ own > 0.5]
     if not len(normals):
-        return own
+        return np.asarray(own)
     tried = normals[:: len(normals) // 300 + 1]
     best = tried[int((tried @ normals.T > _ALIKE).sum(axis=1).argmax())]
     down = normals[normals @ best > _ALIKE].sum(axis=0)
-    return down / float(np.linalg.norm(down))
+    found_down: Floats = down / float(np.linalg.norm(down))
+    return found_down
 
 
 def _from_above(frames: list[Frame], places: Floats, edge: int) -> Image.Image:
