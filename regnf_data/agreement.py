@@ -152,11 +152,10 @@ def check_recording(recording: Recording) -> str | None:
     count = len(recording)
     parts = _FRAMES // len(_OFFSETS)
     spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
-    frames = [
-        recording.frames[index].read(color=False) for index in (sorted(spread) if count > _FRAMES else range(count))
-    ]
     if count < 2:
         return None
+    chosen = sorted(spread) if count > _FRAMES else range(count)
+    frames = [recording.frames[index].read(color=False) for index in chosen]
     shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
     step = max(1, shape[1] // _ACROSS)
     frames = [frame for frame in frames if frame.depth.shape == shape]
@@ -185,7 +184,9 @@ def _checked(stated: _Views) -> str | None:
     found = sample.agreement(stated)
     if found.places >= _FEWEST and found.disagreement < _SUSPECT:
         return None
-    best, other = _search(stated, sample)
+    # Poses that are all the same, as of a camera on a stand, agree or not by every convention.
+    still = bool((np.ptp(stated.poses, axis=0) == 0.0).all())
+    best, other = (stated, found) if still else _search(stated, sample)
     # A factor above 1 may be but a way to be rid of the cameras' places: beside depths that are large enough, shifts
     # count for nothing, and images of one distant wall agree by their turns alone.
     beyond = sample.agreement(replace(best, factor=_BEYOND * best.factor)).disagreement

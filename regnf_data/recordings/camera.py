@@ -28,6 +28,8 @@ _FOCAL = 0.05, 50.0
 """Focal lengths over the image's width that some lens has."""
 _OFF_MIDDLE = 0.9
 """Of half of an image: intrinsics of images twice as large have their principal point at the border, give or take."""
+_CENTRAL = 0.25
+"""Of half of an image's side: how far its principal point may be from its middle."""
 _UNITS_M = 1e-5, 0.01
 """Meters that a step of a depth image may stand for."""
 _ROUNDS = 8
@@ -67,6 +69,10 @@ class Camera:
     def off_middle(self, size: Size) -> float:
         """How far the principal point lies from the middle of images of a size: 1 at their border."""
         return max(abs(2.0 * self.K[0, 2] / size[1] - 1.0), abs(2.0 * self.K[1, 2] / size[0] - 1.0))
+
+    def is_central(self, size: Size) -> bool:
+        """Whether the principal point is near the middle of images of this size, as lenses are mounted."""
+        return self.off_middle(size) <= _CENTRAL
 
     def rays(self, pixels: Array) -> Array:
         """(P, 3): directions through image points (P, 2) of a camera without a lens; their z is 1."""
@@ -159,8 +165,7 @@ class Camera:
         sideways = np.stack(
             [2.0 * p1 * x * y + p2 * (r + 2.0 * x * x), p1 * (r + 2.0 * y * y) + 2.0 * p2 * x * y], axis=1
         )
-        bent: Array = slopes * radial[:, None] + sideways
-        return bent
+        return np.asarray(slopes * radial[:, None] + sideways)
 
 
 def camera_of(
@@ -176,10 +181,12 @@ def camera_of(
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What a file says of a camera. depth_unit: meters a step of its depth images, or None."""
+    """What a file says of a camera. depth_unit: meters a step of its depth images, or None · pose: what stands under
+    T_world_camera, or None."""
 
     camera: Camera
     depth_unit: float | None = None
+    pose: Any = None
 
 
 def read_camera_file(path: Path) -> CameraFile | None:
@@ -211,7 +218,8 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             lens, coefficients = _lens(each, name)
             K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
             camera = Camera(K, size, lens, coefficients).check(name)
-            return CameraFile(camera, depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit")))
+            unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
 
 

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import tarfile
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +23,9 @@ from regnf_data.recordings.stored import is_stored, read_stored
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MOST_LISTED = 12
+_TARS = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
+_CHECKPOINTS = (".ckpt", ".pt", ".pth", ".pkl", ".safetensors")
+_IMAGES = (".png", ".tif", ".tiff", ".npy", ".pgm", ".exr")
 _NEAR = 3
 """Folders below the one that was given in which recordings are looked for, to name them."""
 
@@ -35,37 +44,58 @@ class Layout:
 
     def recording(self, path: Path, given: Given) -> Recording:
         """That at ``path``, with cameras whose axes are those that were given."""
-        found = _sized(replace(self.read(path, given), terms=self.terms))
+        found = replace(self.read(path, given), terms=self.terms)
         if given.axes in (None, self.terms.axes):
             return found
         turned = (replace(one, T_world_camera=one.T_world_camera @ _OPENGL) for one in found.frames)
         return replace(found, frames=tuple(turned), terms=replace(self.terms, axes=str(given.axes)))
 
 
-def _sized(recording: Recording) -> Recording:
-    """Intrinsics of which no file says the resolution are those of the depth images, or of color images of another
-    size where the principal point lies nearer to the middle of those."""
-    unsized = [one for one in recording.frames if one.camera.size is None and one.color is not None]
-    first = next((one for one in unsized if one.color_camera is None), None)
-    if first is None or first.color is None:
-        return recording
-    sizes = [image.shape[:2] for image in (first.depth(), first.color())]
-    if sizes[0] == sizes[1]:
-        return recording
-    size = min(sizes, key=lambda each: first.camera.off_middle((each[0], each[1])))
-    frames = tuple(
-        one if one.camera.size is not None else replace(one, camera=replace(one.camera, size=(size[0], size[1])))
-        for one in recording.frames
-    )
-    which = "color" if size == sizes[1] else "depth"
-    note = f"the intrinsics are taken as those of images of {size[1]} x {size[0]} pixels, as the {which} images have"
-    return replace(recording, frames=frames, notes=(*recording.notes, note))
-
-
 def _bag(path: Path, given: Given) -> Recording:
     from regnf_data.recordings.bags import read_bag
 
     return read_bag(path, given)
+
+
+def _is_archive(path: Path) -> bool:
+    """Whether an archive holds depth images or a bag, and no checkpoint."""
+    if not path.is_file():
+        return False
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as zipped:
+                names = zipped.namelist()
+        elif path.name.lower().endswith(_TARS):
+            with tarfile.open(path) as tarred:
+                names = tarred.getnames()
+        else:
+            return False
+    except (OSError, zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error):
+        return False
+    return not any(name.endswith(_CHECKPOINTS) for name in names) and any(
+        name.endswith((".mcap", ".db3", ".bag")) or ("depth" in name.lower() and name.lower().endswith(_IMAGES))
+        for name in names
+    )
+
+
+def _archive(path: Path, given: Given) -> Recording:
+    """Imported as a service imports it; what was made of an archive is kept in the user's cache."""
+    from regnf_core.loading import default_cache_dir
+    from regnf_data.recordings.importing import import_recording
+
+    said: dict[str, Any] = {"depth_unit": given.depth_unit, "layout": given.layout, "camera_axes": given.axes}
+    if given.camera is not None:
+        K, size = given.camera.K, given.camera.size or (None, None)
+        said["intrinsics"] = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] - 0.5, "cy": K[1, 2] - 0.5}
+        said["intrinsics"] |= {} if size[0] is None else {"height": size[0], "width": size[1]}
+    description = {name: value for name, value in said.items() if value is not None}
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+    digest.update(json.dumps(description, sort_keys=True).encode())
+    kept = default_cache_dir().parent / "recordings" / digest.hexdigest()[:32]
+    if not (kept / "field.safetensors").is_file():
+        import_recording(path, kept, description)
+    return read_stored(kept / "field.safetensors", path.name)
 
 
 def _is_bag(path: Path) -> bool:
@@ -80,6 +110,7 @@ _REDWOOD = Terms("the trajectory or pose graph", "camera_intrinsic.json")
 _COLMAP = Terms("images.txt or .bin", "cameras.txt or .bin", to_camera=True)
 LAYOUTS = (
     Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
+    Layout("archive", "an archive of a recording", "*.zip, *.tar", _is_archive, _archive),
     Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop, _BOP),
     Layout(
         "sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio, _SDFSTUDIO
