@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from regnf_data.recordings.recording import Given
 
 _INVALID = "DATASET_METADATA_INVALID"
+_METRIC = 1e-3
+"""How far the scale of a world in meters may be from 1."""
 _INTRINSICS = "DATASET_INTRINSICS_INVALID"
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -235,7 +237,9 @@ def read_sdfstudio(folder: Path, given: Given) -> Recording:
                 color_file(resolve(folder, color, f"rgb_path of {name}")) if color else None,
             )
         )
-    return recording_of(folder.name, "sdfstudio", frames, (), T_metric_world)
+    scale = None if T_metric_world is None else np.cbrt(np.linalg.det(T_metric_world[:3, :3]))
+    is_metric = scale is not None and abs(scale - 1.0) < _METRIC
+    return recording_of(folder.name, "sdfstudio", frames, (), T_metric_world, is_metric)
 
 
 # COLMAP: cameras and images, as text or binary, and a depth image of each image's name.
@@ -289,7 +293,7 @@ def read_colmap(folder: Path, given: Given) -> Recording:
         frames.append(
             StoredFrame(name, given.camera or cameras[number], pose, reader, color_file(color) if color else None)
         )
-    return recording_of(folder.name, "COLMAP with depth", frames)
+    return recording_of(folder.name, "COLMAP with depth", frames, is_metric=given.depth_unit is not None)
 
 
 def _dense(path: Path | None) -> Any:
