@@ -274,7 +274,7 @@ def read_colmap(folder: Path, given: Given) -> Recording:
     cameras = dict(_binary_cameras(model / "cameras.bin") if binary else _text_cameras(model / "cameras.txt"))
     images = list(_binary_images(model / "images.bin") if binary else _text_images(model / "images.txt"))
     colors = _subfolder(folder, _COLOR_FOLDERS)
-    unit = given.depth_unit or 0.001
+    unit, is_dense = given.depth_unit or 0.001, False
     frames: list[StoredFrame | None] = []
     for name, number, quaternion, place in sorted(images, key=lambda each: each[0]):
         if number not in cameras:
@@ -289,11 +289,12 @@ def read_colmap(folder: Path, given: Given) -> Recording:
             frames.append(None)
             continue
         color = colors / name if colors and (colors / name).is_file() else None
+        is_dense |= depth is None
         reader = depth_file(depth, unit) if depth is not None else _dense(dense)
         frames.append(
             StoredFrame(name, given.camera or cameras[number], pose, reader, color_file(color) if color else None)
         )
-    return recording_of(folder.name, "COLMAP with depth", frames, is_metric=given.depth_unit is not None)
+    return recording_of(folder.name, "COLMAP with depth", frames, is_metric=not is_dense)
 
 
 def _dense(path: Path | None) -> Any:

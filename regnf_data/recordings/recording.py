@@ -107,8 +107,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is the
-    meter.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world is in
+    meters.
     """
 
     name: str
