@@ -1,0 +1,31 @@
+// A result in the image of its detection: the object's outline there, and where it is as the camera sees it.
+
+import { el } from './dom.js';
+import { fixed } from './format.js';
+import { canvasOf } from './pictures.js';
+
+export const OVERLAY = 'overlay.png';
+
+/** Where the object is, in meters, as one line; '' for a result that no camera saw. */
+export function placeWords({ camera }) {
+  if (!camera?.center_camera?.length) return '';
+  const [x, y, z] = camera.center_camera.map((part) => fixed(part, 3));
+  return `x ${x}, y ${y}, z ${z} m from the camera of ${camera.frame} (right, down, ahead)`;
+}
+
+/** The overlay, which opens large when it is clicked. Raises ApiProblem where the job has none. */
+export async function overlayButton(api) {
+  const blob = new Blob([await api.artifact(OVERLAY)]);
+  const label = 'The object’s outline on the picture';
+  const small = await canvasOf(blob, label, null, false);
+  return el('button', { type: 'button', className: 'overlay', title: 'Show it large', onclick: () => open(blob, label) }, small);
+}
+
+async function open(blob, label) {
+  const close = el('button', { type: 'button' }, 'Close');
+  const dialog = el('dialog', { className: 'large', 'aria-label': label }, await canvasOf(blob, label, null, false), el('div', { className: 'row end' }, close));
+  close.onclick = () => dialog.close();
+  dialog.addEventListener('close', () => dialog.remove());
+  document.body.append(dialog);
+  dialog.showModal();
+}
