@@ -13,9 +13,8 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.progress import MofNCompleteColumn
 
-from regnf_cli.convert import CameraAxes
 from regnf_cli.guard import require
-from regnf_cli.options import Seed, check_output
+from regnf_cli.options import CameraAxes, Seed, check_output
 from regnf_cli.report import out, progress, tell, warn
 from regnf_core.errors import InvalidOptionsError
 

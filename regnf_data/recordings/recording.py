@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,12 +154,14 @@ class Recording:
 class Given:
     """What a person says where a layout does not, or says it wrongly.
 
-    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in ``LAYOUTS``.
+    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in ``LAYOUTS`` · axes: of the
+    cameras, opencv look along z, opengl against it.
     """
 
     camera: Camera | None = None
     depth_unit: float | None = None
     layout: str | None = None
+    axes: Literal["opencv", "opengl"] | None = None
 
 
 def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[Any]]:

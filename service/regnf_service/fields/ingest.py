@@ -89,17 +89,9 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
 
 
 def held_field(services: Services, caller: str, sha256: str) -> FieldRecord | None:
-    """The caller's field of these bytes, unless it was rejected. Raises Problem FIELD_DESCRIPTION_DIFFERS."""
+    """The caller's field of these bytes, unless it was rejected."""
     known = _known(services, reference_of(caller, sha256))
-    if known is None or known.state == "rejected":
-        return None
-    if known.is_recording:
-        raise _held_as_recording(sha256)
-    return known
-
-
-def _held_as_recording(sha256: str) -> Problem:
-    return Problem("FIELD_DESCRIPTION_DIFFERS", hint=f"It is stored as a recording: GET /recordings/{sha256}.")
+    return None if known is None or known.state == "rejected" else known
 
 
 def room_for_bytes(services: Services, caller: str, again: FieldRecord | None = None) -> int | None:
@@ -175,7 +167,8 @@ async def store_upload(
 def keep_held(services: Services, known: FieldRecord, beside: Beside) -> StoredUpload:
     """A field that the caller has already. Raises Problem FIELD_DESCRIPTION_DIFFERS."""
     if known.is_recording and beside.is_nothing:
-        raise _held_as_recording(sha256_of(known.sha256))
+        hint = f"They are stored as a recording: GET /recordings/{sha256_of(known.sha256)}."
+        raise Problem("FIELD_DESCRIPTION_DIFFERS", hint=hint)
     if not beside.is_nothing and not beside.is_function_of(known):
         raise Problem("FIELD_DESCRIPTION_DIFFERS")
     if beside.label is not None and beside.label != known.label:

@@ -6,14 +6,12 @@ the same recording. No image is decoded here.
 
 from __future__ import annotations
 
-import json
-import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, explain_refusal, sniff_format
+from regnf_core.importing.containers.sniff import BAGS, HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_service.concurrency import Claim
 from regnf_service.fields.ingest import Beside
 from regnf_service.fields.uploads import Received, Upload
@@ -24,18 +22,14 @@ from regnf_state.records import RECORDING
 FRAME_BYTES = 256 << 20
 """Of all parts of a frame."""
 CAMERA_BYTES = 64 * 1024
-NAME_BYTES = 400
 _RECORDINGS = RUN_ARCHIVES | {"sqlite", "safetensors"}
-_BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n")
 _WRITTEN = (1980, 1, 1, 0, 0, 0)
-_ENDINGS: dict[str, dict[bytes, str]] = {
+_IMAGES: dict[str, dict[bytes, str]] = {
     "depth": {b"\x89PNG": ".png", b"II*\0": ".tiff", b"MM\0*": ".tiff", b"\x93NUM": ".npy"},
     "color": {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"BM": ".bmp", b"RIFF": ".webp"},
 }
-"""Of the files in the zip, by how the images begin."""
-_FORMATS = {"depth": "a PNG, a TIFF or a .npy file", "color": "a PNG, a JPEG, a BMP or a WebP file"}
+"""How images of each part begin, and the endings of their names in the zip."""
 _MAGIC_BYTES = 4
-_NAME = re.compile(r"[A-Za-z0-9._-]{1,100}")
 
 
 @dataclass(frozen=True)
@@ -45,10 +39,7 @@ class AsRecording(Beside):
 
     name: str | None = None
     said: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def is_nothing(self) -> bool:
-        return False
+    is_nothing = False
 
     @property
     def label(self) -> str | None:
@@ -62,12 +53,50 @@ class RecordingUpload(Upload):
     """A file: an archive, a bag, or a stored recording."""
 
     def _recognize(self) -> None:
-        head = bytes(self._pending[:HEAD_BYTES])
-        if sniff_format(head) not in _RECORDINGS and not head.startswith(_BAGS):
-            _, sentence = explain_refusal(head)
-            what = "" if head[:4] in _ENDINGS["depth"] else f"The file is {sentence}."
-            raise Problem("RECORDING_NOT_RECOGNIZED", what or None)
+        if sniff_format(bytes(self._pending[:HEAD_BYTES])) not in _RECORDINGS and not self._pending.startswith(BAGS):
+            raise Problem("RECORDING_NOT_RECOGNIZED")
         self._recognized = True
+
+
+class FrameUpload(Upload):
+    """One frame: ``images`` are the sinks of a form, and ``finish_frame`` ends the zip file."""
+
+    def __init__(self, services: Services, claim: Claim) -> None:
+        super().__init__(services, claim, min(FRAME_BYTES, services.settings.max_upload_bytes))
+        self._pipe = _Pipe()
+        self._zip = zipfile.ZipFile(self._pipe, "w")  # type: ignore[call-overload]
+        self._file: IO[bytes] | None = None
+        self._recognized = True
+        self.images = {name: _Image(self, name) for name in _IMAGES}
+
+    async def __aexit__(self, *what: object) -> None:
+        self.begin_file(None)
+        self._zip.close()
+        await super().__aexit__(*what)
+
+    def begin_file(self, name: str | None) -> None:
+        """What is written from here on is the file ``name``; None: the one before has ended."""
+        if self._file is not None:
+            self._file.close()
+        self._file = None if name is None else self._zip.open(zipfile.ZipInfo(name, _WRITTEN), "w")
+
+    async def write(self, data: bytes | bytearray) -> None:
+        """Raises Problem as ``feed`` does."""
+        assert self._file is not None, "a file was begun"
+        self._file.write(data)
+        await self.feed(self._pipe.take())
+
+    async def finish_frame(self, texts: Mapping[str, bytes]) -> Received:
+        """The whole file, with these files behind the images. Raises Problem as ``feed`` does."""
+        for image in self.images.values():
+            image.require_whole()
+        for name, text in texts.items():
+            self.begin_file(name)
+            await self.write(text)
+        self.begin_file(None)
+        self._zip.close()
+        await self.feed(self._pipe.take())
+        return await self.finish()
 
 
 class _Pipe:
@@ -88,85 +117,32 @@ class _Pipe:
         return held
 
 
-class FrameUpload(Upload):
-    """One frame: ``parts`` are the sinks of a form, and ``finish_frame`` ends the zip file."""
-
-    def __init__(self, services: Services, claim: Claim) -> None:
-        super().__init__(services, claim, min(FRAME_BYTES, services.settings.max_upload_bytes))
-        self._pipe = _Pipe()
-        self._zip = zipfile.ZipFile(self._pipe, "w")  # type: ignore[call-overload]
-        self._entry: IO[bytes] | None = None
-        self.parts = {name: _Image(self, name) for name in _ENDINGS}
-        self._recognized = True
-
-    async def __aexit__(self, *what: object) -> None:
-        self.begin_file(None)
-        self._zip.close()
-        await super().__aexit__(*what)
-
-    def begin_file(self, name: str | None) -> None:
-        """What is written from here on is the file ``name``; None: the one before has ended."""
-        if self._entry is not None:
-            self._entry.close()
-        self._entry = None if name is None else self._zip.open(zipfile.ZipInfo(name, _WRITTEN), "w")
-
-    async def write(self, data: bytes | bytearray) -> None:
-        """Raises Problem as ``feed`` does."""
-        assert self._entry is not None, "a file was begun"
-        self._entry.write(data)
-        await self.feed(self._pipe.take())
-
-    async def finish_frame(self, camera: bytes, also: Mapping[str, Any] | None = None) -> Received:
-        """The whole file. Raises Problem RECORDING_NOT_RECOGNIZED and as ``feed`` does."""
-        for image in self.parts.values():
-            image.check()
-        texts = {"camera.json": camera} | ({} if also is None else {"frame.json": json.dumps(also).encode()})
-        for name, text in texts.items():
-            self.begin_file(name)
-            await self.write(text)
-        self.begin_file(None)
-        self._zip.close()
-        await self.feed(self._pipe.take())
-        return await self.finish()
-
-
 class _Image:
     """The sink of one image, whose first bytes say the ending of its file's name."""
 
     def __init__(self, frame: FrameUpload, name: str) -> None:
         self._frame, self._name = frame, name
-        self._head: bytearray | None = bytearray()
-        self.came = False
+        self._head: bytearray | None = None
 
     def begin(self, filename: str) -> None:  # noqa: ARG002 -- its bytes say what it is
-        self.came = True
+        self._head = bytearray()
         self._frame.begin_file(None)
 
     async def feed(self, data: bytes | bytearray) -> None:
+        """Raises Problem RECORDING_NOT_RECOGNIZED, and as ``Upload.feed`` does."""
         if self._head is not None:
-            self._head += data
-            if len(self._head) < _MAGIC_BYTES:
+            data = self._head = self._head + data
+            if len(data) < _MAGIC_BYTES:
                 return
-            data, self._head = self._head, None
-            endings = (ending for magic, ending in _ENDINGS[self._name].items() if data.startswith(magic))
-            ending = next(endings, None)
+            ending = next((end for magic, end in _IMAGES[self._name].items() if data.startswith(magic)), None)
             if ending is None:
-                raise self._refusal()
-            self._frame.begin_file(self._name + ending)
+                self.require_whole()
+            self._head = None
+            self._frame.begin_file(f"{self._name}{ending}")
         await self._frame.write(data)
 
-    def check(self) -> None:
+    def require_whole(self) -> None:
         """Raises Problem for an image that came and has no bytes, or too few to be one."""
-        if self.came and self._head is not None:
-            raise self._refusal()
-
-    def _refusal(self) -> Problem:
-        return Problem("RECORDING_NOT_RECOGNIZED", f"The part `{self._name}` is not {_FORMATS[self._name]}.")
-
-
-def frame_name(text: bytes) -> str:
-    """The name of a frame that is added. Raises Problem INVALID_REQUEST."""
-    name = text.decode("utf-8", "replace").strip()
-    if not _NAME.fullmatch(name):
-        raise Problem("INVALID_REQUEST", "The part `name` has 1 to 100 letters, digits, dots, hyphens and underscores.")
-    return name
+        if self._head is not None:
+            known = ", ".join(dict.fromkeys(_IMAGES[self._name].values()))
+            raise Problem("RECORDING_NOT_RECOGNIZED", f"The part `{self._name}` is no image of these kinds: {known}.")

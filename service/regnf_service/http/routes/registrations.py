@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Mapping
 from contextlib import AsyncExitStack
@@ -12,6 +13,7 @@ from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
+from regnf_core.detections.images import ImageDetection
 from regnf_core.field_source import Role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
@@ -43,7 +45,6 @@ from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
 from regnf_service.http.routes.recordings import FRAME_PARTS, camera_of
 from regnf_service.http.routes.uploads import DESCRIPTION_BYTES, read_description
-from regnf_service.http.schemas.detections import mask_detection
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.reading import reference
 from regnf_service.http.schemas.registrations import DryRunDocument, OneShotRequest, RegisterRequest
@@ -126,6 +127,7 @@ async def answer(services: Services, caller: str, prefix: str, asked: JobRequest
 
 
 router = APIRouter(tags=["registrations"])
+_PNG = b"\x89PNG"
 _ROLES: tuple[Role, Role] = ("scene", "object")
 _ONE_SHOT = {
     "schema": {
@@ -226,7 +228,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         files = {name: await stack.enter_async_context(Upload(services, claim)) for name in _ROLES}
         configs = {name: await stack.enter_async_context(SettingsUpload(services, claim)) for name in _ROLES}
         frame = await stack.enter_async_context(FrameUpload(services, claim))
-        sinks = {**files, **{f"{name}_settings": config for name, config in configs.items()}, **frame.parts}
+        sinks = {**files, **{f"{name}_settings": config for name, config in configs.items()}, **frame.images}
         texts = {"request": settings.max_request_bytes, "camera": CAMERA_BYTES, "mask": settings.max_request_bytes}
         texts |= {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
         parts = await read_parts(body.chunks(request, limit), boundary_of(request), sinks, texts)
@@ -238,7 +240,8 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
             beside = Beside(said, await configs[name].received(), role=name)
             uploads[name] = (files[name], await files[name].finish(), beside)
         if "depth" in parts:
-            uploads["scene"] = (frame, await frame.finish_frame(camera_of(parts)), AsRecording())
+            received = await frame.finish_frame({"camera.json": camera_of(parts)})
+            uploads["scene"] = (frame, received, AsRecording())
         asked, named = await _asked(
             services, caller, spec, {name: one[1].sha256 for name, one in uploads.items()}, parts
         )
@@ -269,12 +272,10 @@ async def _asked(
     """The job's request and the fields that must be held, as ``asked_by_reference``. came: the SHA-256s of files."""
     if ("object" in came) == (spec.object is not None or spec.candidates is not None):
         raise Problem("MALFORMED_MULTIPART", "Send the part `object`, or name `object` or `candidates` in the request.")
-    if ("mask" in parts) == (spec.detection is not None):
-        raise Problem("INVALID_DETECTION", "Give `detection` in the request, or the part `mask` of a frame.")
-    changes: dict[str, Any] = dict(came)
-    if "mask" in parts:
-        changes["detection"] = mask_detection(parts["mask"])
-    whole = spec.model_copy(update=changes)
+    if ("mask" in parts) == (spec.detection is not None) or not parts.get("mask", _PNG).startswith(_PNG):
+        raise Problem("INVALID_DETECTION", "Give `detection` in the request, or a PNG as the part `mask` of a frame.")
+    mask = (ImageDetection(mask=base64.b64encode(parts["mask"]).decode()),) if "mask" in parts else spec.detection
+    whole = spec.model_copy(update={**came, "detection": mask})
     library = Library(services, caller)
     await read_library(library, [whole])
     asked, named = await in_thread(asked_by_reference, library, whole)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import binascii
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
@@ -16,7 +14,6 @@ from regnf_core.detections.images import AnyDetection as BoxOrImages
 from regnf_core.detections.images import ImageDetection, is_image_detection, read_image_detections
 from regnf_core.errors import InvalidDetectionError
 from regnf_service.http.schemas.results import Coordinate, Incoming, Label
-from regnf_service.problem import Problem
 from regnf_state.registration_request import values_of
 
 DETECTION_FAULT = "invalid_detection"
@@ -121,14 +118,7 @@ _Corners = Annotated[
 ]
 
 
-class RunLengths(Incoming):
-    """A mask as COCO has it: lengths of runs of 0 and 1 in turn, down the columns, as numbers or as COCO's text."""
-
-    size: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2, description="Height, width.")]
-    counts: str | list[Annotated[int, Field(ge=0)]]
-
-
-_Polygon = Annotated[list[float], Field(min_length=6)]
+_Pixels = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class InImage(_Labeled):
@@ -137,26 +127,26 @@ class InImage(_Labeled):
     model_config = _one_of_each(("mask", "box_2d", "point_2d"))
 
     frame: str | int = Field(0, description="The name of the frame, or its number.")
-    mask: str | RunLengths | list[_Polygon] | _Nothing = Field(
-        None, description="A PNG of the image's size as base64, not 0 on the thing; or COCO's run lengths or polygons."
+    mask: str | dict[str, Any] | list[list[_Pixels]] | _Nothing = Field(
+        None,
+        description="A PNG of the image's size as base64, not 0 on the thing; or COCO's run lengths, `size` (height, "
+        "width) and `counts`, or its polygons.",
     )
-    box_2d: Annotated[list[float], Field(min_length=4, max_length=4)] | _Nothing = Field(
-        None, description="Left, top, right, bottom."
-    )
-    point_2d: Annotated[list[float], Field(min_length=2, max_length=2)] | _Nothing = Field(
-        None, description="Column, row of a pixel on the thing."
-    )
+    box_2d: Annotated[list[_Pixels], Field(min_length=4, max_length=4, description="Left, top, right, bottom.")] | (
+        _Nothing
+    ) = None
+    point_2d: Annotated[list[_Pixels], Field(min_length=2, max_length=2, description="Column, row.")] | _Nothing = None
 
 
 MOST_IMAGES = 32
 """Detections of one thing, each in an image of its own."""
 _MOST_NAME = 200
-_MOST_PIXELS = 1 << 25
-_PNG = b"\x89PNG\r\n\x1a\n"
-_PNG_HINT = "Write the bytes of a PNG of the image's size as base64, or COCO's run lengths."
+_PNG = "iVBORw0KGgo"
+"""How one begins as base64."""
 
 
-def _read_images(value: Any) -> tuple[ImageDetection, ...]:
+def read_images(value: Any) -> tuple[ImageDetection, ...]:
+    """A thing in images, as requests have it. Raises InvalidDetectionError."""
     if isinstance(value, list) and len(value) > MOST_IMAGES:
         hint = "Give the images that show most of it."
         raise InvalidDetectionError(f"has {len(value)} entries, expected {MOST_IMAGES} at most", hint=hint)
@@ -164,39 +154,17 @@ def _read_images(value: Any) -> tuple[ImageDetection, ...]:
     for one in found:
         if max(len(str(one.frame)), len(one.label or "")) > _MOST_NAME:
             raise InvalidDetectionError(f"the frame's name and the label have at most {_MOST_NAME} characters")
-        if isinstance(one.mask, str):
-            _check_png(one.mask)
+        if isinstance(one.mask, str) and not (one.mask.partition("base64,")[2] or one.mask).startswith(_PNG):
+            hint = "Write the bytes of a PNG of the image's size as base64, or COCO's run lengths."
+            raise InvalidDetectionError("the mask is no PNG as base64", hint=hint, place=("mask",))
     return found
 
 
-def _check_png(text: str) -> None:
-    """Its size is looked at before anybody decodes it. Raises InvalidDetectionError."""
-    try:
-        head = base64.b64decode(text.partition("base64,")[2] or text, validate=True)[:24]
-    except (binascii.Error, ValueError) as error:
-        raise InvalidDetectionError("the mask is not base64", hint=_PNG_HINT, place=("mask",)) from error
-    width, height = int.from_bytes(head[16:20]), int.from_bytes(head[20:24])
-    if not head.startswith(_PNG) or not width * height > 0:
-        raise InvalidDetectionError("the mask is no PNG", hint=_PNG_HINT, place=("mask",))
-    if width * height > _MOST_PIXELS:
-        message = f"the mask has {width} x {height} pixels, expected {_MOST_PIXELS} at most"
-        raise InvalidDetectionError(message, place=("mask",))
-
-
-def mask_detection(png: bytes) -> tuple[ImageDetection, ...]:
-    """The thing on which a PNG, the mask of a recording's only frame, is not 0. Raises Problem INVALID_DETECTION."""
-    try:
-        return _read_images({"mask": base64.b64encode(png).decode()})
-    except InvalidDetectionError as error:
-        raise Problem(error.reason, str(error), hint=error.hint) from error
-
-
 def _read_any(value: Any) -> BoxOrImages:
-    """A box in the scene, or a thing in images of a recording."""
     if not is_image_detection(value):
         return _read(value)
     try:
-        return _read_images(value)
+        return read_images(value)
     except InvalidDetectionError as error:
         raise _fault(error) from error
 
