@@ -18,7 +18,7 @@ export async function filesOf(transfer) {
 /** A folder with one frame is its files; any other one is an archive. */
 function ofFolder(name, found) {
   const isFrame = found.length <= FEW && found.filter(({ path }) => DEPTH.test(path)).length <= 1;
-  return isFrame ? found.map(({ file }) => file) : [archiveOf(`${name}.tar`, found)];
+  return isFrame ? found.map(({ file }) => file) : [archiveOf(name, found)];
 }
 
 /** [{ path, file }] of all that is in a folder; hidden files are left out. */

@@ -11,18 +11,19 @@ const CAMERA_WORDS = /"(fx|fl_x|K|k|cam_K|intrinsics?|intrinsic_matrix|camera_ma
 
 /**
  * { recording, depth, color, mask, camera, rest }: a file each where there is one; rest: those that are no part of a
- * recording. A mask is a picture that is called one. Several depth images are a recording, with all that came with them.
+ * recording, without texts that are nothing to the page. A mask is a picture that is called one. Several depth images are a recording, with all that came with them.
  */
 export async function sorted(files) {
   const found = { rest: [] };
   const kinds = await Promise.all(files.map(kindOf));
   if (kinds.filter((kind) => kind === 'depth').length > 1) {
-    return { recording: archiveOf('frames.tar', files.map((file) => ({ path: file.name, file }))), rest: [] };
+    return { recording: archiveOf('frames', files.map((file) => ({ path: file.name, file }))), rest: [] };
   }
-  files.forEach((file, i) => {
-    if (kinds[i] === 'rest' || kinds[i] in found) found.rest.push(file);
-    else found[kinds[i]] = file;
-  });
+  for (const [i, kind] of kinds.entries()) {
+    if (kind === 'nothing') continue;
+    if (kind === 'rest' || kind in found) found.rest.push(files[i]);
+    else found[kind] = files[i];
+  }
   return found;
 }
 

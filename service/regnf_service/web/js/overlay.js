@@ -5,19 +5,22 @@ import { fixed } from './format.js';
 import { canvasOf } from './pictures.js';
 
 export const OVERLAY = 'overlay.png';
+const CAPTION = 52; // pixels of the picture, with words that stand beside a small one anyway
 
-/** Where the object is, in meters, as one line; '' for a result that no camera saw. */
+/** Where the object is, as one line; '' for a result that no camera saw. */
 export function placeWords({ camera }) {
   if (!camera?.center_camera?.length) return '';
   const [x, y, z] = camera.center_camera.map((part) => fixed(part, 3));
-  return `x ${x}, y ${y}, z ${z} m from the camera of ${camera.frame} (right, down, ahead)`;
+  return `Its center in the camera’s frame: x ${x}, y ${y}, z ${z} m (right, down, ahead)`;
 }
 
 /** The overlay, which opens large when it is clicked. Raises ApiProblem where the job has none. */
 export async function overlayButton(api) {
   const blob = new Blob([await api.artifact(OVERLAY)]);
   const label = 'The object’s outline on the picture';
-  const small = await canvasOf(blob, label, null, false);
+  const picture = await createImageBitmap(blob);
+  const small = el('canvas', { width: picture.width, height: picture.height - CAPTION, role: 'img', 'aria-label': label });
+  small.getContext('2d').drawImage(picture, 0, -CAPTION);
   return el('button', { type: 'button', className: 'overlay', title: 'Show it large', onclick: () => open(blob, label) }, small);
 }
 

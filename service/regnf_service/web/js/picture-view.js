@@ -157,6 +157,10 @@ export class PictureView {
       began = null;
     });
     this.sheet.addEventListener('keydown', (event) => { if (event.target === this.sheet && this.frame) this.key(event); });
+    this.sheet.addEventListener('blur', () => {
+      this.cursor = null;
+      this.draw();
+    });
     new ResizeObserver(() => this.draw()).observe(this.sheet);
   }
 
@@ -191,7 +195,7 @@ const boxBetween = ([u, v], [x, y]) => [Math.min(u, x), Math.min(v, y), Math.max
 /** A shape in SVG, twice: a dark rim below, so that it shows on every picture. pixel: of the picture, for one of the screen. */
 function drawn({ point, box }, pixel, name) {
   if (!point && !box) return []; // a mask is drawn on the picture itself
-  if (point) return cross(point, 9 * pixel, name);
+  if (point) return cross(point, 18 * pixel, name);
   const [x, y, right, bottom] = box;
   return ['rim', name].map((kind) => svg('rect', { x, y, width: right - x, height: bottom - y, class: kind }));
 }

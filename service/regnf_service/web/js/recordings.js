@@ -4,10 +4,8 @@ import { ApiProblem } from './api.js';
 import { sha256Of } from './sha256.js';
 import { importWords, labelOf, untilDone } from './uploads.js';
 
-const FOLLOW_S = 4;
-
 /** Whether a document, of a recording or of a field, is of a recording. */
-export const isRecording = ({ links }) => Boolean(links?.self?.includes('/recordings/'));
+export const isRecording = ({ description }) => description?.as === 'recording';
 
 /** The names of a recording's frames. */
 export const framesOf = ({ report }) => report?.frames ?? ['0'];
@@ -17,7 +15,7 @@ export function recordingOfFile(service, file, onStep) {
   return untilDone(async () => {
     onStep('Computing the digest', 0);
     const sha256 = await sha256Of(file, (share) => onStep('Computing the digest', share));
-    const known = await document(service, sha256);
+    const known = await service.field(sha256);
     const usable = known && known.state !== 'rejected';
     const headers = { 'Content-Type': 'application/octet-stream' };
     return imported(service, usable ? known : await sent(service, file.name, file, headers, onStep), onStep);
@@ -33,12 +31,6 @@ export function recordingOfFrame(service, parts, onStep) {
   });
 }
 
-/** A recording that the service has, once its import has ended; null: it has none of this digest. */
-export async function knownRecording(service, sha256) {
-  const known = await document(service, sha256);
-  return known && imported(service, known, () => {});
-}
-
 /** The picture of a frame, a PNG of the image that detections are made in. */
 export async function framePicture(service, sha256, name) {
   const path = name.split('/').map(encodeURIComponent).join('/');
@@ -52,21 +44,8 @@ function sent(service, name, body, headers, onStep) {
   return service.send(path, body, headers, (share, words) => onStep(`Uploading, ${words}`, share));
 }
 
-async function imported(service, first, onStep) {
-  let known = first;
-  while (known?.state === 'validating') {
-    onStep(importWords(known), null);
-    known = await document(service, known.sha256, FOLLOW_S);
-  }
+async function imported(service, { sha256 }, onStep) {
+  const known = await service.imported(sha256, (news) => onStep(importWords(news), null));
   if (known?.state === 'ready') return known;
   throw new ApiProblem(422, known?.error ?? { detail: 'The recording was deleted.' });
-}
-
-async function document(service, sha256, wait = 0) {
-  try {
-    return await service.json(`/recordings/${sha256}${wait ? `?wait=${wait}` : ''}`);
-  } catch (error) {
-    if (error.status === 404) return null;
-    throw error;
-  }
 }

@@ -80,7 +80,6 @@ export class Runs {
     const { probability } = result;
     const facts = [
       Number.isFinite(probability) && `probability ${percent(probability, 1)}`,
-      placeWords(result),
       `scale ${result.T_object_scene.scale.toPrecision(4)}`,
       `${seconds(took / 1000)} from the click on Register`,
     ].filter(Boolean);
@@ -88,16 +87,20 @@ export class Runs {
       el('strong', { 'data-tone': tone }, `${name}, ${words(result.verdict).toLowerCase()}: ${nameOf(object)}`),
       el('span', {}, result.verdict_detail || words(result.verdict_reason)),
       ...(result.verdict_hint ? [el('span', { className: 'note' }, result.verdict_hint)] : []),
+      ...(result.camera ? [el('span', {}, placeWords(result))] : []),
       el('span', { className: 'note' }, facts.join(', ')),
       el('p', { className: 'row' }, el('a', { className: 'button', href: job.links.view }, 'Look closer')),
     );
     row.dataset.verdict = result.verdict;
-    row.classList.toggle('pictured', Boolean(result.camera));
     announce(`${name}: ${words(result.verdict)}`);
   }
   /** The picture comes after the result. */
   async showOverlay(row, job) {
-    const picture = await overlayButton(this.service.job(job.id)).catch((error) => el('p', { className: 'note' }, `No picture: ${told(error)}`));
-    row.prepend(picture);
+    try {
+      row.append(await overlayButton(this.service.job(job.id)));
+      row.classList.add('pictured');
+    } catch (error) {
+      row.append(el('p', { className: 'note' }, `There is no picture: ${told(error)}`));
+    }
   }
 }

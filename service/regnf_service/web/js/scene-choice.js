@@ -8,7 +8,7 @@ import { sorted } from './frame-files.js';
 import { FrameForm } from './frame-form.js';
 import { Turns } from './latest.js';
 import { progressLine } from './progress.js';
-import { isRecording, knownRecording, recordingOfFile, recordingOfFrame } from './recordings.js';
+import { isRecording, recordingOfFile, recordingOfFrame } from './recordings.js';
 import { sayRole } from './roles.js';
 import { fieldOf, nameOf } from './uploads.js';
 
@@ -124,7 +124,7 @@ export class SceneChoice {
     const isLatest = this.turns.next();
     if (!sha256) return this.draw(); // there is no way back to no scene
     try {
-      const field = await this.service.imported(sha256) ?? await knownRecording(this.service, sha256);
+      const field = await this.service.imported(sha256);
       if (isLatest() && field?.state === 'ready') await this.use(field, isLatest);
       else if (isLatest()) this.fail(new Error('The service has no ready field with this digest. It may have been deleted.'));
     } catch (error) {
