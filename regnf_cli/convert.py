@@ -144,8 +144,8 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
 
 
 def _keep_what_was_seen(field: Path, images: Path, opengl: bool) -> None:
+    from regnf_data.agreement import check_agreement
     from regnf_data.sdfstudio import load_dataset
-    from regnf_fit.images.checks import check_agreement
     from regnf_fit.images.observing import attach_observation
 
     given = load_dataset(images, opengl=opengl)

@@ -168,10 +168,12 @@ def camera_of(
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What a file says of a camera. depth_unit: meters a step of its depth images, or None."""
+    """What a file says of a camera. depth_unit: meters a step of its depth images, or None · pose: what stands under
+    T_world_camera, or None."""
 
     camera: Camera
     depth_unit: float | None = None
+    pose: Any = None
 
 
 def read_camera_file(path: Path) -> CameraFile | None:
@@ -203,7 +205,8 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             lens, coefficients = _lens(each, name)
             K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
             camera = Camera(K, size, lens, coefficients).check(name)
-            return CameraFile(camera, depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit")))
+            unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
 
 

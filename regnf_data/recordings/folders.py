@@ -351,7 +351,7 @@ def _has_16_bits(path: Path) -> bool:
 
 
 def read_frame(path: Path, given: Given) -> Recording:
-    """The camera's frame is the world."""
+    """The camera's frame is the world, unless the file of intrinsics says T_world_camera."""
     files = _frame_files(path)
     if files is None:
         raise DatasetError(f"{path.name} has not one depth image", reason="DATASET_NO_FRAMES")
@@ -369,8 +369,8 @@ def read_frame(path: Path, given: Given) -> Recording:
             notes.append("no file says the depth's unit: millimeters are taken")
     # A camera file of the color image's resolution is scaled to the depth image's.
     size = checked_size(depth)
-    picture = color_file(color) if color else None
-    frame = StoredFrame(depth.stem, camera.of_size(size, depth.name), np.eye(4), depth_file(depth, unit), picture)
+    pose = np.eye(4) if found is None or found.pose is None else pose_of(found.pose, "T_world_camera")
+    frame = _frame(depth.stem, camera.of_size(size, depth.name), pose, depth, unit, color)
     return recording_of(path.name, "one frame", [frame], notes)
 
 
