@@ -53,7 +53,7 @@ class PretendWorker:
         while not self._stop.wait(_LOOK_S):
             for field in self._records.list_fields(None, 100, None, self._caller).records:
                 if field.state == "validating":
-                    self._import(field)
+                    (self._import_recording if field.is_recording else self._import)(field)
                 elif field.views == "pending":
                     self._draw(field)
             for job in self._records.list_jobs(None, 100, None, self._caller).records:
@@ -61,8 +61,6 @@ class PretendWorker:
                     self._finish(job)
 
     def _import(self, field: FieldRecord) -> None:
-        if field.is_recording:
-            return self._import_recording(field)
         low, high = self._mesh(field).bounds
         padded = [(low - 0.1 * (high - low)).tolist(), (high + 0.1 * (high - low)).tolist()]
         report = {"family": "mesh", "bounds": padded, "surface_bounds": [low.tolist(), high.tolist()]}

@@ -165,10 +165,13 @@ RUN = archive(model_ckpt=b"x", loss_png=b"y")
 @pytest.mark.parametrize(
     ("files", "found"),
     [
-        ({"d.png": DEPTH, "c.png": COLOR, "cat.stl": b"solid cat facet"}, {"depth": "d.png", "color": "c.png", "rest": ["cat.stl"]}),
-        ({"k.json": b'{"K": [1]}', "truth.json": b"{}", "mask.png": MASK, "x.json": b"{}"}, {"camera": "k.json", "mask": "mask.png", "rest": []}),
+        ({"d.png": DEPTH, "c.png": COLOR, "cat.stl": b"solid cat facet"},
+         {"depth": "d.png", "color": "c.png", "rest": ["cat.stl"]}),
+        ({"k.json": b'{"K": [1]}', "truth.json": b"{}", "mask.png": MASK, "x.json": b"{}"},
+         {"camera": "k.json", "mask": "mask.png", "rest": []}),
         ({"1.png": DEPTH, "2.png": DEPTH, "1.txt": b"1 0 0 0"}, {"recording": "frames", "rest": []}),
-        ({"a.zip": archive(depth_png=DEPTH, camera_json=b"{}"), "b.glb": b"glTF"}, {"recording": "a.zip", "rest": ["b.glb"]}),
+        ({"a.zip": archive(depth_png=DEPTH, camera_json=b"{}"), "b.glb": b"glTF"},
+         {"recording": "a.zip", "rest": ["b.glb"]}),
         ({"run.zip": RUN, "log.mcap": b"\x89MCAP0\r\n"}, {"recording": "log.mcap", "rest": ["run.zip"]}),
     ],
 )  # fmt: skip

@@ -157,7 +157,9 @@ export class SceneChoice {
     for (const id of ['scene-up', 'scene-up-label']) show(byId(id), !isRecording(field));
     const up = field.description?.up_axis ?? 'z';
     byId('scene-up').value = up;
-    byId('scene-state').replaceChildren(el('strong', {}, nameOf(field)));
+    const { notes = [], warnings = [] } = isRecording(field) ? field.report : {};
+    byId('scene-state').replaceChildren(el('strong', {}, nameOf(field)),
+      ...warnings.map((text) => el('p', { className: 'warn' }, text)), ...notes.map((text) => el('p', { className: 'note' }, text)));
     this.draw();
     try {
       await this.onScene(field, up, isLatest, mask);
