@@ -11,7 +11,7 @@ import { nameOf, sizeOf } from './uploads.js';
 
 const TONES = { ready: 'good', rejected: 'bad', validating: 'warn' };
 
-const framesWords = (field) => isRecording(field) && field.state === 'ready' && `${framesOf(field).length} frame${framesOf(field).length > 1 ? 's' : ''}`;
+const framesWords = (field) => isRecording(field) && framesOf(field).length > 1 && `${framesOf(field).length} frames`;
 
 export class FieldTiles {
   constructor(service, store, refresh) {
