@@ -17,6 +17,7 @@ from regnf_core.detections import images as detections
 from regnf_core.detections.images import AnyDetection
 from regnf_core.errors import (
     RECORDING_SUFFIX,
+    DatasetError,
     FieldFormatError,
     InvalidDetectionError,
     InvalidInputError,
@@ -222,12 +223,28 @@ def source_of(
     path: Path, said: Mapping[str, Any] | None, settings: SettingsChoice = None, role: Role | None = None
 ) -> FieldSource:
     """What a path stands for; the settings that were found are said. Raises what ``find_source`` does."""
-    source = find_source(path, said, settings, role)
+    try:
+        source = find_source(path, said, settings, role)
+    except FieldFormatError as error:
+        if error.reason != "RUN_WITHOUT_CHECKPOINT" or role == "object" or not path.is_dir():
+            raise
+        raise FieldFormatError(f"{error}. {_no_recording(path)}", reason=error.reason, hint=error.hint) from error
     if source.file != path:
         tell(f"checkpoint: {source.file}")
     if source.settings:
         tell(f"settings: {', '.join(source.settings_names)}")
     return source
+
+
+def _no_recording(path: Path) -> str:
+    """Why a folder is no recording either, in words."""
+    from regnf_data.recordings.opening import open_recording
+
+    try:
+        open_recording(path.resolve())
+    except DatasetError as error:
+        return str(error)
+    return ""
 
 
 DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
@@ -237,6 +254,12 @@ DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
 # a field by itself
 
 Field = Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)]
+FieldOrRecording = Annotated[
+    Path,
+    typer.Argument(
+        help="A field, or a recording: a folder of depth images, a bag.", parser=scene_path, metavar="FIELD|RECORDING"
+    ),
+]
 Description = Annotated[
     dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
 ]
@@ -273,7 +296,7 @@ SceneDescription = Annotated[
 ]
 
 ObjectUnit = Annotated[
-    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 3 %.")
+    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 1 %.")
 ]
 Scale = Annotated[
     Literal["known", "free"], typer.Option(help="free: whatever the object's unit is, the scale is not known.")
@@ -321,8 +344,9 @@ def given_of(
         camera, step = (found.camera, step or found.depth_unit) if found else (None, step)
     elif intrinsics is not None and len(numbers := [_positive(one) for one in intrinsics.split(",")]) in (4, 6):
         size = (int(numbers[5]), int(numbers[4])) if numbers[4:] else None
+        fx, fy, cx, cy = numbers[:4]
         if all(numbers):
-            camera = camera_of(*numbers[:4], size, whole_centers=True).check("--intrinsics")
+            camera = camera_of(fx, fy, cx, cy, size, whole_centers=True).check("--intrinsics")
     if intrinsics is not None and camera is None:
         hint = "Give fx,fy,cx,cy in pixels, or a file of Open3D, RealSense, ROS or a 3x3 matrix."
         raise InvalidOptionsError(f"--intrinsics {intrinsics[:200]}: no intrinsics", hint=hint)

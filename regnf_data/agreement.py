@@ -260,9 +260,7 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
     }
     orders |= {f"poses {step:+d} images off": np.roll(np.arange(count), -step) for step in (-3, -2, -1, 1, 2, 3)}
     for name, order_of in orders.items():
-        yield replace(views, poses=views.poses[order_of]).because(
-            name, "list each frame's own camtoworld beside its images in meta_data.json"
-        )
+        yield replace(views, poses=views.poses[order_of]).because(name, "give each image its own pose")
 
 
 def _of_axes(axes: Pixels, inverted: bool) -> tuple[str, str]:
@@ -270,16 +268,16 @@ def _of_axes(axes: Pixels, inverted: bool) -> tuple[str, str]:
     wrong, mend = [], []
     if inverted:
         wrong.append("poses from the world to the camera")
-        mend.append("invert the matrices: camtoworld in meta_data.json leads from the camera to the world")
+        mend.append("invert the matrices: poses lead from the camera to the world")
     rows = tuple(tuple(int(number) for number in row) for row in axes)
     if rows == _OPENGL:
         wrong.append("cameras that look against z (OpenGL's axes)")
-        mend.append("say --camera-axes opengl, or negate the second and third column of each camtoworld")
+        mend.append("say --camera-axes opengl (opencv where it was), or negate columns two and three of each pose")
     elif not np.array_equal(axes, np.eye(3)):
         named = ["+-"[int(column.sum() < 0)] + "xyz"[int(np.abs(column).argmax())] for column in axes.T]
         body = " (x forward, as of a robot's body)" if rows == np.array(_BODY).T.tolist() else ""
         wrong.append(f"cameras whose right is {named[0]}, down {named[1]} and forward {named[2]}{body}")
-        mend.append("turn the axes of each camtoworld: its columns are the camera's right, down and forward")
+        mend.append("turn the axes of each pose: its columns are the camera's right, down and forward")
     return " and ".join(wrong), "; ".join(mend)
 
 
@@ -313,7 +311,7 @@ def _of_factor(factor: float) -> tuple[str, str]:
             factor, wrong = known, f"depths in {name}"
         elif known in _UNITS and abs(factor * known - 1.0) < _NAMED:
             factor, wrong = 1.0 / known, f"poses in {name}"
-    change = "multiply the depths, or depth_unit_scale_factor in meta_data.json"
+    change = "multiply the depths, or their unit (--depth-unit; depth_unit_scale_factor in meta_data.json)"
     return wrong, f"{change}, by {factor:.4g}; or divide the poses"
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, MissingExtraError
 from regnf_data.recordings.camera import Array, Camera, camera_of_values
 from regnf_data.recordings.folders import interpolated, poses_of
 from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, recording_of
@@ -40,14 +40,12 @@ class Bag:
     """A bag that stays open while its frames are used."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DatasetError (DATASET_BAG_INVALID, MISSING_DEPENDENCY)."""
+        """Raises DatasetError (DATASET_BAG_INVALID) and MissingExtraError."""
         try:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise DatasetError(
-                "ROS bags need the library rosbags", reason="MISSING_DEPENDENCY", hint="pip install 'regnf[recordings]'"
-            ) from error
+            raise MissingExtraError.of(["rosbags"], ["engine"]) from error
         self.name, self._lock = path.name, Lock()
         with self.errors():
             self.reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
@@ -184,11 +182,14 @@ def _depth_topic(bag: Bag) -> tuple[Any, list[str]]:
 
 def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
     """Times of the headers (s), times in the bag (ns), and the frame of the camera."""
-    stamps, times, frame = [], [], ""
+    stamps: list[float] = []
+    times: list[int] = []
+    frame = ""
     for time, raw in bag.times(connection):
         if not times:
             with bag.errors():
-                frame = bag.reader.deserialize(raw, connection.msgtype).header.frame_id
+                first: Any = bag.reader.deserialize(raw, connection.msgtype)
+                frame = first.header.frame_id
         # The header comes first: CDR has 4 bytes before it, ROS 1 a counter.
         seconds, nanoseconds = struct.unpack_from("<iI", raw, 4)
         stamps.append(seconds + 1e-9 * nanoseconds)
@@ -235,7 +236,8 @@ def _camera(info: Any, topic: str) -> Camera:
 def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str]:
     """T_world_camera at the times, and where from."""
     links = _links(bag)
-    chain, at = [], frame
+    chain: list[Link] = []
+    at = frame
     while at in links and len(chain) < _LONGEST_CHAIN:
         chain.append(links[at])
         at = links[at].parent

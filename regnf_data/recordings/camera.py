@@ -26,6 +26,8 @@ _INVALID = "DATASET_INTRINSICS_INVALID"
 _MOST_BYTES = 1 << 20
 _FOCAL = 0.05, 50.0
 """Focal lengths over the image's width that some lens has."""
+_CENTRAL = 0.25
+"""Of half of an image's side: how far its principal point may be from its middle."""
 _UNITS_M = 1e-5, 0.01
 """Meters that a step of a depth image may stand for."""
 _ROUNDS = 8
@@ -61,6 +63,12 @@ class Camera:
             )
         return replace(self, K=np.diag([across, down, 1.0]) @ self.K, size=size)
 
+    def is_central(self, size: Size) -> bool:
+        """Whether the principal point is near the middle of images of this size, as lenses are mounted."""
+        height, width = size
+        off = np.abs(2.0 * self.K[:2, 2] / (width, height) - 1.0)
+        return bool(off.max() <= _CENTRAL)
+
     def rays(self, pixels: Array) -> Array:
         """(P, 3): directions through image points (P, 2) of a camera without a lens; their z is 1."""
         slopes = (pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
@@ -86,7 +94,7 @@ class Camera:
             column, row = np.floor(found).T
             inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         index = (np.where(inside, value, 0).astype(np.int64).reshape(self.size) for value in (row, column))
-        return ideal, (*index, inside.reshape(self.size))  # type: ignore[return-value]
+        return ideal, (*index, inside.reshape(self.size))
 
     def check(self, name: str) -> Camera:
         """This camera. Raises DatasetError (DATASET_INTRINSICS_INVALID, DATASET_CAMERA_UNSUPPORTED) with ``name``."""
@@ -152,7 +160,7 @@ class Camera:
         sideways = np.stack(
             [2.0 * p1 * x * y + p2 * (r + 2.0 * x * x), p1 * (r + 2.0 * y * y) + 2.0 * p2 * x * y], axis=1
         )
-        return slopes * radial[:, None] + sideways
+        return np.asarray(slopes * radial[:, None] + sideways)
 
 
 def camera_of(

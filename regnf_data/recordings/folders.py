@@ -47,6 +47,8 @@ _TUM_CAMERAS = {
 }
 """fx fy cx cy as the benchmark publishes them, by the part of the folder's name; its lists have no intrinsics."""
 _TUM_STEP_M = 1.0 / 5000.0
+_NANOSECONDS = 1e15
+"""Time stamps beyond are no seconds."""
 _MOST_APART_S = 0.05
 """Between an image and the poses on both sides of it, or the color beside it."""
 
@@ -72,10 +74,11 @@ def read_tum(folder: Path, given: Given) -> Recording:
         camera = camera_of(*published, size=(480, 640), whole_centers=True)
         notes.append("the folder has no intrinsics: those that the benchmark publishes for it are taken")
     unit = given.depth_unit or (found.depth_unit if found else None) or _TUM_STEP_M
-    stamps, poses = _tum_trajectory(_tum_poses(folder) or folder / "groundtruth.txt")
     depths, colors = _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
     color_stamps = np.array([stamp for stamp, _ in colors])
-    placed = interpolated(stamps, poses, np.array([stamp for stamp, _ in depths]))
+    wanted = np.array([stamp for stamp, _ in depths])
+    stamps, poses = _tum_trajectory(_tum_poses(folder) or folder / "groundtruth.txt", wanted)
+    placed = interpolated(stamps, poses, wanted)
     if depths and not any(pose is not None for pose in placed):
         first, last = depths[0][0], depths[-1][0]
         raise DatasetError(
@@ -108,11 +111,23 @@ def _tum_list(path: Path) -> list[tuple[float, str]]:
     return found
 
 
-def _tum_trajectory(path: Path) -> tuple[Array, Array]:
-    """Time stamps (N,), rising, and poses (N, 4, 4)."""
+def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
+    """Time stamps (N,), rising, and poses (N, 4, 4). wanted: of the depth images, for poses without stamps.
+
+    Also as EuRoC has it (ns, p, q w first, and more), and as KITTI does (12 numbers a line, in the images' order).
+    """
     rows = [[_number(word, path.name) for word in line.replace(",", " ").split()] for line in _lines(path)]
-    if not rows or any(len(row) != 8 for row in rows):
-        raise DatasetError(f"{path.name}: expected lines of t tx ty tz qx qy qz qw", reason=_INVALID)
+    lengths = {len(row) for row in rows}
+    if lengths in ({12}, {16}) and len(rows) == len(wanted):
+        found = [pose_of(row, path.name) for row in rows]
+        known = [number for number, pose in enumerate(found) if pose is not None]
+        return wanted[known], np.array([found[number] for number in known])
+    if len(lengths) == 1 and min(lengths) >= 8 and rows[0][0] > _NANOSECONDS:
+        rows = [[1e-9 * row[0], *row[1:4], *row[5:8], row[4]] for row in rows]
+        lengths = {8}
+    if lengths != {8}:
+        expected = "lines of t tx ty tz qx qy qz qw, or 12 numbers for each depth image"
+        raise DatasetError(f"{path.name}: expected {expected}", reason=_INVALID)
     values = np.array(rows)
     values = values[np.isfinite(values).all(axis=1)]
     values = values[np.argsort(values[:, 0], kind="stable")]

@@ -41,6 +41,7 @@ _MODULES = (
     "regnf_core.fields.build",
     "regnf_core.library",
     "regnf_core.rendering.job",
+    "regnf_data.recordings.importing",
     "regnf_data.recordings.stored",
     "regnf_fit.images.recorded_scene",
     "regnf_fit.images.overlay",
