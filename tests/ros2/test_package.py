@@ -67,7 +67,7 @@ def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request]
     monkeypatch.setattr(Node, "given", usual | given)
     service, transport = part("service").Service, httpx.MockTransport(answers)
     monkeypatch.setattr(part("node"), "Service", lambda address, token: service(address, token, transport))
-    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self: None)
+    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self, *what: None)
     return part("node").RegisterObjects()
 
 
@@ -358,7 +358,9 @@ def test_the_launch_file_gives_each_parameter_of_the_node() -> None:
     made = runpy.run_path(str(PACKAGE / "launch" / "regnf.launch.py"))["generate_launch_description"]()
     *declared, node = made
     names = {one.arguments[0] for one in declared}
-    assert names == set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
+    topics = {topic: name.arguments[0] for topic, name in node.named["remappings"]}
+    assert set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
+    assert names == set(part("node").PARAMETERS) | set(topics.values())
     assert (node.named["package"], node.named["executable"]) == ("regnf_ros", "register_objects")
 
 

@@ -18,6 +18,10 @@ from regnf_ros.poses import Matrix, scale_of
 _AXIS = re.compile(r"\+?(?:axis[_ -]?)?([xyz])(?:[_ -]?axis)?", re.IGNORECASE)
 _ENTRY = re.compile(r"\s*(.+?)\s*=\s*([0-9a-fA-F]{64})(?:[\s,;]+|$)", re.DOTALL)
 _DIGEST = re.compile(r"[0-9a-fA-F]{64}")
+METERS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Of the units that an object may be in."""
+KNOWN = 0.03
+"""By what share a unit that is said may be off: models and sensors are scaled a little wrong."""
 TOKEN_VARIABLE = "REGNF_API_TOKEN"  # noqa: S105 - the variable's name
 
 
@@ -88,18 +92,24 @@ def _entries(text: str) -> list[str]:
     return [*found, text[at:]] if text[at:].strip() else found
 
 
-def options_of(up_axis: str, scale_tolerance: float | None, T_field_map: Matrix) -> dict[str, Any]:
-    """The options of every registration. scale_tolerance: by what share the objects' units may differ from meters;
-    None: they are not known.
+def unit_of(name: str, value: Any) -> str:
+    """The unit of the objects' fields: auto, free, or one of a known length. Raises ValueError."""
+    if value in ("auto", "free", *METERS):
+        return str(value)
+    raise ValueError(f"{name}: {value!r} is none of auto, free, {', '.join(METERS)}")
+
+
+def options_of(up_axis: str, scale_tolerance: float | None, object_unit: str, T_scene_map: Matrix) -> dict[str, Any]:
+    """The options of every registration. scale_tolerance: by what share the objects' units may differ from what
+    ``object_unit`` says, or from meters where it says nothing; None: not known, or 3 % of a unit that is said.
     """
     options: dict[str, Any] = {"up_axis": up_axis} if up_axis else {}
-    if scale_tolerance is not None:
-        metric = 1.0 / scale_of(T_field_map)
-        options["robust"] = {
-            "min_scale": (1.0 - scale_tolerance) * metric,
-            "max_scale": (1.0 + scale_tolerance) * metric,
-        }
-    return options
+    robust: dict[str, Any] = {} if object_unit == "auto" else {"object_unit": object_unit}
+    if object_unit in METERS or (scale_tolerance is not None and object_unit == "auto"):
+        tolerance = KNOWN if scale_tolerance is None else scale_tolerance
+        units = 1.0 / (scale_of(T_scene_map) * METERS.get(object_unit, 1.0))
+        robust |= {"min_scale": (1.0 - tolerance) * units, "max_scale": (1.0 + tolerance) * units}
+    return options | ({"robust": robust} if robust else {})
 
 
 def token_of(file: str, environment: Mapping[str, str] = os.environ) -> str:
