@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from regnf_cli.report import tell
-from regnf_core.detections import Detection, parse_detection
+from regnf_core.detections import images as detections
+from regnf_core.detections.images import AnyDetection
 from regnf_core.errors import (
     RECORDING_SUFFIX,
     FieldFormatError,
@@ -23,7 +24,7 @@ from regnf_core.errors import (
 )
 from regnf_core.field_files import require_field_file, require_file
 from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
-from regnf_core.options import Preset, RegistrationOptions
+from regnf_core.options import Preset, RegistrationOptions, Unit
 from regnf_core.rotations import Rows, transform_rows
 from regnf_core.texts import json_value
 
@@ -57,8 +58,19 @@ folder = _parser(_no_folder, folders=True)
 existing = _parser(require_file, folders=True)
 field_path = _parser(lambda path: find_source(path, config=False))
 """Of a field: a file, a training run's folder or an archive."""
+scene_path = _parser(lambda path: is_recording(path) or find_source(path, config=False), folders=True)
+"""Of a field, or of a recording: depth images with their cameras."""
 library_path = _parser(require_field_file, folders=True)
 """A folder of fields, or a field."""
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a recording's; never without the engine's extra, which reads them."""
+    try:
+        from regnf_data.recordings.opening import is_recording as known
+    except ModuleNotFoundError:
+        return False
+    return known(path)
 
 
 def output_folder(text: str) -> Path:
@@ -111,10 +123,10 @@ _TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: s
 _TRANSFORM += ' or {"T_scene_object": ...}: object coordinates to scene coordinates.'
 
 
-def read_detection(path: Path, index: int | None = None) -> Detection:
+def read_detection(path: Path, index: int | None = None) -> AnyDetection:
     """The detection in a file, in any form. Raises InvalidInputError (MALFORMED_JSON) and InvalidDetectionError."""
     try:
-        return parse_detection(read_json(path, "detection"), index)
+        return detections.read_detection(read_json(path, "detection"), index, path.parent)
     except InvalidDetectionError as error:
         message = f"{path}: {error}"
         raise InvalidDetectionError(message, reason=error.reason, hint=error.hint, place=error.place) from error
@@ -129,8 +141,10 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
     raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
 
 
-def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
-    """Plain options: those of a file, or none, with the preset that was asked for by name.
+def read_options(
+    path: Path | None, preset: Preset | None, unit: Unit | None = None, scale: str = "known"
+) -> dict[str, Any]:
+    """Plain options: those of a file, or none, with the preset that was asked for by name, and the object's unit.
 
     Raises InvalidOptionsError when the file names another preset, or holds what is no option.
     """
@@ -139,6 +153,9 @@ def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
     if preset is not None and named != preset:
         raise InvalidOptionsError(f"options.preset: {path} says {named!r}, --preset {preset}: leave one of them out")
     options = values | {"preset": named} if named is not None else values
+    if unit is not None or scale == "free":
+        robust = options.get("robust", {})
+        options = options | {"robust": robust | {"object_unit": "free" if scale == "free" else unit}}
     try:
         RegistrationOptions.from_dict(options)
     except InvalidOptionsError as error:
@@ -230,10 +247,17 @@ NoConfig = Annotated[bool, typer.Option("--no-config", help="Leave settings that
 
 Scene = Annotated[
     Path,
-    typer.Argument(help="The scene's field: a file, a run's folder or an archive.", **FIELD | {"metavar": "SCENE"}),
+    typer.Argument(
+        help="The scene: a field (a file, a run's folder or an archive), or a recording (depth images, a bag).",
+        parser=scene_path,
+        metavar="SCENE",
+    ),
 ]
 DetectionFile = Annotated[
-    Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **FILE)
+    Path,
+    typer.Option(
+        help="JSON: a box in the scene's frame and units, or of a recording a mask, box or point in an image.", **FILE
+    ),
 ]
 DetectionIndex = Annotated[
     int | None, typer.Option(min=0, help="Which one, where the file holds a list of detections; 0 is the first.")
@@ -244,6 +268,13 @@ SceneConfig = Annotated[
 NoConfigs = Annotated[bool, typer.Option("--no-config", help="Leave settings that lie beside a checkpoint unread.")]
 SceneDescription = Annotated[
     dict[str, Any] | None, typer.Option(help="What the scene's file does not say: a file or JSON.", **DESCRIPTION)
+]
+
+ObjectUnit = Annotated[
+    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 3 %.")
+]
+Scale = Annotated[
+    Literal["known", "free"], typer.Option(help="free: whatever the object's unit is, the scale is not known.")
 ]
 
 # the work and its result

@@ -22,7 +22,7 @@ from regnf_data.recordings.folders import interpolated, poses_of
 from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, recording_of
 
 if TYPE_CHECKING:
-    from regnf_data.recordings.opening import Given
+    from regnf_data.recordings.recording import Given
 
 _INVALID = "DATASET_BAG_INVALID"
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

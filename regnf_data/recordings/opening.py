@@ -9,24 +9,12 @@ from pathlib import Path
 
 from regnf_core.errors import DatasetError
 from regnf_data.recordings import documents, folders
-from regnf_data.recordings.camera import Camera
-from regnf_data.recordings.recording import Recording
+from regnf_data.recordings.recording import Given, Recording
+from regnf_data.recordings.stored import is_stored, read_stored
 
 _MOST_LISTED = 12
 _NEAR = 3
 """Folders below the one that was given in which recordings are looked for, to name them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Given:
-    """What a person says where a layout does not, or says it wrongly.
-
-    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in :data:`LAYOUTS`.
-    """
-
-    camera: Camera | None = None
-    depth_unit: float | None = None
-    layout: str | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +40,7 @@ def _is_bag(path: Path) -> bool:
 
 
 LAYOUTS = (
+    Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
     Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop),
     Layout("sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio),
     Layout("nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio),
@@ -98,6 +87,11 @@ def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> 
     raise DatasetError(
         f"{source.name} is no recording that is known. Looked for {known}", reason="DATASET_NOT_RECOGNIZED"
     )
+
+
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder or file has the layout of a recording."""
+    return any(layout.fits(Path(path)) for layout in LAYOUTS)
 
 
 def _recordings_below(folder: Path) -> list[Path]:

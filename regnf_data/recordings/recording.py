@@ -150,6 +150,18 @@ class Recording:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a person says where a layout does not, or says it wrongly.
+
+    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in ``LAYOUTS``.
+    """
+
+    camera: Camera | None = None
+    depth_unit: float | None = None
+    layout: str | None = None
+
+
 def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[Any]]:
     ideal, found = camera.undistorted()
     if found is None:
