@@ -34,7 +34,7 @@ class Log:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def info(self, text: str, throttle_duration_sec: float = 0.0) -> None:
+    def info(self, text: str) -> None:
         self.lines.append(text)
 
     warning = error = info

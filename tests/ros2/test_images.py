@@ -379,6 +379,12 @@ def test_depth_of_another_frame_than_the_color_is_said(robot: Robot) -> None:
     assert "depth is of 'camera', color of 'color': is the depth aligned?" in robot.said
 
 
+def test_equal_warnings_are_said_once(robot: Robot) -> None:
+    for stamp in (1.0, 2.0, 3.0):
+        robot.see(boxes(stamp, ("lamp", (8.0, 6.0, 4.0, 5.0))), image(stamp, MILLIMETERS, "16UC1"))
+    assert robot.node.log.lines == ["no object for the class 'lamp'"]
+
+
 def test_an_image_that_is_still_needed_goes_the_next_time(monkeypatch: pytest.MonkeyPatch) -> None:
     answers, refused = Answers(), [True]
 

@@ -61,11 +61,13 @@ class Answers:
         return httpx.Response(200, json={"id": "j1", "status": "successful"})
 
 
-def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request], httpx.Response], **given: Any) -> Any:
+def make_node(monkeypatch: pytest.MonkeyPatch, answers: Any, **given: Any) -> Any:
+    """answers: a function of requests, or a transport."""
     monkeypatch.setenv("REGNF_API_TOKEN", "open-sesame")
     usual = {"server": "http://127.0.0.1:1", "scene": SCENE, "objects": f"chair={CHAIR}"}
     monkeypatch.setattr(Node, "given", usual | given)
-    service, transport = part("service").Service, httpx.MockTransport(answers)
+    service = part("service").Service
+    transport = answers if isinstance(answers, httpx.BaseTransport) else httpx.MockTransport(answers)
     monkeypatch.setattr(part("node"), "Service", lambda address, token: service(address, token, transport))
     monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self, *what: None)
     return part("node").RegisterObjects()

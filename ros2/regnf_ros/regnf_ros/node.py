@@ -7,6 +7,7 @@ from contextlib import suppress
 from functools import partial
 from queue import Empty, Full, Queue
 from threading import Thread
+from time import monotonic
 from typing import Any
 
 import rclpy
@@ -40,8 +41,10 @@ WAITING = 16
 """Arrays of boxes that may wait for the service; later ones are dropped, which is said in the log."""
 WAIT_S = 0.5
 """How long tf may take to say where the camera was."""
-QUIET_S = 5.0
-"""Between warnings of one kind, at least: a camera sends thirty images a second."""
+QUIET_S = 10.0
+"""Between two equal warnings, at least: a camera sends thirty images a second."""
+MOST_WARNINGS = 100
+"""That are kept to be compared."""
 
 
 class RegisterObjects(Node):
@@ -71,6 +74,7 @@ class RegisterObjects(Node):
         self.waiting: Queue[Detection3DArray] = Queue(WAITING)
         self.latest: Queue[Shot] = Queue(1)
         self.matcher = Matcher(self.warn)
+        self.warned: dict[str, float] = {}
         self.create_subscription(Detection3DArray, "detections", self.take, 10)
         self.subscribe_to_images()
         Thread(target=self.work, args=(self.waiting, self.answer), daemon=True).start()
@@ -108,7 +112,13 @@ class RegisterObjects(Node):
             self.latest.put_nowait(shot)
 
     def warn(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
+        now = monotonic()
+        if now - self.warned.get(text, -QUIET_S) < QUIET_S:
+            return
+        if len(self.warned) >= MOST_WARNINGS:
+            self.warned.clear()
+        self.warned[text] = now
+        self.get_logger().warning(text)
 
     # Called by threads of their own.
 
@@ -140,7 +150,7 @@ class RegisterObjects(Node):
                 T_map_camera = self.camera_in_map(header)
                 image = camera_image(shot.depth, shot.info, shot.color, T_map_camera, self.rectified)
             except (TransformException, ValueError) as error:
-                self.get_logger().error(f"no object is looked for: {error}")
+                self.warn(f"no object is looked for: {error}")
                 return
             frame, size = self.map_frame if image.in_map else frame, shot.color_size or image.size
             for number, one in known:
