@@ -36,10 +36,17 @@ Array = NDArray[Any]
 
 
 class Answers:
-    """A service that finds the object where it is in the camera's frame, whatever that camera's pose is."""
+    """A service that finds the object where it is in the camera's frame. world: its own frame of the scene, if it does
+    not take the camera's pose that is sent."""
 
-    def __init__(self, error: dict[str, Any] | None = None, verdict: str = "registered", bounds: Any = BOUNDS) -> None:
-        self.error, self.verdict, self.bounds = error, verdict, bounds
+    def __init__(
+        self,
+        error: dict[str, Any] | None = None,
+        verdict: str = "registered",
+        bounds: Any = BOUNDS,
+        world: Sim3 | None = None,
+    ) -> None:
+        self.error, self.verdict, self.bounds, self.world = error, verdict, bounds, world
         self.sent: list[dict[str, bytes]] = []
         self.deleted: list[str] = []
 
@@ -58,11 +65,16 @@ class Answers:
         if path.startswith("/fields/"):
             return httpx.Response(200, json={"report": {"surface_bounds": self.bounds}})
         assert path == "/jobs/j/result"
-        T_world_camera = Sim3.from_matrix(self.json("camera")["T_world_camera"])
-        pose = (T_world_camera @ T_CAMERA_OBJECT).inverse().to_dict()
-        covariance = (1e-4 * np.eye(7)).tolist()
-        found = {"T_object_scene": pose, "center_object": [0.0, 0.0, 60.0], "covariance": covariance}
-        return httpx.Response(200, json={"verdict": self.verdict, "probability": 0.9, **found})
+        T_scene_camera = Sim3.from_matrix(self.json("camera")["T_world_camera"]) if self.world is None else self.world
+        document = {
+            "verdict": self.verdict,
+            "probability": 0.9,
+            "T_object_scene": (T_scene_camera @ T_CAMERA_OBJECT).inverse().to_dict(),
+            "center_object": [0.0, 0.0, 60.0],
+            "covariance": (1e-4 * np.eye(7)).tolist(),
+            "camera": {"T_scene_camera": T_scene_camera.to_dict()},
+        }
+        return httpx.Response(200, json=document)
 
     def json(self, name: str, index: int = -1) -> Any:
         return json.loads(self.sent[index][name])
@@ -280,7 +292,11 @@ def test_a_rectified_image_is_known_by_its_topic(monkeypatch: pytest.MonkeyPatch
 # What is published.
 
 
-def test_a_pose_is_published_in_the_map_where_tf_knows_it(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "world", [None, Sim3.identity(), Sim3.from_quaternion(1.0, [0.1, 0.7, 0.2, 0.5], [3.0, 2.0, 1.0])]
+)
+def test_a_pose_is_published_in_the_map_where_tf_knows_it(monkeypatch: pytest.MonkeyPatch, world: Sim3 | None) -> None:
+    robot = Robot(monkeypatch, Answers(world=world))
     monkeypatch.setattr(Buffer, "poses", {12.5: moved(T_MAP_CAMERA), 12.6: moved(Sim3.identity())})
     array = robot.see(boxes(12.49, BOX))
     np.testing.assert_allclose(robot.answers.json("camera")["T_world_camera"], T_MAP_CAMERA.matrix().numpy(), atol=1e-9)

@@ -31,14 +31,14 @@ class CameraImage:
     """What one camera saw at one time, as parts of a request. depth, color: PNG.
 
     size: of the image that detections are sent in pixels of: the color's, or the depth's where no color is sent ·
-    camera: the part of that name, T_world_camera included · in_map: whether that world is the map, not the camera.
+    camera: the part of that name, T_world_camera included · T_map_camera: None where the camera's frame is the world.
     """
 
     depth: bytes
     camera: dict[str, Any]
     size: Size
     color: bytes | None = None
-    in_map: bool = False
+    T_map_camera: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,7 @@ class Seen:
 def camera_image(
     depth: Any, info: Any, color: Any | None, T_map_camera: NDArray[np.float64] | None, rectified: bool
 ) -> CameraImage:
-    """Of messages of one time. T_map_camera: None where the camera's own frame is the world · rectified: whether the
-    depth image is. Raises ValueError.
-    """
+    """Of messages of one time. rectified: whether the depth image is. Raises ValueError."""
     values, unit = depth_of(depth)
     camera = camera_of(info, rectified, values.shape)
     T_world_camera = np.eye(4) if T_map_camera is None else T_map_camera
@@ -84,7 +82,7 @@ def camera_image(
         taken = color_of(color)
         size, picture = taken.shape[:2], png(taken)
         _scales(values.shape, size)
-    return CameraImage(png(values), camera, size, picture, T_map_camera is not None)
+    return CameraImage(png(values), camera, size, picture, T_map_camera)
 
 
 def _scales(size: Size, given: Size) -> tuple[float, float]:

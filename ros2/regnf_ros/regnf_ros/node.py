@@ -152,7 +152,7 @@ class RegisterObjects(Node):
             except (TransformException, ValueError) as error:
                 self.warn(f"no object is looked for: {error}")
                 return
-            frame, size = self.map_frame if image.in_map else frame, shot.color_size or image.size
+            frame, size = frame if T_map_camera is None else self.map_frame, shot.color_size or image.size
             for number, one in known:
                 self.keep(found, number, one.class_id, partial(self.registrar.find_in_image, one, image, size))
             self.registrar.forget()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.linalg import inv
 
 from regnf_ros.images import CameraImage, Seen, Size
 from regnf_ros.parameters import options_of
@@ -74,10 +75,14 @@ class Registrar:
 
         size: of the image that detections are made in, where they do not say it. Raises ServiceError, ValueError.
         """
-        object_, same = self._asked.objects[seen.class_id], np.eye(4)
-        options = self._asked.options(same, image.in_map)
+        object_, upright = self._asked.objects[seen.class_id], image.T_map_camera is not None
+        options = self._asked.options(np.eye(4), upright)
         result = self._register(Request(image, object_, seen.detection(image.size, size), options))
-        return None if result is None else _found(seen.class_id, result, self._box(object_, result), same)
+        if result is None:
+            return None
+        T_scene_camera = _matrix(result["camera"]["T_scene_camera"])
+        T_scene_frame = T_scene_camera if image.T_map_camera is None else T_scene_camera @ inv(image.T_map_camera)
+        return _found(seen.class_id, result, self._box(object_, result, T_scene_frame), T_scene_frame)
 
     def forget(self) -> None:
         """Nothing more is searched for in the images so far: the service need not keep them."""
@@ -87,8 +92,8 @@ class Registrar:
         result = self._service.register(request)
         return None if result["verdict"] == "rejected" else result
 
-    def _box(self, object_: str, result: dict[str, Any]) -> Box:
-        """The box of the object's own axes around it, by a result in meters."""
+    def _box(self, object_: str, result: dict[str, Any], T_scene_frame: Matrix) -> Box:
+        """The box of the object's own axes around it."""
         if self._bounds.get(object_) is None:
             try:
                 self._bounds[object_] = self._service.bounds(object_)
@@ -99,14 +104,18 @@ class Registrar:
         middle = np.asarray(result["center_object"]) if given is None else (low + high) / 2.0
         box = Box(np.eye(4), tuple((high - low).tolist()))
         box.T_frame_box[:3, 3] = middle
-        return box.moved(np.linalg.inv(np.asarray(result["T_object_scene"]["matrix"], dtype=np.float64)))
+        return box.moved(inv(_matrix(result["T_object_scene"]) @ T_scene_frame))
 
 
 def _found(class_id: str, result: dict[str, Any], box: Box, T_field_map: Matrix) -> Found:
     def pose(said: dict[str, Any], covariance: Matrix | None) -> ObjectPose:
-        return object_pose(np.asarray(said["T_object_scene"]["matrix"], dtype=np.float64), covariance, T_field_map)
+        return object_pose(_matrix(said["T_object_scene"]), covariance, T_field_map)
 
     given = result.get("covariance")
     best = pose(result, None if given is None else np.asarray(given, dtype=np.float64))
     others = [pose(one, None) for one in result.get("alternatives", [])]
     return Found(class_id, [best, *others], box, result["probability"], result["verdict"])
+
+
+def _matrix(said: dict[str, Any]) -> Matrix:
+    return np.asarray(said["matrix"], dtype=np.float64)
