@@ -90,7 +90,8 @@ class Matcher:
 
     def add_color(self, message: Any) -> None:
         self._colors.add(message)
-        self._color_size = int(message.height), int(message.width)
+        if message.height and message.width:
+            self._color_size = int(message.height), int(message.width)
 
     def add_depth(self, message: Any) -> list[Shot]:
         self._depths.add(message)

@@ -123,8 +123,12 @@ class RegisterObjects(Node):
     # Called by threads of their own.
 
     def work(self, waiting: Queue[Any], answer: Callable[[Any], None]) -> None:
-        while True:
-            answer(waiting.get())
+        """What is foreseen is caught below. Anything else ends the node, which must not run on without answering."""
+        try:
+            while True:
+                answer(waiting.get())
+        finally:
+            rclpy.try_shutdown()
 
     def answer(self, message: Detection3DArray) -> None:
         """Registers all detections of a message and publishes what was found."""
