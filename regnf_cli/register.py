@@ -58,6 +58,10 @@ def register(
     ] = None,
     object_unit: cli.ObjectUnit = None,
     scale: cli.Scale = "known",
+    depth_unit: cli.DepthUnit = None,
+    intrinsics: cli.Intrinsics = None,
+    layout: cli.Layout = None,
+    camera_axes: cli.CameraAxes = None,
     seed: cli.Seed = 0,
     output: cli.Output = None,
     recording: cli.Recording = None,
@@ -90,8 +94,9 @@ def register(
     elif recording is not None:
         hint = "Leave --server out, or look at the page of the job."
         raise InvalidOptionsError("--recording is for registrations that are done here", hint=hint)
+    said = depth_unit, intrinsics, layout, camera_axes
     thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
-    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), thing)
+    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), thing, said)
     client = cli.client_of(server, token, worker_timeout)
     answer(place, thing, request, Files(output, recording), client, None, cancel_on_interrupt, as_json)
 
@@ -106,13 +111,15 @@ def _place(
     detection: AnyDetection,
     description: dict[str, Any] | None,
     settings: SettingsChoice,
-    thing: FieldSource | None = None,
+    thing: FieldSource | None,
+    said: tuple[Any, ...],
 ) -> FieldSource | Recording:
-    """The scene's field, or a recording; a box outside of it is refused. thing: the only object."""
-    if cli.is_recording(scene):
+    """The scene's field, or a recording; a box outside of it is refused. thing: the only object · said: of the
+    recording, as ``cli.given_of`` takes it."""
+    if any(said) or cli.is_recording(scene):
         from regnf_data.recordings.opening import open_recording
 
-        return open_recording(scene)
+        return open_recording(scene, cli.given_of(*said))
     place = cli.source_of(scene, description, settings, "scene")
     if not isinstance(detection, Detection):
         raise image_detection_in_field(scene)
@@ -150,6 +157,10 @@ def search(
     ] = None,
     object_unit: cli.ObjectUnit = None,
     scale: cli.Scale = "known",
+    depth_unit: cli.DepthUnit = None,
+    intrinsics: cli.Intrinsics = None,
+    layout: cli.Layout = None,
+    camera_axes: cli.CameraAxes = None,
     seed: cli.Seed = 0,
     output: cli.Output = None,
     server: cli.Server = None,
@@ -173,7 +184,8 @@ def search(
         raise InvalidInputError(message, reason="PRESET_UNSUITABLE", hint=hint)
     if server is None:
         require("engine")
-    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config))
+    said = depth_unit, intrinsics, layout, camera_axes
+    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), None, said)
     objects: list[FieldSource] = []
     if server is None or library:
         for one in _objects_of(library, tag):
