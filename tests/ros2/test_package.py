@@ -134,6 +134,19 @@ def test_objects_in_meters_bound_the_scale(monkeypatch: pytest.MonkeyPatch, tmp_
     bounds = pytest.approx({"min_scale": 3.88, "max_scale": 4.12})  # an object's meters for each of the field's units
     assert quarter["options"]["robust"] == bounds
     assert metric["options"]["robust"] == {"min_scale": 1.0, "max_scale": 1.0}
+    _, inches = answered(monkeypatch, scale_tolerance="0.1", object_unit="in")
+    bounds = {name: pytest.approx(share / 0.0254) for name, share in (("min_scale", 0.9), ("max_scale", 1.1))}
+    assert inches["options"]["robust"] == {"object_unit": "in", **bounds}
+    _, known = answered(monkeypatch, object_unit="mm")
+    assert known["options"]["robust"] == {"object_unit": "mm"}
+    _, scaled = answered(monkeypatch, dataparser_transforms=str(file), object_unit="mm")
+    assert {name: scaled["options"]["robust"][name] for name in ("min_scale", "max_scale")} == pytest.approx(
+        {"min_scale": 3960.0, "max_scale": 4040.0}
+    )
+    _, free = answered(monkeypatch, object_unit="free", scale_tolerance="0.1")
+    assert free["options"]["robust"] == {"object_unit": "free"}
+    with pytest.raises(ValueError, match="object_unit: 'ft' is none of auto, free, m, cm, mm, in"):
+        make_node(monkeypatch, Answers(result()), object_unit="ft")
     for wrong in ("-0.1", "1", "nan", "little"):
         with pytest.raises(ValueError, match=r"scale_tolerance|could not convert"):
             make_node(monkeypatch, Answers(result()), scale_tolerance=wrong)

@@ -20,8 +20,8 @@ _ENTRY = re.compile(r"\s*(.+?)\s*=\s*([0-9a-fA-F]{64})(?:[\s,;]+|$)", re.DOTALL)
 _DIGEST = re.compile(r"[0-9a-fA-F]{64}")
 METERS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Of the units that an object may be in."""
-KNOWN = 0.03
-"""By what share a unit that is said may be off: models and sensors are scaled a little wrong."""
+KNOWN = 0.01
+"""By what share the scale of a unit that is said may be off, as in the service."""
 TOKEN_VARIABLE = "REGNF_API_TOKEN"  # noqa: S105 - the variable's name
 
 
@@ -101,14 +101,16 @@ def unit_of(name: str, value: Any) -> str:
 
 def options_of(up_axis: str, scale_tolerance: float | None, object_unit: str, T_scene_map: Matrix) -> dict[str, Any]:
     """The options of every registration. scale_tolerance: by what share the objects' units may differ from what
-    ``object_unit`` says, or from meters where it says nothing; None: not known, or 3 % of a unit that is said.
+    ``object_unit`` says, or from meters where it says nothing; None: as the service takes a known unit, if it is known.
     """
     options: dict[str, Any] = {"up_axis": up_axis} if up_axis else {}
     robust: dict[str, Any] = {} if object_unit == "auto" else {"object_unit": object_unit}
-    if object_unit in METERS or (scale_tolerance is not None and object_unit == "auto"):
-        tolerance = KNOWN if scale_tolerance is None else scale_tolerance
-        units = 1.0 / (scale_of(T_scene_map) * METERS.get(object_unit, 1.0))
-        robust |= {"min_scale": (1.0 - tolerance) * units, "max_scale": (1.0 + tolerance) * units}
+    scale = scale_of(T_scene_map)
+    if scale_tolerance is None and object_unit in METERS and abs(scale - 1.0) > KNOWN:
+        scale_tolerance = KNOWN  # of a scene that is not in meters the service cannot tell
+    if scale_tolerance is not None and object_unit != "free":
+        units = 1.0 / (scale * METERS.get(object_unit, 1.0))
+        robust |= {"min_scale": (1.0 - scale_tolerance) * units, "max_scale": (1.0 + scale_tolerance) * units}
     return options | ({"robust": robust} if robust else {})
 
 
