@@ -108,7 +108,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one · terms: what its files call things.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is
+    the meter, as far as files can tell · terms: what the layout's files call things.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Recording:
     frames: tuple[StoredFrame, ...]
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
+    is_metric: bool = True
     terms: Terms = NO_TERMS
 
     def __len__(self) -> int:
@@ -291,6 +293,7 @@ def recording_of(
     frames: Sequence[StoredFrame | None],
     notes: Sequence[str] = (),
     T_metric_world: Array | None = None,
+    is_metric: bool = True,
 ) -> Recording:
     """The recording of the frames that have a pose; what was left out is noted.
 
@@ -307,4 +310,4 @@ def recording_of(
     said = (
         (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
     )
-    return Recording(name, layout, found, said, T_metric_world)
+    return Recording(name, layout, found, said, T_metric_world, is_metric)
