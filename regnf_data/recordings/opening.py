@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, RegnfError
 from regnf_data.agreement import NO_TERMS, Terms
 from regnf_data.recordings import documents, folders
 from regnf_data.recordings.recording import Given, Recording
@@ -44,7 +45,16 @@ class Layout:
 
     def recording(self, path: Path, given: Given) -> Recording:
         """That at ``path``, with cameras whose axes are those that were given."""
-        found = replace(self.read(path, given), terms=self.terms)
+        try:
+            found = replace(self.read(path, given), terms=self.terms)
+        except (OSError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            if isinstance(error, RegnfError):
+                raise
+            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EMFILE, errno.ENFILE):
+                raise
+            # Readers check what is often wrong; of the rest the reason is all that there is to say.
+            said = f"{path.name} cannot be read as {self.words}: {type(error).__name__}: {error}"
+            raise DatasetError(said[:400], reason="DATASET_METADATA_INVALID") from error
         if given.axes in (None, self.terms.axes):
             return found
         turned = (replace(one, T_world_camera=one.T_world_camera @ _OPENGL) for one in found.frames)
@@ -145,11 +155,12 @@ def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> 
         raise DatasetError(f"there is no {source}", reason="DATASET_NOT_RECOGNIZED")
     if given.layout is not None:
         named = {layout.name: layout for layout in LAYOUTS}
-        if given.layout not in named:
+        name = given.layout.partition(":")[0]  # a bag's topic may follow
+        if name not in named:
             raise DatasetError(
                 f"no layout is called {given.layout[:40]!r}: {', '.join(named)}", reason="DATASET_NOT_RECOGNIZED"
             )
-        return named[given.layout].recording(source, given)
+        return named["archive" if _is_archive(source) else name].recording(source, given)
     for layout in LAYOUTS:
         if layout.fits(source):
             return layout.recording(source, given)
