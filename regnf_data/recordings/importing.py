@@ -94,6 +94,17 @@ _MAGIC = {
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
+def kind_of(path: Path) -> str:
+    """Of an archive: zip, tar, or what a tar file is packed by; of a bag its ending; "" for something else."""
+    with path.open("rb") as file:
+        return _kind(file.read(512))
+
+
+def _kind(head: bytes) -> str:
+    known = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
+    return known or ("tar" if head[257:262] == b"ustar" else "")
+
+
 def main(arguments: list[str]) -> int:
     """Confine, read, write, report. Our own code is loaded before: where it lies may not be read afterwards."""
     from regnf_core.importing.containers import zip_members  # noqa: F401
@@ -105,14 +116,13 @@ def main(arguments: list[str]) -> int:
     request = json.load(sys.stdin)
     limits, folder = ImportLimits(**request["limits"]), Path(arguments[0])
     opened = os.open(arguments[1], os.O_RDONLY)
-    head = os.pread(opened, 512, 0)
-    kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
+    kind = _kind(os.pread(opened, 512, 0))
     # Libraries choose by a file's ending: a link gives the upload one, made while links still may be.
     named = folder / f"upload{kind if kind.startswith('.') else '.safetensors'}"
     named.symlink_to(f"/proc/self/fd/{opened}")
     isolation = confine(limits, request["parent_pid"], [opened], folder, threads=True, folders=True)
     try:
-        report = _converted(named, kind or ("tar" if head[257:262] == b"ustar" else ""), folder, request, limits)
+        report = _converted(named, kind, folder, request, limits)
     except RegnfError as error:
         report = {"reason": error.reason, "detail": str(error), "hint": error.hint}
     except MemoryError:

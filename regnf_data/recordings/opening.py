@@ -12,6 +12,7 @@ import numpy as np
 
 from regnf_core.errors import DatasetError
 from regnf_data.recordings import documents, folders
+from regnf_data.recordings.archives import is_archive, unpacked
 from regnf_data.recordings.recording import Given, Recording
 from regnf_data.recordings.stored import is_stored, read_stored
 
@@ -71,13 +72,16 @@ LAYOUTS = (
 
 
 def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> Recording:
-    """The recording in a folder or file. No image is decoded yet.
+    """The recording in a folder, a file or an archive. No image is decoded yet.
 
     Raises DatasetError: DATASET_NOT_RECOGNIZED with what was looked for, and those of the layout's reader.
     """
     source, given = Path(path), given or Given()
     if not source.exists():
         raise DatasetError(f"there is no {source}", reason="DATASET_NOT_RECOGNIZED")
+    if is_archive(source):
+        inside, kept = unpacked(source)
+        return replace(open_recording(inside, given), name=source.name, kept=kept)
     if given.layout is not None:
         named = {layout.name: layout for layout in LAYOUTS}
         if given.layout not in named:
@@ -104,7 +108,8 @@ def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
     """Whether there is a folder or file, and it has the layout of a recording."""
-    return Path(path).exists() and any(layout.fits(Path(path)) for layout in LAYOUTS)
+    source = Path(path)
+    return source.exists() and (is_archive(source) or any(layout.fits(source) for layout in LAYOUTS))
 
 
 def _recordings_below(folder: Path) -> list[Path]:

@@ -101,7 +101,7 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · kept: what its files go with.
     """
 
     name: str
@@ -109,6 +109,7 @@ class Recording:
     frames: tuple[StoredFrame, ...]
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
+    kept: Any = None
 
     def __len__(self) -> int:
         return len(self.frames)
