@@ -13,7 +13,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,17 +94,6 @@ _MAGIC = {
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
-def kind_of(path: Path) -> str:
-    """Of an archive: zip, tar, or what a tar file is packed by; of a bag its ending; "" for something else."""
-    with path.open("rb") as file:
-        return _kind(file.read(512))
-
-
-def _kind(head: bytes) -> str:
-    known = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
-    return known or ("tar" if head[257:262] == b"ustar" else "")
-
-
 def main(arguments: list[str]) -> int:
     """Confine, read, write, report. Our own code is loaded before: where it lies may not be read afterwards."""
     from regnf_core.importing.containers import zip_members  # noqa: F401
@@ -116,13 +105,14 @@ def main(arguments: list[str]) -> int:
     request = json.load(sys.stdin)
     limits, folder = ImportLimits(**request["limits"]), Path(arguments[0])
     opened = os.open(arguments[1], os.O_RDONLY)
-    kind = _kind(os.pread(opened, 512, 0))
+    head = os.pread(opened, 512, 0)
+    kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
     # Libraries choose by a file's ending: a link gives the upload one, made while links still may be.
     named = folder / f"upload{kind if kind.startswith('.') else '.safetensors'}"
     named.symlink_to(f"/proc/self/fd/{opened}")
     isolation = confine(limits, request["parent_pid"], [opened], folder, threads=True, folders=True)
     try:
-        report = _converted(named, kind, folder, request, limits)
+        report = _converted(named, kind or ("tar" if head[257:262] == b"ustar" else ""), folder, request, limits)
     except RegnfError as error:
         report = {"reason": error.reason, "detail": str(error), "hint": error.hint}
     except MemoryError:
@@ -138,7 +128,7 @@ def main(arguments: list[str]) -> int:
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
     from regnf_data.recordings.opening import open_recording
-    from regnf_data.recordings.stored import write_recording
+    from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
     if kind in ("zip", "tar", "gzip", "bzip2", "xz"):
@@ -146,6 +136,8 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
         unpack(upload, kind, source, limits.file_bytes // 2)
         source = inner_folder(source)
     recording = open_recording(source, given_of(request["description"] or {}))
+    if len(recording) == 1:  # somebody waits for it: it is decoded once
+        recording = replace(recording, frames=recording_of_frames([recording.frames[0].read()]).frames)
     kept, bounds = _kept(recording)
     stored = write_recording(recording, kept, folder / "field.safetensors")
     warning = _agreement(recording, kept, bounds)

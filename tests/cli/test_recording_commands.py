@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import json
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -135,14 +132,3 @@ def test_frames_that_add_most_are_taken(tmp_path: Path) -> None:
     taken = images_of(folder, most=3)
     assert len(taken.images) == 3
     assert "3 of 12 frames" in taken.notes[0]
-
-
-@pytest.mark.parametrize("kind", ["zip", "gztar"])
-def test_an_archive_is_read_and_leaves_nothing(kind: str, run: Run, tmp_path: Path, monkeypatch: Any) -> None:
-    writers.bop(tmp_path / "data" / "000001", walk(2))
-    path = shutil.make_archive(str(tmp_path / "scene"), kind, tmp_path / "data")
-    (tmp_path / "work").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "work"))
-    assert report(run, path)["frames"] == 2
-    gc.collect()
-    assert not list((tmp_path / "work").iterdir())
