@@ -107,7 +107,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world is in
+    meters.
     """
 
     name: str
@@ -115,6 +116,7 @@ class Recording:
     frames: tuple[StoredFrame, ...]
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
+    is_metric: bool = True
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -289,6 +291,7 @@ def recording_of(
     frames: Sequence[StoredFrame | None],
     notes: Sequence[str] = (),
     T_metric_world: Array | None = None,
+    is_metric: bool = True,
 ) -> Recording:
     """The recording of the frames that have a pose; what was left out is noted.
 
@@ -305,4 +308,4 @@ def recording_of(
     said = (
         (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
     )
-    return Recording(name, layout, found, said, T_metric_world)
+    return Recording(name, layout, found, said, T_metric_world, is_metric)

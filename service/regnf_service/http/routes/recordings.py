@@ -22,7 +22,6 @@ from regnf_service.http.body import (
     PageTokenQuery,
     PrefixDep,
     ServicesDep,
-    WaitQuery,
     boundary_of,
     read_parts,
 )
@@ -37,10 +36,9 @@ from regnf_service.http.routes.documentation import (
     PIECE_REFUSALS,
     UPLOAD_REFUSALS,
     get_and_head,
-    header,
     refusals,
 )
-from regnf_service.http.routes.fields import delete_field, get_field, require_field
+from regnf_service.http.routes.fields import FIELD_ANSWERS, delete_field, get_field, require_field
 from regnf_service.http.routes.uploads import (
     ANSWERS,
     UPLOAD_BYTES,
@@ -207,27 +205,22 @@ def list_recordings(
     return JSONResponse({"recordings": documents, "next_page_token": encode_token(found.rest)})
 
 
-@get_and_head(
+get_and_head(
     router,
     "/recordings/{sha256}",
+    name="get_recording",
     summary="A recording's state and what its import found",
     response_model=FieldDocument,
-    responses={
-        200: {"headers": {"ETag": header("For If-None-Match.")}},
-        304: NOT_MODIFIED,
-        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
-    },
-)
-async def get_recording(
-    sha256: str,
-    services: ServicesDep,
-    caller: CallerDep,
-    prefix: PrefixDep,
-    held: IfNoneMatchDep,
-    wait: WaitQuery = 0,
-) -> Response:
-    """The same as `GET /fields/{sha256}`."""
-    return await get_field(sha256, services, caller, prefix, held, wait)
+    responses=FIELD_ANSWERS,
+)(get_field)
+router.delete(
+    "/recordings/{sha256}",
+    name="delete_recording",
+    summary="Forget a recording and its bytes",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE", "FIELD_IN_LIBRARY"),
+)(delete_field)
 
 
 @get_and_head(
@@ -264,10 +257,3 @@ def _picture(services: Services, record: FieldRecord, name: str) -> bytes:
     except FileNotFoundError:
         pass  # it was deleted
     raise Problem("RECORDING_FRAME_NOT_FOUND")
-
-
-@router.delete("/recordings/{sha256}", summary="Forget a recording and its bytes", status_code=204,
-               response_class=Response, responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"))  # fmt: skip
-async def delete_recording(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
-    """Refused while an active job needs the recording. Results of finished jobs stay."""
-    return await delete_field(sha256, services, caller)
