@@ -267,7 +267,7 @@ def _thing(part: _Part) -> Mask:
             weight *= np.exp(-0.5 * (apart / (0.25 * max(sides, 1))) ** 2)
     total, held = (np.bincount(labels, each, minlength=count) for each in (None, inside))
     share = held / np.maximum(total, 1)
-    best = int((np.bincount(labels, weight, minlength=count) * share).argmax())
+    best = int((np.bincount(labels, weight, minlength=count) * share**2).argmax())
     # Something thin before it may part the thing: pieces at its depth belong to it.
     depths = part.depth[kept]
     low, high = np.quantile(depths[labels == best], [0.05, 0.95])
@@ -279,7 +279,7 @@ def _thing(part: _Part) -> Mask:
         near = np.zeros_like(kept)
         near[kept] = labels == best
         near = ndimage.binary_dilation(near, iterations=2 * _EDGE)
-        belongs &= np.bincount(labels, near[kept], minlength=count) > 0
+        belongs &= (np.bincount(labels, near[kept], minlength=count) > 0) & (not part.clicked)
     belongs[best] = True
     around = ndimage.binary_dilation(part.inside, iterations=_EDGE)
     ends = np.bincount(labels, around[kept], minlength=count) >= _WHOLE * total
@@ -294,7 +294,7 @@ def _background(part: _Part) -> Mask:
     measured = part.depth > 0.0
     out = np.zeros_like(measured)
     everything = bool(part.inside.all())
-    around = measured & (~part.inside | everything)
+    around = measured & (~part.inside | part.clicked)
     if around.sum() < 3 * _FEWEST:
         return out
     own = _middle(part, measured & part.inside)
