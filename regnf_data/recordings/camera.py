@@ -68,7 +68,7 @@ class Camera:
 
     def off_middle(self, size: Size) -> float:
         """How far the principal point lies from the middle of images of a size: 1 at their border."""
-        return max(abs(2.0 * self.K[0, 2] / size[1] - 1.0), abs(2.0 * self.K[1, 2] / size[0] - 1.0))
+        return float(np.abs(2.0 * self.K[:2, 2] / (size[1], size[0]) - 1.0).max())
 
     def is_central(self, size: Size) -> bool:
         """Whether the principal point is near the middle of images of this size, as lenses are mounted."""

@@ -1,7 +1,8 @@
-"""Which frames of a recording are worth reading, and where its surfaces lie."""
+"""Which frames of a recording are worth reading, where its surfaces lie, and whether its frames agree."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import check_depths
 from regnf_data.recordings.camera import Array
 from regnf_data.recordings.recording import Frame, Recording
 
@@ -18,6 +20,10 @@ if TYPE_CHECKING:
 
 _LOOKED_AT = 240
 """Frames whose depths are looked at, evenly spread over the recording."""
+_LOOKED_AT_EACH = 4
+"""Frames whose depths are looked at for each that is wanted, of those whose cameras look at the box."""
+_FAR = 3.0
+"""Times as far from the box as the nearer cameras: farther frames show little of it."""
 _POINTS = 4_000
 """Of each such frame."""
 _CELLS_ACROSS = 64
@@ -29,6 +35,12 @@ _OUTLIERS = 0.005
 """The share of the cells, at each end of an axis, outside the bounds: flying pixels, views through windows."""
 _MARGIN = 0.02
 """Of the extent, around it."""
+
+
+_COMPARED, _ACROSS = 32, 200
+"""Of a recording that are compared, and pixels of them across."""
+_OFFSETS = 0.0, 1.0 / 16.0, 0.25, 0.5
+"""Where frames are taken of each part of a recording: some follow each other closely, whatever its length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +58,21 @@ def choose_frames(
     box: OrientedBox | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Chosen:
-    """At most ``most`` frames, by what they add. box: what lies outside does not count, the nearer frame sees more.
+    """At most ``most`` frames, by what they add. box: what lies outside does not count, the nearer frame sees more, and
+    only frames whose cameras look at it are read.
 
     Frames that cannot be read are an error. Raises DatasetError: DATASET_DEPTH_MISSING where no frame has a depth,
     DATASET_NOTHING_IN_BOUNDS where none shows a surface in the box.
     """
-    count = min(len(recording), _LOOKED_AT)
-    looked_at = [(index * len(recording)) // count for index in range(count)]
+    places = list(range(len(recording))) if box is None else _looking_at(recording, box)
+    count = min(len(places), _LOOKED_AT if box is None else _LOOKED_AT_EACH * most)
+    looked_at = [places[(index * len(places)) // count] for index in range(count)]
     seen: list[tuple[Array, float]] = []
     for number, index in enumerate(looked_at):
         if progress is not None:
             progress(number, count)
         frame = recording.frames[index].read(color=False)
-        seen.append((_some_points(frame), _sharpness(frame)))
+        seen.append((_some_points(frame), _sharpness(frame, box)))
     points = [each for each, _ in seen]
     if not sum(map(len, points)):
         raise DatasetError(f"{recording.name}: no frame has a measured depth", reason="DATASET_DEPTH_MISSING")
@@ -86,8 +100,27 @@ def _some_points(frame: Frame) -> Array:
     return local @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
 
 
-def _sharpness(frame: Frame) -> float:
-    """Pixels a meter, at the nearer part of what the frame shows."""
+def _looking_at(recording: Recording, box: OrientedBox) -> list[int]:
+    """Frames whose cameras have a part of the box before them, by their poses alone; all of them where none has."""
+    poses = np.stack([frame.T_world_camera for frame in recording.frames])
+    K = np.stack([frame.camera.K for frame in recording.frames])
+    sides = np.array([(frame.camera.size or 2.0 * frame.camera.K[[1, 0], 2])[::-1] for frame in recording.frames])
+    local = np.einsum("nji,nj->ni", poses[:, :3, :3], box.center.numpy() - poses[:, :3, 3])
+    depth = np.maximum(local[:, 2], 1e-9)
+    pixels = local[:, :2] / depth[:, None] * K[:, [0, 1], [0, 1]] + K[:, :2, 2]
+    around = (box.diagonal / 2.0 * K[:, 0, 0] / depth)[:, None]
+    looking = (local[:, 2] > 0.0) & ((pixels > -around) & (pixels < sides + around)).all(axis=1)
+    if not looking.any():
+        return list(range(len(recording)))
+    near = np.linalg.norm(local, axis=1)
+    return [int(index) for index in np.flatnonzero(looking & (near <= _FAR * np.quantile(near[looking], 0.1)))]
+
+
+def _sharpness(frame: Frame, box: OrientedBox | None) -> float:
+    """Pixels a meter, at the box or at the nearer part of what the frame shows."""
+    if box is not None:
+        apart = float(np.linalg.norm(box.center.numpy() - frame.T_world_camera[:3, 3]))
+        return float(frame.camera.K[0, 0]) / max(apart, 1e-9)
     measured = frame.depth[frame.depth > 0.0]
     return float(frame.camera.K[0, 0] / np.quantile(measured, 0.25)) if len(measured) else 0.0
 
@@ -129,3 +162,27 @@ def _greedy(cells: list[NDArray[np.int64]], worth: list[float], most: int) -> li
         picked.append(best)
         left[each[best]] *= 0.5
     return picked
+
+
+def check_recording(recording: Recording) -> str | None:
+    """A warning where frames disagree by every convention; None where they agree, or cannot tell.
+
+    Some frames are read. Raises DatasetError as their readers do, and DATASET_COMPARED_DISAGREE where they agree by
+    another convention, in the words of the recording's layout.
+    """
+    count = len(recording)
+    parts = _COMPARED // len(_OFFSETS)
+    spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
+    if count < 2:
+        return None
+    chosen = sorted(spread) if count > _COMPARED else range(count)
+    frames = [recording.frames[index].read(color=False) for index in chosen]
+    shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
+    step = max(1, shape[1] // _ACROSS)
+    frames = [frame for frame in frames if frame.depth.shape == shape]
+    # Every step-th pixel: the center of the first one stays where it is.
+    smaller = np.array([[1.0 / step, 0.0, 0.5 - 0.5 / step], [0.0, 1.0 / step, 0.5 - 0.5 / step], [0.0, 0.0, 1.0]])
+    depths = np.stack([frame.depth[::step, ::step] for frame in frames])
+    intrinsics = np.stack([smaller @ frame.camera.K for frame in frames])
+    poses = np.stack([frame.T_world_camera for frame in frames])
+    return check_depths(depths, intrinsics, poses, recording.terms)

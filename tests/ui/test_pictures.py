@@ -107,10 +107,10 @@ def test_a_recording_is_chosen_and_boxes_are_drawn_by_mouse_and_keys(
     page.mouse.down()
     page.mouse.move(*at(page, 12.0, 9.0), steps=3)
     page.mouse.up()
-    expect(page.locator("#boxes button").first).to_have_text("Mark 1: box of 8 × 6 pixels")
+    expect(page.locator("#boxes button").first).to_have_text("Mark 1: box of 8 × 6 pixels in b")
     page.get_by_role("button", name="Right bottom corner").focus()
     page.keyboard.press("ArrowLeft")
-    expect(page.locator("#boxes button").first).to_have_text("Mark 1: box of 7 × 6 pixels")
+    expect(page.locator("#boxes button").first).to_have_text("Mark 1: box of 7 × 6 pixels in b")
     page.get_by_role("button", name="Move the box").focus()
     for _ in range(9):
         page.keyboard.press("ArrowDown")  # no farther than the picture's edge

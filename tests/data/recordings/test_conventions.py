@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from regnf_core.errors import DatasetError
-from regnf_data.agreement import check_recording
+from regnf_data.recordings.choosing import check_recording
 from regnf_data.recordings.opening import open_recording
 from regnf_data.recordings.recording import Given
 from tests.data.recordings import writers
