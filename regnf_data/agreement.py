@@ -7,9 +7,11 @@ or sees something before it. Only what lies before the other's surface contradic
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, permutations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,9 @@ from numpy.typing import NDArray
 from regnf_core.errors import DatasetError
 from regnf_core.importing.observing.trajectory import rolled_quaternions
 from regnf_data.posed_images import PosedImages
+
+if TYPE_CHECKING:
+    from regnf_data.recordings.recording import Recording
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int64]
@@ -52,8 +57,30 @@ _FACTORS = np.exp(_STEP * np.array([step for step in range(-115, 116) if abs(ste
 _UNITS = {0.001: "millimeters", 0.01: "centimeters", 0.0254: "inches", 0.3048: "feet", 0.0002: "steps of 1/5000"}
 _STEPS = {0.2: "steps of 1/5000 that were read as 1/1000", 5.0: "steps of 1/1000 that were read as 1/5000"}
 _NAMED = 0.04
+_FRAMES, _ACROSS = 32, 200
+"""Of a recording that are compared, and pixels of them across."""
+_OFFSETS = 0.0, 1.0 / 16.0, 0.25, 0.5
+"""Where frames are taken of each part of a recording: some follow each other closely, whatever its length."""
 _OPENGL = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 _BODY = ((0, -1, 0), (0, 0, -1), (1, 0, 0))
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What the files of a layout call the things that a convention is about.
+
+    poses, intrinsics, unit: where they are stated · to_camera: whether poses lead from the world to the camera ·
+    axes: of the cameras, by --camera-axes.
+    """
+
+    poses: str = "the poses"
+    intrinsics: str = "the intrinsics"
+    unit: str = ""
+    to_camera: bool = False
+    axes: str = "opencv"
+
+
+NO_TERMS = Terms()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +93,7 @@ class _Views:
     poses: Floats
     factor: float = 1.0
     changes: tuple[tuple[str, str], ...] = ()
+    terms: Terms = NO_TERMS
 
     def because(self, wrong: str, mend: str) -> _Views:
         return replace(self, changes=(*self.changes, (wrong, mend)))
@@ -74,7 +102,7 @@ class _Views:
         """What is wrong, and what mends it."""
         changes = list(self.changes)
         if self.factor != 1.0:
-            changes.append(_of_factor(self.factor))
+            changes.append(_of_factor(self.factor, self.terms))
         mend = "; ".join(mend for _, mend in changes)
         return " and ".join(wrong for wrong, _ in changes), f"{mend[0].upper()}{mend[1:]}."
 
@@ -116,6 +144,29 @@ def score_of_scale(images: PosedImages, factor: float) -> float:
     return sample.agreement(_Views(images.depths, images.intrinsics, images.T_world_camera, factor)).score
 
 
+def check_recording(recording: Recording) -> str | None:
+    """As :func:`check_agreement`, of some frames of a recording, in the words of its layout.
+
+    Frames are read. Raises DatasetError as their readers do, too.
+    """
+    count = len(recording)
+    parts = _FRAMES // len(_OFFSETS)
+    spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
+    if count < 2:
+        return None
+    chosen = sorted(spread) if count > _FRAMES else range(count)
+    frames = [recording.frames[index].read(color=False) for index in chosen]
+    shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
+    step = max(1, shape[1] // _ACROSS)
+    frames = [frame for frame in frames if frame.depth.shape == shape]
+    # Every step-th pixel: the center of the first one stays where it is.
+    smaller = np.array([[1.0 / step, 0.0, 0.5 - 0.5 / step], [0.0, 1.0 / step, 0.5 - 0.5 / step], [0.0, 0.0, 1.0]])
+    depths = np.stack([frame.depth[::step, ::step] for frame in frames])
+    intrinsics = np.stack([smaller @ frame.camera.K for frame in frames])
+    poses = np.stack([frame.T_world_camera for frame in frames])
+    return _checked(_Views(depths, intrinsics, poses, terms=recording.terms))
+
+
 def check_agreement(images: PosedImages) -> str | None:
     """A warning where the images disagree by every convention; None where they agree, or cannot tell.
 
@@ -124,18 +175,23 @@ def check_agreement(images: PosedImages) -> str | None:
     if images.depths is None or len(images) < 2:
         return None
     depths = np.where(images.measured, images.depths, np.float32(0.0))
-    stated = _Views(depths, images.intrinsics, images.T_world_camera)
-    if (sample := _Sample.of(depths, _PAIRS, _PIXELS)) is None:
+    return _checked(_Views(depths, images.intrinsics, images.T_world_camera))
+
+
+def _checked(stated: _Views) -> str | None:
+    if (sample := _Sample.of(stated.depths, _PAIRS, _PIXELS)) is None:
         return None
     found = sample.agreement(stated)
     if found.places >= _FEWEST and found.disagreement < _SUSPECT:
         return None
-    best, other = _search(stated, sample)
+    # Poses that are all the same, as of a camera on a stand, agree or not by every convention.
+    still = bool((np.ptp(stated.poses, axis=0) == 0.0).all())
+    best, other = (stated, found) if still else _search(stated, sample)
     # A factor above 1 may be but a way to be rid of the cameras' places: beside depths that are large enough, shifts
     # count for nothing, and images of one distant wall agree by their turns alone.
     beyond = sample.agreement(replace(best, factor=_BEYOND * best.factor)).disagreement
     tells_depth = best.factor <= 1.0 or other.disagreement <= _CLEAR * beyond
-    if best is not stated and tells_depth and _clearly_better(other, found, len(images)):
+    if best is not stated and tells_depth and _clearly_better(other, found, len(stated.poses)):
         wrong, mend = best.told()
         raise DatasetError(
             f"the images contradict each other: {found.said()}. With {wrong}: {other.said()}",
@@ -247,10 +303,10 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
         for inverted in (False, True):
             if inverted or not np.array_equal(axes, np.eye(3)):
                 changed = replace(views, poses=(inverse if inverted else views.poses) @ turn)
-                yield changed.because(*_of_axes(axes, inverted))
+                yield changed.because(*_of_axes(axes, inverted, views.terms))
     for step, wrong in ((-1, "quaternions written w first"), (1, "quaternions x y z w that were read w first")):
         rolled = replace(views, poses=rolled_quaternions(views.poses, step))
-        yield rolled.because(wrong, "make the matrices of quaternions anew, in the order that they are written in")
+        yield rolled.because(wrong, f"write the quaternions of {views.terms.poses} anew, in the order that is expected")
     count = len(views.poses)
     by_name = np.argsort([str(number) for number in range(count)], kind="stable")
     orders = {
@@ -260,24 +316,32 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
     }
     orders |= {f"poses {step:+d} images off": np.roll(np.arange(count), -step) for step in (-3, -2, -1, 1, 2, 3)}
     for name, order_of in orders.items():
-        yield replace(views, poses=views.poses[order_of]).because(name, "give each image its own pose")
+        yield replace(views, poses=views.poses[order_of]).because(
+            name, f"give each image its own pose in {views.terms.poses}"
+        )
 
 
-def _of_axes(axes: Pixels, inverted: bool) -> tuple[str, str]:
+def _of_axes(axes: Pixels, inverted: bool, terms: Terms) -> tuple[str, str]:
     """What is wrong with poses of such axes, and what mends it."""
     wrong, mend = [], []
     if inverted:
-        wrong.append("poses from the world to the camera")
-        mend.append("invert the matrices: poses lead from the camera to the world")
+        ways = ["from the camera to the world", "from the world to the camera"]
+        wrong.append(f"poses {ways[not terms.to_camera]}")
+        mend.append(f"invert the matrices: {terms.poses} must lead {ways[terms.to_camera]}")
     rows = tuple(tuple(int(number) for number in row) for row in axes)
     if rows == _OPENGL:
-        wrong.append("cameras that look against z (OpenGL's axes)")
-        mend.append("say --camera-axes opengl (opencv where it was), or negate columns two and three of each pose")
+        other = "opengl" if terms.axes == "opencv" else "opencv"
+        wrong.append(
+            "cameras that look " + ("against z (OpenGL's axes)" if other == "opengl" else "along z (OpenCV's axes)")
+        )
+        mend.append(f"say --camera-axes {other}, or negate columns two and three of each pose, to the world")
     elif not np.array_equal(axes, np.eye(3)):
         named = ["+-"[int(column.sum() < 0)] + "xyz"[int(np.abs(column).argmax())] for column in axes.T]
         body = " (x forward, as of a robot's body)" if rows == np.array(_BODY).T.tolist() else ""
         wrong.append(f"cameras whose right is {named[0]}, down {named[1]} and forward {named[2]}{body}")
-        mend.append("turn the axes of each pose: its columns are the camera's right, down and forward")
+        mend.append(
+            f"turn the axes of {terms.poses}: columns of a pose to the world are the camera's right, down and forward"
+        )
     return " and ".join(wrong), "; ".join(mend)
 
 
@@ -303,7 +367,7 @@ def _other_depths(views: _Views) -> Iterator[_Views]:
         yield replace(of_inverse, factor=float(factor))
 
 
-def _of_factor(factor: float) -> tuple[str, str]:
+def _of_factor(factor: float, terms: Terms) -> tuple[str, str]:
     """What is wrong where depths need a factor, and what mends it."""
     wrong = f"depths {factor:.3g} times as large"
     for known, name in (_UNITS | _STEPS).items():
@@ -311,15 +375,15 @@ def _of_factor(factor: float) -> tuple[str, str]:
             factor, wrong = known, f"depths in {name}"
         elif known in _UNITS and abs(factor * known - 1.0) < _NAMED:
             factor, wrong = 1.0 / known, f"poses in {name}"
-    change = "multiply the depths, or their unit (--depth-unit; depth_unit_scale_factor in meta_data.json)"
-    return wrong, f"{change}, by {factor:.4g}; or divide the poses"
+    unit = f"--depth-unit or {terms.unit}" if terms.unit else "--depth-unit"
+    return wrong, f"multiply the depths, or their unit ({unit}), by {factor:.3g}; or divide the poses"
 
 
 def _other_intrinsics(views: _Views) -> Iterator[_Views]:
     height, width = views.depths.shape[1:]
     K = views.intrinsics
     swapped = K[:, [1, 0, 2]][:, :, [1, 0, 2]]
-    mend = "write the intrinsics in pixels of these images"
+    mend = f"write {views.terms.intrinsics} in pixels of these images"
     yield replace(views, intrinsics=swapped).because("intrinsics whose width and height are exchanged", mend)
     middle = np.median(K[:, :2, 2], axis=0)
     fitting = {round(float(side / (2.0 * at)), 3) for side, at in zip((width, height), middle, strict=True) if at > 0.0}

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import NO_TERMS, Terms
 from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array, Camera, Size
 from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
@@ -111,7 +112,7 @@ class StoredFrame:
         if not color or self.color is None:
             return frame
         picture = self.color()
-        colored = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
+        colored = (self.color_camera or with_lens).of_size((picture.shape[0], picture.shape[1]), self.name)
         return replace(frame, color=picture, color_camera=colored.check(self.name))
 
 
@@ -120,8 +121,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world is in
-    meters.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is
+    the meter, as far as files can tell · terms: what the layout's files call things.
     """
 
     name: str
@@ -130,6 +131,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
     is_metric: bool = True
+    terms: Terms = NO_TERMS
 
     def __len__(self) -> int:
         return len(self.frames)

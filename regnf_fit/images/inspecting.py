@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageOps
 
 from regnf_core.errors import DatasetError
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR
-from regnf_data.agreement import check_agreement
+from regnf_data.agreement import check_recording
 from regnf_data.recordings.choosing import choose_frames
 from regnf_data.recordings.recording import Frame, Given, Recording
 from regnf_fit.images.overlay import shaded
@@ -77,7 +77,7 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
         },
         "bounds": [[_rounded(value) for value in row] for row in chosen.bounds.tolist()],
         "path": _rounded(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())),
-        "agreement": _agreement(recording, chosen.indices, chosen.bounds),
+        "agreement": _agreement(recording),
         "notes": list(recording.notes),
     }
     return InspectedRecording(report, _picture(frames, places))
@@ -97,12 +97,12 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def _agreement(recording: Recording, indices: tuple[int, ...], bounds: Floats) -> str:
+def _agreement(recording: Recording) -> str:
     """How the depths of one surface agree from frame to frame, in words."""
-    if len(indices) < 2:
+    if len(recording) < 2:
         return "one frame: nothing to compare"
     try:
-        return check_agreement(recording.posed_images(indices, bounds)) or "frames that see the same place agree"
+        return check_recording(recording) or "frames that see the same place agree"
     except DatasetError as error:
         return f"{error.reason}: {error}. {error.hint or ''}".strip()
 
