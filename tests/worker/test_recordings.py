@@ -75,6 +75,8 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
         ({"after": "c" * 64, "frame": "left"}, frame(), "FIELD_NOT_FOUND"),
         ({}, frame(png(np.zeros(SIZE, np.uint16))), "DATASET_DEPTH_MISSING"),
         ({}, frame(cx=900.0), "DATASET_INTRINSICS_INVALID"),
+        ({}, frame(depth_unit=1e9), "DATASET_INTRINSICS_INVALID"),
+        ({}, frame(depth_unit="mm"), "DATASET_INTRINSICS_INVALID"),
         ({}, frame(T_world_camera=np.diag([1, 1, -1, 1]).tolist()), "DATASET_POSE_NOT_RIGID"),
         ({}, frame()[:300], "FILE_TRUNCATED"),
         ({}, archive(notes_txt=b"nothing"), "DATASET_NOT_RECOGNIZED"),
