@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -94,7 +95,8 @@ class _Errors:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, DatasetError):
-            raise DatasetError(f"{self._name} cannot be read as a bag: {error}"[:400], reason=_INVALID) from error
+            told = re.sub(r"(/[^\s/]+)+/", "", str(error))  # paths of this machine are nobody's business
+            raise DatasetError(f"{self._name} cannot be read as a bag: {told}"[:400], reason=_INVALID) from error
 
 
 @dataclass

@@ -171,15 +171,13 @@ def given_of(said: dict[str, Any]) -> Any:
 
 def unpack(upload: Path, kind: str, folder: Path, most: int) -> None:
     """Write an archive's files below ``folder``. Raises FieldFormatError with the ARCHIVE_* reasons."""
-    with upload.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        view = memoryview(data)
-        try:
-            for name, content in _members(view, kind, most):
-                target = folder / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(content)
-        finally:
-            view.release()
+    with upload.open("rb") as file:
+        # Closed with the last view of it: an error may hold one.
+        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    for name, content in _members(data, kind, most):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(content)
 
 
 def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, bytes]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import zlib
 from pathlib import Path
@@ -80,6 +81,8 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
         ({}, frame(T_world_camera=np.diag([1, 1, -1, 1]).tolist()), "DATASET_POSE_NOT_RIGID"),
         ({}, frame()[:300], "FILE_TRUNCATED"),
         ({}, archive(notes_txt=b"nothing"), "DATASET_NOT_RECOGNIZED"),
+        ({}, gzip.compress(bytes(range(256)) * 20), "ARCHIVE_MALFORMED"),
+        ({}, b"SQLite format 3\0" + bytes(5000), "DATASET_BAG_INVALID"),
     ],
 )
 def test_a_recording_that_is_none_leaves_nothing(
