@@ -31,8 +31,8 @@ _BACKGROUND = (249, 249, 247)
 
 @dataclass(frozen=True, eq=False)
 class InspectedRecording:
-    """report: plain values, the recording's unit and pixels · picture: some images, and the points from above with the cameras'
-    path."""
+    """report: plain values, the recording's unit and pixels · picture: some images, and the points from above with the
+    cameras' path."""
 
     report: dict[str, Any]
     picture: Image.Image
