@@ -219,6 +219,9 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
             camera = Camera(K, size, lens, coefficients).check(name)
             unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            if unit is None and each.get("depth_unit") is not None:
+                told = f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters a step, such as 0.001"
+                raise DatasetError(told, reason=_INVALID)
             return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
 
