@@ -7,11 +7,9 @@ or sees something before it. Only what lies before the other's surface contradic
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, permutations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +17,6 @@ from numpy.typing import NDArray
 from regnf_core.errors import DatasetError
 from regnf_core.importing.observing.trajectory import rolled_quaternions
 from regnf_data.posed_images import PosedImages
-
-if TYPE_CHECKING:
-    from regnf_data.recordings.recording import Recording
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int64]
@@ -57,10 +52,6 @@ _FACTORS = np.exp(_STEP * np.array([step for step in range(-115, 116) if abs(ste
 _UNITS = {0.001: "millimeters", 0.01: "centimeters", 0.0254: "inches", 0.3048: "feet", 0.0002: "steps of 1/5000"}
 _STEPS = {0.2: "steps of 1/5000 that were read as 1/1000", 5.0: "steps of 1/1000 that were read as 1/5000"}
 _NAMED = 0.04
-_FRAMES, _ACROSS = 32, 200
-"""Of a recording that are compared, and pixels of them across."""
-_OFFSETS = 0.0, 1.0 / 16.0, 0.25, 0.5
-"""Where frames are taken of each part of a recording: some follow each other closely, whatever its length."""
 _OPENGL = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 _BODY = ((0, -1, 0), (0, 0, -1), (1, 0, 0))
 
@@ -144,27 +135,9 @@ def score_of_scale(images: PosedImages, factor: float) -> float:
     return sample.agreement(_Views(images.depths, images.intrinsics, images.T_world_camera, factor)).score
 
 
-def check_recording(recording: Recording) -> str | None:
-    """As :func:`check_agreement`, of some frames of a recording, in the words of its layout.
-
-    Frames are read. Raises DatasetError as their readers do, too.
-    """
-    count = len(recording)
-    parts = _FRAMES // len(_OFFSETS)
-    spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
-    if count < 2:
-        return None
-    chosen = sorted(spread) if count > _FRAMES else range(count)
-    frames = [recording.frames[index].read(color=False) for index in chosen]
-    shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
-    step = max(1, shape[1] // _ACROSS)
-    frames = [frame for frame in frames if frame.depth.shape == shape]
-    # Every step-th pixel: the center of the first one stays where it is.
-    smaller = np.array([[1.0 / step, 0.0, 0.5 - 0.5 / step], [0.0, 1.0 / step, 0.5 - 0.5 / step], [0.0, 0.0, 1.0]])
-    depths = np.stack([frame.depth[::step, ::step] for frame in frames])
-    intrinsics = np.stack([smaller @ frame.camera.K for frame in frames])
-    poses = np.stack([frame.T_world_camera for frame in frames])
-    return _checked(_Views(depths, intrinsics, poses, terms=recording.terms))
+def check_views(depths: NDArray[np.float32], intrinsics: Floats, poses: Floats, terms: Terms) -> str | None:
+    """As :func:`check_agreement`, of depths (N, H, W), intrinsics (N, 3, 3), poses (N, 4, 4), in a layout's words."""
+    return _checked(_Views(depths, intrinsics, poses, terms=terms))
 
 
 def check_agreement(images: PosedImages) -> str | None:

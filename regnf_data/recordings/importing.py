@@ -125,8 +125,8 @@ def main(arguments: list[str]) -> int:
 
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
-    from regnf_data.agreement import check_recording
     from regnf_data.recordings.layouts import read_layout
+    from regnf_data.recordings.recording import check_recording
     from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
