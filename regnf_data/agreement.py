@@ -135,6 +135,11 @@ def score_of_scale(images: PosedImages, factor: float) -> float:
     return sample.agreement(_Views(images.depths, images.intrinsics, images.T_world_camera, factor)).score
 
 
+def check_views(depths: NDArray[np.float32], intrinsics: Floats, poses: Floats, terms: Terms) -> str | None:
+    """As :func:`check_agreement`, of depths (N, H, W), intrinsics (N, 3, 3), poses (N, 4, 4), in a layout's words."""
+    return _checked(_Views(depths, intrinsics, poses, terms=terms))
+
+
 def check_agreement(images: PosedImages) -> str | None:
     """A warning where the images disagree by every convention; None where they agree, or cannot tell.
 
@@ -143,14 +148,10 @@ def check_agreement(images: PosedImages) -> str | None:
     if images.depths is None or len(images) < 2:
         return None
     depths = np.where(images.measured, images.depths, np.float32(0.0))
-    return check_depths(depths, images.intrinsics, images.T_world_camera)
+    return _checked(_Views(depths, images.intrinsics, images.T_world_camera))
 
 
-def check_depths(
-    depths: NDArray[np.float32], intrinsics: Floats, T_world_camera: Floats, terms: Terms = NO_TERMS
-) -> str | None:
-    """As :func:`check_agreement`, of depth images (N, H, W), at least two, intrinsics (N, 3, 3) and poses (N, 4, 4)."""
-    stated = _Views(depths, intrinsics, T_world_camera, terms=terms)
+def _checked(stated: _Views) -> str | None:
     if (sample := _Sample.of(stated.depths, _PAIRS, _PIXELS)) is None:
         return None
     found = sample.agreement(stated)

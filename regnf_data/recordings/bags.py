@@ -95,8 +95,8 @@ class _Errors:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, DatasetError):
-            said = re.sub(r"/\S*/", "", str(error))  # folders tell nothing, and may be nobody's business
-            raise DatasetError(f"{self._name} cannot be read as a bag: {said}"[:400], reason=_INVALID) from error
+            told = re.sub(r"(/[^\s/]+)+/", "", str(error))  # paths of this machine are nobody's business
+            raise DatasetError(f"{self._name} cannot be read as a bag: {told}"[:400], reason=_INVALID) from error
 
 
 @dataclass

@@ -68,7 +68,7 @@ class Camera:
 
     def off_middle(self, size: Size) -> float:
         """How far the principal point lies from the middle of images of a size: 1 at their border."""
-        return float(np.abs(2.0 * self.K[:2, 2] / (size[1], size[0]) - 1.0).max())
+        return float(np.abs(2.0 * self.K[:2, 2] / size[::-1] - 1.0).max())
 
     def is_central(self, size: Size) -> bool:
         """Whether the principal point is near the middle of images of this size, as lenses are mounted."""
@@ -219,6 +219,9 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
             camera = Camera(K, size, lens, coefficients).check(name)
             unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            if unit is None and each.get("depth_unit") is not None:
+                told = f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters a step, such as 0.001"
+                raise DatasetError(told, reason=_INVALID)
             return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
 

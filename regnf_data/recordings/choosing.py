@@ -1,8 +1,7 @@
-"""Which frames of a recording are worth reading, where its surfaces lie, and whether its frames agree."""
+"""Which frames of a recording are worth reading, and where its surfaces lie."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
-from regnf_data.agreement import check_depths
 from regnf_data.recordings.camera import Array
 from regnf_data.recordings.recording import Frame, Recording
 
@@ -35,12 +33,6 @@ _OUTLIERS = 0.005
 """The share of the cells, at each end of an axis, outside the bounds: flying pixels, views through windows."""
 _MARGIN = 0.02
 """Of the extent, around it."""
-
-
-_COMPARED, _ACROSS = 32, 200
-"""Of a recording that are compared, and pixels of them across."""
-_OFFSETS = 0.0, 1.0 / 16.0, 0.25, 0.5
-"""Where frames are taken of each part of a recording: some follow each other closely, whatever its length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,27 +154,3 @@ def _greedy(cells: list[NDArray[np.int64]], worth: list[float], most: int) -> li
         picked.append(best)
         left[each[best]] *= 0.5
     return picked
-
-
-def check_recording(recording: Recording) -> str | None:
-    """A warning where frames disagree by every convention; None where they agree, or cannot tell.
-
-    Some frames are read. Raises DatasetError as their readers do, and DATASET_COMPARED_DISAGREE where they agree by
-    another convention, in the words of the recording's layout.
-    """
-    count = len(recording)
-    parts = _COMPARED // len(_OFFSETS)
-    spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
-    if count < 2:
-        return None
-    chosen = sorted(spread) if count > _COMPARED else range(count)
-    frames = [recording.frames[index].read(color=False) for index in chosen]
-    shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
-    step = max(1, shape[1] // _ACROSS)
-    frames = [frame for frame in frames if frame.depth.shape == shape]
-    # Every step-th pixel: the center of the first one stays where it is.
-    smaller = np.array([[1.0 / step, 0.0, 0.5 - 0.5 / step], [0.0, 1.0 / step, 0.5 - 0.5 / step], [0.0, 0.0, 1.0]])
-    depths = np.stack([frame.depth[::step, ::step] for frame in frames])
-    intrinsics = np.stack([smaller @ frame.camera.K for frame in frames])
-    poses = np.stack([frame.T_world_camera for frame in frames])
-    return check_depths(depths, intrinsics, poses, recording.terms)

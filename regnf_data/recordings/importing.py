@@ -125,8 +125,8 @@ def main(arguments: list[str]) -> int:
 
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
-    from regnf_data.recordings.choosing import check_recording
     from regnf_data.recordings.layouts import read_layout
+    from regnf_data.recordings.recording import check_recording
     from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
@@ -171,9 +171,9 @@ def given_of(said: dict[str, Any]) -> Any:
 def unpack(upload: Path, kind: str, folder: Path, most: int) -> None:
     """Write an archive's files below ``folder``. Raises FieldFormatError with the ARCHIVE_* reasons."""
     with upload.open("rb") as file:
-        # Left to be closed with the last view into it: an error on its way out holds some.
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    for name, content in _members(memoryview(data), kind, most):
+        # Closed with the last view of it: an error may hold one.
+        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    for name, content in _members(data, kind, most):
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(content)

@@ -25,13 +25,14 @@ OVERLAY = "overlay.png"
 @dataclass(frozen=True, eq=False)
 class Place:
     """Where a job looks: the scene or the region of it, the box, and the options with what the scene says of the scale.
-    camera, frame: the image of the detection, where the scene is a recording."""
+    camera, frame: the image of the detection, where the scene is a recording · notes: what was taken for granted."""
 
     field: SdfField
     box: OrientedBox
     options: RegistrationOptions
     camera: CameraView | None = None
     frame: Frame | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def pictures(self) -> tuple[str, ...]:
@@ -69,7 +70,7 @@ def place_of(scene: Path, request: RegistrationRequest, obj: Any, device: str) -
         return Place(open_field(scene, device), detection, request.options)
     bounds = None if obj is None else obj.bounds.cpu().numpy()
     found = recorded_scene(read_stored(scene, "the recording"), detection, bounds, request.options)
-    return Place(found.field.to(device), found.box, found.options, found.camera, found.frame)
+    return Place(found.field.to(device), found.box, found.options, found.camera, found.frame, found.notes)
 
 
 def joined_recordings(first: Path, added: Path, name: str, target: Path) -> None:

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from regnf_core.errors import DatasetError
-from regnf_data.recordings.choosing import check_recording
 from regnf_data.recordings.opening import open_recording
-from regnf_data.recordings.recording import Given
+from regnf_data.recordings.recording import Given, check_recording
 from tests.data.recordings import writers
 from tests.data.recordings.truth import HEIGHT, WIDTH, Array, K, Truth, walk
 
