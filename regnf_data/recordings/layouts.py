@@ -43,6 +43,9 @@ class Layout:
                 raise
             if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EMFILE, errno.ENFILE):
                 raise
+            if isinstance(error, FileNotFoundError | NotADirectoryError):
+                said = f"{path.name} is not of the layout {self.words}: it has no {Path(str(error.filename)).name}"
+                raise DatasetError(said, reason="DATASET_NO_METADATA") from error
             # Readers check what is often wrong; of the rest the reason is all that there is to say.
             said = f"{path.name} cannot be read as {self.words}: {type(error).__name__}: {error}"
             raise DatasetError(said[:400], reason="DATASET_METADATA_INVALID") from error

@@ -24,6 +24,8 @@ _FARTHEST = 1e6
 """Camera positions beyond are no meters."""
 _NOT_RIGID = 0.02
 _MILLIMETER, _EIGHT_BITS = 0.001, 255.5
+_FEW = 4
+"""Different depths of an image that shows but a wall."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,13 +243,16 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
     """Reads a depth image: whole numbers of ``unit`` meters, or numbers in meters where the file has a point."""
 
     def read() -> NDArray[np.float32]:
-        depth = read_depth(path, checked_size(path), unit)
-        if unit is not None and path.suffix.lower() == ".npy" and _whole_numbers(path):
-            depth = depth * np.float32(unit)
-        if unit is not None and unit <= _MILLIMETER and 0.0 < depth.max() <= _EIGHT_BITS * unit:
+        size = checked_size(path)
+        if unit is None or not _whole_numbers(path):
+            return read_depth(path, size, unit and 1.0)
+        depth = read_depth(path, size, unit) * np.float32(unit if path.suffix.lower() == ".npy" else 1.0)
+        some = np.round(depth[::4, ::4] / unit)
+        spread = next((by for by in (256, 257) if not (some % by).any() and len(np.unique(some)) > _FEW), None)
+        if unit <= _MILLIMETER and (spread or 0.0 < depth.max() <= _EIGHT_BITS * unit):
+            which = f"multiples of {spread}" if spread else f"whole numbers up to {round(depth.max() / unit)}"
             raise DatasetError(
-                f"{path.name}: its depths are whole numbers up to {round(depth.max() / unit)}: an image of 8 bits",
-                reason="DATASET_IMAGE_INVALID",
+                f"{path.name}: its depths are {which}: an image of 8 bits", reason="DATASET_IMAGE_INVALID"
             )
         return depth
 
@@ -284,7 +289,10 @@ def checked_size(path: Path) -> Size:
 
 
 def _whole_numbers(path: Path) -> bool:
-    return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
+    if path.suffix.lower() == ".npy":
+        return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
+    with opened_image(path) as image:
+        return bool(image.mode != "F")
 
 
 def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) -> Array | None:
