@@ -66,14 +66,14 @@ def write_recording(recording: Recording, indices: Sequence[int], path: Path) ->
             yield np.zeros((*color, 3), np.uint8) if frame is None or frame.color is None else frame.color
 
     count, first = len(kept), kept[0]
-    seen = first.color_camera or first.camera
+    seen, bent = first.color_camera or first.camera, first.taken or first.camera
     said = {
         "names": names,
         "depth_unit": unit,
         "layout": recording.layout,
         "notes": list(recording.notes),
         "is_metric": recording.is_metric,
-        "lens": [first.camera.lens, list(first.camera.distortion)],
+        "lens": [bent.lens, list(bent.distortion)],
         "color_lens": [seen.lens, list(seen.distortion)],
         "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
     }
@@ -198,7 +198,13 @@ def recording_of_frames(frames: Sequence[Frame], name: str = "frames", layout: s
     def held(frame: Frame) -> StoredFrame:
         color: Callable[[], NDArray[np.uint8]] | None = None if frame.color is None else partial(_same, frame.color)
         return StoredFrame(
-            frame.name, frame.camera, frame.T_world_camera, partial(_same, frame.depth), color, frame.color_camera
+            frame.name,
+            frame.camera,
+            frame.T_world_camera,
+            partial(_same, frame.depth),
+            color,
+            frame.color_camera,
+            taken=frame.taken,
         )
 
     return Recording(name, layout, tuple(held(frame) for frame in frames))
