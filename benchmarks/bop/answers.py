@@ -10,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.bop.dataset import Dataset, Target, matrix_of
-from benchmarks.bop.errors import MSPD_LIMITS, MSSD_LIMITS, Array, matched, mspd, mssd, surfaces_apart
+from benchmarks.bop.dataset import Dataset, Target, Truth, matrix_of
+from benchmarks.bop.errors import MSPD_LIMITS, MSSD_LIMITS, Array, Mesh, matched, mspd, mssd, surfaces_apart
+from benchmarks.bop.writing import rendered
 
 RIGHT = 0.05
 """Diameters: a pose at which no point of the surface is farther off is right."""
+_NEAR = 5.0
+"""mm."""
 _COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
 
@@ -27,7 +30,8 @@ class Answer:
     the processor, for this detection alone · number, visible: of the true object, the share of its silhouette that is
     seen.
     Errors: mssd, surface (see :func:`surfaces_apart`) in diameters, listed: the least ``surface`` of the pose and the
-    others · mspd: pixels.
+    others · mspd: pixels. Without a truth: explained, the share of the visible pixels whose measured point lies within
+    5 mm of the placed surface, along the camera's axis.
     """
 
     scene_id: int
@@ -46,6 +50,7 @@ class Answer:
     mspd: float = float("inf")
     surface: float = float("inf")
     listed: float = float("inf")
+    explained: float = float("nan")
 
     @property
     def matrix(self) -> Array | None:
@@ -77,7 +82,18 @@ def judged(dataset: Dataset, answer: Answer) -> Answer:
         mspd=mspd(pose, nearest.pose, known.vertices, known.symmetries, K),
         surface=surfaces[0],
         listed=min(surfaces),
+        explained=_explained(dataset, answer, nearest, pose, known.mesh),
     )
+
+
+def _explained(dataset: Dataset, answer: Answer, truth: Truth, pose: Array, mesh: Mesh) -> float:
+    mask = dataset.mask(answer.scene_id, answer.im_id, truth.number)
+    picture = dataset.picture(answer.scene_id, answer.im_id)
+    measured = (picture.depth > 0.0) if mask is None else mask & (picture.depth > 0.0)
+    if mask is None or not measured.any():
+        return float("nan")
+    apart = np.abs(rendered(mesh, pose, picture) - picture.depth)
+    return float((apart[measured] <= _NEAR).mean())
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from benchmarks.bop.errors import Array, Mesh, outermost, symmetries_of
+from benchmarks.bop.writing import Picture
 from regnf_core.detections.images import ImageDetection
 from regnf_core.errors import DatasetError
 from regnf_core.importing.mesh_file import read_mesh_file
@@ -128,6 +130,13 @@ class Dataset:
     def intrinsics(self, scene_id: int, im_id: int) -> Array:
         """(3, 3): a pixel's center at whole numbers."""
         return np.array(self._read(scene_id, "scene_camera.json")[str(im_id)]["cam_K"], np.float64).reshape(3, 3)
+
+    def picture(self, scene_id: int, im_id: int) -> Picture:
+        """Its depth, mm, without the color."""
+        step = float(self._read(scene_id, "scene_camera.json")[str(im_id)].get("depth_scale", 1.0))
+        files = [self.scene(scene_id) / "depth" / f"{im_id:06d}{ending}" for ending in (".png", ".tif")]
+        values = np.asarray(Image.open(next(file for file in files if file.is_file())))
+        return Picture(values.astype(np.float64) * step, self.intrinsics(scene_id, im_id))
 
     def mask(self, scene_id: int, im_id: int, number: int) -> NDArray[np.bool_] | None:
         """(H, W): what is visible of the true object of a number; None where it is not given."""

@@ -9,7 +9,6 @@ each has a license of its own.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import json
 import shutil
@@ -18,17 +17,15 @@ import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from benchmarks.bop.answers import Answer, read_csv, write_csv
 from benchmarks.bop.dataset import matrix_of
-from benchmarks.bop.errors import Array, Mesh
+from benchmarks.bop.errors import Array, Mesh, outermost
 from benchmarks.bop.writing import Picture, Placed, placed, write_scene
 from regnf_core.importing.mesh_file import read_mesh_file
 
@@ -39,9 +36,8 @@ _YCB_FRAMES = (
     # Repository and path, the keyframe of the videos 48 to 59, and its place among the video's keyframes.
     ("yuxng/PoseCNN/data/demo_images/000001-{}.png", 50, 1, 0),
     ("yuxng/PoseCNN/data/demo_images/000002-{}.png", 51, 1, 0),
-    ("yuxng/PoseCNN/data/demo_images/000003-{}.png", 53, 3, 2),
-    ("yuxng/PoseCNN/data/demo_images/000004-{}.png", 52, 3, 2),
     ("yuxng/PoseCNN/data/demo_images/000005-{}.png", 54, 1, 0),
+    ("GeeeG/CloudPose/data/{}.png", 50, 963, 92),
     ("agimus-project/happypose_ros/happypose_ros/test/{}/000629.png", 50, 629, 48),
 )
 _YCB_K = np.array([[1066.778, 0.0, 312.9869], [0.0, 1067.487, 241.3109], [0.0, 0.0, 1.0]])
@@ -52,6 +48,8 @@ _YCB_NAMES = (
     *("037_scissors", "040_large_marker", "051_large_clamp", "052_extra_large_clamp", "061_foam_brick"),
 )
 """Object 1 and the following."""
+_POSECNN_IDS = {19: 20, 20: 21}
+"""That demo knows no large clamp: its class 19 is the extra large one, its class 20 the foam brick."""
 _YCB_POSES = "DLR-RM/3DObjectTracking/M3T/data/ycb-video_poses.zip"
 _YCB_METHODS = ("cosypose", "posecnn_icp_rss2018", "posecnn_rss2018", "sundermeyer")
 
@@ -98,7 +96,7 @@ def lmo(repositories: Path, output: Path) -> None:
 
 
 def ycbv(repositories: Path, output: Path) -> None:
-    """Keyframes of six YCB-Video test videos: true poses, and those of five methods; and two training frames."""
+    """Five keyframes of three YCB-Video test videos: true poses, and those of five methods; and two training frames."""
     models = Models(output / "models")
     models.take(repositories / _MODELS / "ycbv" / "models")
     shifts = [_shift(repositories, models, obj_id) for obj_id in range(1, len(_YCB_NAMES) + 1)]
@@ -146,40 +144,31 @@ def posecnn(repositories: Path, output: Path) -> None:
         )
         objects = []
         for row, first, refined in zip(values["rois"], values["poses"], values["poses_refined"], strict=True):
-            obj_id = int(row[1])
-            objects.append(Placed(obj_id, _pose_of(refined, shifts[obj_id - 1]), values["labels"] == obj_id))
+            obj_id = _POSECNN_IDS.get(int(row[1]), int(row[1]))
+            objects.append(Placed(obj_id, _pose_of(refined, shifts[obj_id - 1]), values["labels"] == int(row[1])))
             before.append(_published(1, im_id, obj_id, _pose_of(first, shifts[obj_id - 1])))
         pictures[im_id] = (picture, objects)
     write_scene(output / "test" / "000001", pictures)
     write_csv(output / "published" / "posecnn_posecnn-test.csv", before)
 
 
-def m3t(repositories: Path, output: Path) -> None:
-    """Two frames of a stereo depth camera at 0.6 m: a flat triangular thing of 7 cm, its pose given
-    for a tracker's start."""
-    data = repositories / "DLR-RM/3DObjectTracking/M3T/data"
+def tyol(repositories: Path, output: Path) -> None:
+    """One frame of TYO-L: a thing of 0.34 m on a table, a depth camera at 0.7 m, its true pose."""
+    data = repositories / "m-pabst/surface-matching/data"
     models = Models(output / "models")
     models.folder.mkdir(parents=True, exist_ok=True)
-    mesh = read_mesh_file(data / "_body" / "triangle.obj")
-    vertices = 1000.0 * np.asarray(mesh.vertices, np.float64)
-    _write_ply(models.folder / "obj_000001.ply", vertices, np.asarray(mesh.faces))
-    apart = np.linalg.norm(vertices[:, None] - vertices[None], axis=2).max()
-    (models.folder / "models_info.json").write_text(json.dumps({"1": {"diameter": float(apart)}}))
-    numbers = {name: _numbers(data / f"{name}.yaml") for name in ("_sequence/depth_camera", "_body/triangle")}
-    start = _numbers(data / "_body" / "triangle_static_detector.yaml")["link2world_pose"]
-    camera = numbers["_sequence/depth_camera"]
-    pose = np.linalg.inv(camera["camera2world_pose"]) @ start @ numbers["_body/triangle"]["geometry2body_pose"]
-    pose[:3, 3] *= 1000.0
-    f_u, f_v, c_u, c_v = (float(camera[key]) for key in ("f_u", "f_v", "pp_x", "pp_y"))
-    K = np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
-    pictures = {}
-    for im_id in (200, 201):
-        picture = _picture(data / "_sequence" / f"depth_camera_image_{im_id}.png", 1.0, K, None)
-        pictures[im_id] = (picture, placed(picture, [models.mesh(1)], [1], [pose]))
-    write_scene(output / "test" / "000001", pictures)
+    shutil.copyfile(data / "obj.ply", models.folder / "obj_000019.ply")
+    corners = outermost(models.mesh(19)[0])
+    diameter = np.linalg.norm(corners[:, None] - corners[None], axis=2).max()
+    (models.folder / "models_info.json").write_text(json.dumps({"19": {"diameter": float(diameter)}}))
+    camera, (truth,) = (json.loads((data / f"scene_{name}.json").read_text())["10"] for name in ("camera", "gt"))
+    K = np.array(camera["cam_K"], np.float64).reshape(3, 3)
+    picture = _picture(data / "depth" / "000010.png", 1.0, K, data / "rgb" / "000010.png")
+    pose = matrix_of(truth["cam_R_m2c"], truth["cam_t_m2c"])
+    write_scene(output / "test" / "000019", {10: (picture, placed(picture, [models.mesh(19)], [19], [pose]))})
 
 
-SETS: dict[str, Callable[[Path, Path], None]] = {"lmo": lmo, "ycbv": ycbv, "posecnn": posecnn, "m3t": m3t}
+SETS: dict[str, Callable[[Path, Path], None]] = {"lmo": lmo, "ycbv": ycbv, "tyol": tyol, "posecnn": posecnn}
 
 
 # What they share.
@@ -238,31 +227,6 @@ def _with_meta(file: Path, models: Models, shifts: list[Array]) -> tuple[Picture
         poses.append(matrix_of(R.ravel().tolist(), 1000.0 * t + R @ shifts[obj_id - 1]))
     found = placed(picture, [models.mesh(obj_id) for obj_id in ids], ids, poses)
     return picture, [Placed(one.obj_id, one.pose, label == one.obj_id, one.silhouette) for one in found]
-
-
-def _numbers(file: Path) -> dict[str, Any]:
-    """The numbers and 4 x 4 matrices of a file as OpenCV writes them: `name: number` and `data: [ ... ]`."""
-    found: dict[str, Any] = {}
-    text = file.read_text()
-    for line in text.splitlines():
-        name, _, value = line.strip().partition(":")
-        with contextlib.suppress(ValueError):
-            found[name] = float(value)
-    for part in text.split("!!opencv-matrix")[1:]:
-        name = text.split(part)[0].rstrip().removesuffix("!!opencv-matrix").rstrip().removesuffix(":").split()[-1]
-        data = part.split("data:")[1].split("[")[1].split("]")[0]
-        found[name] = np.array([float(value) for value in data.split(",")]).reshape(4, 4)
-    return found
-
-
-def _write_ply(path: Path, vertices: Array, faces: NDArray[Any]) -> None:
-    head = (
-        f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = [" ".join(f"{value:.6g}" for value in vertex) for vertex in vertices]
-    rows += [f"3 {a} {b} {c}" for a, b, c in faces]
-    path.write_text(head + "\n".join(rows) + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

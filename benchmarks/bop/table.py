@@ -45,7 +45,7 @@ def summary(answers: Sequence[Answer], all_poses: Recall, accepted: Recall) -> s
 
 
 def listing(answers: Sequence[Answer], others: Sequence[tuple[str, Sequence[Answer]]] = ()) -> str:
-    """A row a detection; beside it ``surface`` of other methods for the same object and image."""
+    """A row a detection; beside it ``surface`` and ``explained`` of other methods for the same object and image."""
     names = "".join(f" {name} |" for name, _ in others)
     lines = [
         f"| scene | image | object | visible | verdict | reason | probability | surface | MSSD | MSPD, px | s |{names}",
@@ -56,18 +56,20 @@ def listing(answers: Sequence[Answer], others: Sequence[tuple[str, Sequence[Answ
             str(one.scene_id),
             str(one.im_id),
             str(one.obj_id),
-            "" if np.isnan(one.visible) else f"{100 * one.visible:.0f} %",
+            _share(one.visible),
             one.verdict,
             one.reason.split(":")[0],
             f"{one.probability:.3f}",
             _percent(one.surface) + (f" ({_percent(one.listed)})" if one.listed < one.surface else ""),
+            _share(one.explained),
             _percent(one.mssd),
             "" if np.isinf(one.mspd) else f"{one.mspd:.1f}",
             f"{one.seconds:.2f}",
         ]
         for _, theirs in others:
             same = [each for each in theirs if _place(each) == _place(one) and each.number in (one.number, None)]
-            cells.append(_percent(min((each.surface for each in same), default=float("inf"))))
+            best = min(same, key=lambda each: each.surface, default=None)
+            cells.append("none" if best is None else f"{_percent(best.surface)}, {_share(best.explained)}")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
@@ -100,3 +102,7 @@ def _median(values: Iterable[float]) -> float:
 
 def _percent(share: float) -> str:
     return "none" if np.isinf(share) else f"{100 * share:.1f} %"
+
+
+def _share(share: float) -> str:
+    return "" if np.isnan(share) else f"{100 * share:.0f} %"

@@ -161,16 +161,10 @@ def test_a_rendered_scene_says_what_is_visible(dataset: Path) -> None:
     rows, columns = np.nonzero(mask)
     assert hidden.box == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
     # Two renderers agree on what is seen of the thing at its true pose.
-    with_depth = Picture(_depth(found, 12), K)
+    with_depth = found.picture(1, 12)
     (again,) = placed(with_depth, [found.judged(3).mesh], [3], [hidden.pose])
     assert (again.visible & mask).sum() > 0.97 * (again.visible | mask).sum()
-    assert np.abs(rendered(found.judged(3).mesh, whole.pose, with_depth) - _depth(found, 7))[mask].max() < 0.2
-
-
-def _depth(dataset: Dataset, im_id: int) -> Array:
-    from PIL import Image
-
-    return np.asarray(Image.open(dataset.scene(1) / "depth" / f"{im_id:06d}.png")).astype(np.float64) / 10.0
+    assert np.abs(rendered(found.judged(3).mesh, whole.pose, with_depth) - found.picture(1, 7).depth)[mask].max() < 0.2
 
 
 def test_recall_counts_targets_without_an_answer(dataset: Path) -> None:
