@@ -88,7 +88,10 @@ def recorded_scene(
     frame = own[0] if own else max(frames, key=lambda one: _shown(one, box))
     camera = CameraView(frame.name, Sim3.from_matrix(frame.T_world_camera.tolist()), METERS.get(unit))
     known = replace(options, robust=replace(options.robust, object_unit=unit))
-    return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), recording.notes)
+    notes = recording.notes
+    if unit in METERS and options.robust.object_unit == "auto":
+        notes += (f"the object's unit is taken to be {unit}, by its size: say --object-unit, or --scale free",)
+    return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), notes)
 
 
 def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:
