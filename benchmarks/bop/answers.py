@@ -88,9 +88,11 @@ def judged(dataset: Dataset, answer: Answer) -> Answer:
 
 def _explained(dataset: Dataset, answer: Answer, truth: Truth, pose: Array, mesh: Mesh) -> float:
     mask = dataset.mask(answer.scene_id, answer.im_id, truth.number)
+    if mask is None:
+        return float("nan")
     picture = dataset.picture(answer.scene_id, answer.im_id)
-    measured = (picture.depth > 0.0) if mask is None else mask & (picture.depth > 0.0)
-    if mask is None or not measured.any():
+    measured = mask & (picture.depth > 0.0)
+    if not measured.any():
         return float("nan")
     apart = np.abs(rendered(mesh, pose, picture) - picture.depth)
     return float((apart[measured] <= _NEAR).mean())

@@ -17,6 +17,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -95,6 +96,26 @@ def lmo(repositories: Path, output: Path) -> None:
     write_csv(output / "published" / "megapose_lmo-test.csv", theirs)
 
 
+def lmo_truth(repositories: Path, output: Path) -> None:
+    """The true poses of all of LM-O, without images: for judging poses of others by BOP's errors."""
+    lmo_models = Models(output / "models")
+    lmo_models.take(repositories / _MODELS / "lm" / "models", [repositories / _EXAMPLE / "obj_000005.ply"])
+    K = json.loads((repositories / _EXAMPLE / "camera.json").read_text())["cam_K"]
+    truths: dict[str, list[dict[str, Any]]] = {}
+    for one in read_csv(_one(repositories / _RESULTS, "gt-*_lmo-test_*.csv")):
+        pose = one.matrix
+        assert pose is not None
+        row = {"cam_R_m2c": pose[:3, :3].ravel().tolist(), "cam_t_m2c": pose[:3, 3].tolist(), "obj_id": one.obj_id}
+        truths.setdefault(str(one.im_id), []).append(row)
+    scene = output / "test" / "000002"
+    scene.mkdir(parents=True, exist_ok=True)
+    (scene / "scene_gt.json").write_text(json.dumps(truths))
+    (scene / "scene_camera.json").write_text(json.dumps({im_id: {"cam_K": K} for im_id in truths}))
+    theirs = _one(repositories / _RESULTS, "cnos-fastsammegapose_lmo-*.csv")
+    (output / "published").mkdir(exist_ok=True)
+    shutil.copyfile(theirs, output / "published" / "megapose_lmo-test.csv")
+
+
 def ycbv(repositories: Path, output: Path) -> None:
     """Five keyframes of three YCB-Video test videos: true poses, and those of five methods; and two training frames."""
     models = Models(output / "models")
@@ -168,7 +189,13 @@ def tyol(repositories: Path, output: Path) -> None:
     write_scene(output / "test" / "000019", {10: (picture, placed(picture, [models.mesh(19)], [19], [pose]))})
 
 
-SETS: dict[str, Callable[[Path, Path], None]] = {"lmo": lmo, "ycbv": ycbv, "tyol": tyol, "posecnn": posecnn}
+SETS: dict[str, Callable[[Path, Path], None]] = {
+    "lmo": lmo,
+    "lmo_truth": lmo_truth,
+    "ycbv": ycbv,
+    "tyol": tyol,
+    "posecnn": posecnn,
+}
 
 
 # What they share.
