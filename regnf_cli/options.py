@@ -296,7 +296,7 @@ SceneDescription = Annotated[
 ]
 
 ObjectUnit = Annotated[
-    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 3 %.")
+    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 1 %.")
 ]
 Scale = Annotated[
     Literal["known", "free"], typer.Option(help="free: whatever the object's unit is, the scale is not known.")

@@ -46,7 +46,7 @@ def mask_of(value: Any, size: Size | None = None) -> Mask:
             with Image.open(io.BytesIO(data), formats=_MASK_FORMATS) as image:
                 if image.width * image.height <= MOST_PIXELS:
                     return np.asarray(image.convert("L")) > 0
-        except (OSError, ValueError, SyntaxError) as error:
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise InvalidDetectionError(f"the mask is no image as base64: {error}"[:200]) from error
     raise InvalidDetectionError("the mask is no file, no image as base64 and no run lengths of COCO", hint=HINT)
 

@@ -21,6 +21,7 @@ MOST_PIXELS = 1 << 25
 _FARTHEST = 1e6
 """Camera positions beyond are no meters."""
 _NOT_RIGID = 0.02
+_MILLIMETER, _EIGHT_BITS = 0.001, 255.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,12 @@ class StoredFrame:
     def read(self, color: bool = True) -> Frame:
         """Raises DatasetError (DATASET_IMAGE_INVALID, DATASET_INTRINSICS_INVALID, ...) naming the frame."""
         depth = self.depth()
-        camera = self.camera.of_size((depth.shape[0], depth.shape[1]), self.name).check(self.name)
+        size, given = (depth.shape[0], depth.shape[1]), self.camera
+        if given.size is None and self.color is not None and not given.is_central(size):
+            # Phones and ROS drivers give the color's intrinsics beside a smaller depth image.
+            height, width = self.color().shape[:2]
+            given = given.of_size((height, width), self.name) if given.is_central((height, width)) else given
+        camera = given.of_size(size, self.name).check(self.name)
         camera, depth = _without_lens(camera, depth)
         if self.along_ray:
             rows, columns = np.indices(depth.shape) + 0.5
@@ -91,7 +97,7 @@ class StoredFrame:
         if not color or self.color is None:
             return frame
         picture = self.color()
-        taken = (self.color_camera or self.camera).of_size((picture.shape[0], picture.shape[1]), self.name)
+        taken = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
         taken, picture = _without_lens(taken.check(self.name), picture)
         return replace(frame, color=picture, color_camera=taken)
 
@@ -137,17 +143,24 @@ class Recording:
             frame = self.frames[index].read()
             gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
             frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
-        shapes = [frame.depth.shape for frame in frames]
-        shape = max(set(shapes), key=shapes.count)
-        frames = [frame for frame in frames if frame.depth.shape == shape]
-        return PosedImages(
-            colors=np.stack([frame.color for frame in frames if frame.color is not None]),
-            intrinsics=np.stack([frame.camera.K for frame in frames]),
-            T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
-            bounds=bounds,
-            depths=np.stack([frame.depth for frame in frames]),
-            T_metric_world=self.T_metric_world,
-        )
+        return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
+
+
+def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
+    """Frames as images of one size, the most common among them; gray where a frame has no color of that size. bounds:
+    (2, 3), world."""
+    shapes = [frame.depth.shape for frame in frames]
+    shape = max(set(shapes), key=shapes.count)
+    frames = [frame for frame in frames if frame.depth.shape == shape]
+    gray = np.full((*shape, 3), 128, np.uint8)
+    colors = [gray if one.color is None or one.color.shape[:2] != shape else one.color for one in frames]
+    return PosedImages(
+        colors=np.stack(colors),
+        intrinsics=np.stack([frame.camera.K for frame in frames]),
+        T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
+        bounds=bounds,
+        depths=np.stack([frame.depth for frame in frames]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +197,11 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
         depth = read_depth(path, checked_size(path), unit)
         if unit is not None and path.suffix.lower() == ".npy" and _whole_numbers(path):
             depth = depth * np.float32(unit)
+        if unit is not None and unit <= _MILLIMETER and 0.0 < depth.max() <= _EIGHT_BITS * unit:
+            raise DatasetError(
+                f"{path.name}: its depths are whole numbers up to {round(depth.max() / unit)}: an image of 8 bits",
+                reason="DATASET_IMAGE_INVALID",
+            )
         return depth
 
     return read
@@ -232,8 +250,8 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
         given = np.array(matrix, np.float64)
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{name}: the pose is not numbers", reason="DATASET_POSE_NOT_RIGID") from error
-    if given.shape == (16,):
-        given = given.reshape(4, 4)
+    if given.shape in ((16,), (12,)):
+        given = given.reshape(-1, 4)
     if given.shape not in ((4, 4), (3, 4)):
         raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")
     if not np.isfinite(given).all():
