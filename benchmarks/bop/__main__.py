@@ -4,7 +4,8 @@
         [--limit N] [--method regnf ransac_icp] [--results CSV ...]
 
 A target is looked for where the detector of --detections says; else in the mask of what is visible of it, or with
---boxes in the box round that. --results judges poses of other methods in BOP's form, in the same table.
+--boxes in the box round that. --results judges poses of other methods in BOP's form, in the same table, --answers those
+of an earlier run.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.bop.answers import Answer, judged, read_csv, recall, write_answers, write_csv
+from benchmarks.bop.answers import Answer, judged, read_answers, read_csv, recall, write_answers, write_csv
 from benchmarks.bop.dataset import Dataset, Detections
 from benchmarks.bop.registering import METHODS, register_all
 from benchmarks.bop.table import listing, summary
@@ -47,6 +48,8 @@ def _run(dataset: Dataset, asked: argparse.Namespace) -> None:
         write_csv(asked.output / f"{method.replace('_', '')}_{dataset.folder.name}-{dataset.split}.csv", answers)
         write_answers(asked.output / f"{method}.jsonl", answers)
         found.append((method, answers))
+    for file in asked.answers:
+        found.append((file.stem, [judged(dataset, one) for one in read_answers(file)]))
     wanted = {(one.scene_id, one.im_id, one.obj_id) for one in targets}
     for file in asked.results:
         given = [one for one in read_csv(file) if (one.scene_id, one.im_id, one.obj_id) in wanted]
@@ -75,6 +78,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--limit", type=int, help="so many targets, the first ones")
     parser.add_argument("--method", nargs="*", choices=METHODS, default=["regnf"])
     parser.add_argument("--results", nargs="*", type=Path, default=[], help="poses of other methods, BOP's CSV")
+    parser.add_argument(
+        "--answers", nargs="*", type=Path, default=[], help="METHOD.jsonl of earlier runs, judged again"
+    )
     parser.add_argument("--width", type=int, default=640, help="of the images, pixels, for the limits of MSPD")
     parser.add_argument("--seed", type=int, default=0)
     return parser

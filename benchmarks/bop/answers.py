@@ -30,8 +30,8 @@ class Answer:
     the processor, for this detection alone · number, visible: of the true object, the share of its silhouette that is
     seen.
     Errors: mssd, surface (see :func:`surfaces_apart`) in diameters, listed: the least ``surface`` of the pose and the
-    others · mspd: pixels. Without a truth: explained, the share of the visible pixels whose measured point lies within
-    5 mm of the placed surface, along the camera's axis.
+    others; spread: how far the others' surfaces are from that of the pose · mspd: pixels. Without a truth: explained,
+    the share of the visible pixels whose measured point lies within 5 mm of the placed surface, along the axis.
     """
 
     scene_id: int
@@ -50,6 +50,7 @@ class Answer:
     mspd: float = float("inf")
     surface: float = float("inf")
     listed: float = float("inf")
+    spread: float = 0.0
     explained: float = float("nan")
 
     @property
@@ -82,6 +83,7 @@ def judged(dataset: Dataset, answer: Answer) -> Answer:
         mspd=mspd(pose, nearest.pose, known.vertices, known.symmetries, K),
         surface=surfaces[0],
         listed=min(surfaces),
+        spread=max((surfaces_apart(pose, each, known.mesh) / known.diameter for each in poses[1:]), default=0.0),
         explained=_explained(dataset, answer, nearest, pose, known.mesh),
     )
 
@@ -170,6 +172,15 @@ def read_csv(path: Path) -> list[Answer]:
             flat = tuple(pose.ravel().tolist())
             answers.append(Answer(scene_id, im_id, obj_id, "registered", "", float(row["score"]), flat))
     return answers
+
+
+def read_answers(path: Path) -> list[Answer]:
+    """What :func:`write_answers` wrote."""
+    rows = (json.loads(line) for line in path.read_text().splitlines())
+    poses = (
+        {**row, "pose": row["pose"] and tuple(row["pose"]), "others": tuple(map(tuple, row["others"]))} for row in rows
+    )
+    return [Answer(**row) for row in poses]
 
 
 def write_answers(path: Path, answers: Sequence[Answer]) -> None:

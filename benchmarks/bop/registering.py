@@ -12,7 +12,6 @@ import torch
 from benchmarks.bop.answers import Answer
 from benchmarks.bop.dataset import Dataset, Detections, Target
 from benchmarks.bop.errors import Array
-from benchmarks.peers.clouds import VOXEL
 from benchmarks.peers.interface import PeerCase
 from benchmarks.peers.open3d_peers import RansacIcp
 from regnf_core import RegistrationOptions, RegistrationResult, SdfField, Sim3, open_field, register
@@ -30,6 +29,8 @@ from regnf_fit.images.recorded_scene import recorded_scene
 
 METHODS = ("regnf", "ransac_icp")
 _MILLIMETERS = RegistrationOptions(robust=RobustOptions(object_unit="mm"))
+_VOXELS, _AGREES = (0.08, 0.16, 0.25), 5.0
+"""Of RANSAC: root mean square radii of the object; mm."""
 _NORMAL_NEIGHBORS = 30
 _NO_POSE = Answer(0, 0, 0, "failed")
 
@@ -113,20 +114,28 @@ def _rigid(T_camera_object: Sim3, result: RegistrationResult) -> tuple[float, ..
 
 
 def _ransac_icp(frame: Recording, detection: ImageDetection, known: Known, seed: int) -> Answer:
-    """Open3D's on the lifted points, at the known scale."""
+    """Open3D's on the lifted points, at the known scale; of three sizes of voxels the pose that most points agree
+    with."""
     lifted = lift(frame.frames[0].read(), detection, 0.001 * known.diameter)
+    points = torch.from_numpy(1000.0 * lifted.points)
     work, samples = known.model.frame, known.model.samples
     obj = SurfaceSamples(work.out_of(samples.points), samples.normals.double())
     spread = float((obj.points - obj.points.mean(0)).square().sum(-1).mean().sqrt())
-    scene = _with_normals(1000.0 * lifted.points, 0.5 * VOXEL * spread)
-    case = PeerCase("", known.field, known.field, lifted.box, Sim3.identity(), Symmetries(), 0.0, scene, obj, 0.0, 0)
-    found = RansacIcp(normalized=False, scaled=False).register(case, seed)
-    if found.T_object_scene is None:
-        raise InitializationError("no pose was found")
-    T = found.T_object_scene.inverse()
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = T.rotation.numpy(), T.translation.numpy()
-    return Answer(0, 0, 0, "registered", found.note, 1.0, tuple(pose.ravel().tolist()))
+    best = Answer(0, 0, 0, "failed", "NO_INITIAL_TRANSFORM")
+    for voxel in _VOXELS:
+        scene = _with_normals(points.numpy(), 0.5 * voxel * spread)
+        field, nowhere = known.field, Sim3.identity()
+        given = PeerCase("", field, field, lifted.box, nowhere, Symmetries(), 0.0, scene, obj, 0.0, 0)
+        try:
+            T = RansacIcp(normalized=False, scaled=False, voxel=voxel).register(given, seed).T_object_scene
+        except InitializationError:
+            continue
+        assert T is not None
+        agreeing = float((known.field.signed_distance(T.apply(points).float()).abs() <= _AGREES).double().mean())
+        if agreeing > best.probability:
+            flat = tuple(T.inverse().matrix().flatten().tolist())
+            best = Answer(0, 0, 0, "registered", f"{100.0 * agreeing:.0f} % agree", agreeing, flat)
+    return best
 
 
 def _with_normals(points: Array, voxel: float) -> SurfaceSamples:

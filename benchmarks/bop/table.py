@@ -22,11 +22,12 @@ def summary(answers: Sequence[Answer], all_poses: Recall, accepted: Recall) -> s
         f"{all_poses.targets} targets, {len(answers)} detections. AR of MSSD {all_poses.mssd:.3f}, of MSPD"
         f" {all_poses.mspd:.3f}; of accepted poses alone {accepted.mssd:.3f}, {accepted.mspd:.3f}.",
         "",
-        f"Right: no point of the placed surface is farther than {100 * RIGHT:.0f} % of the diameter from the true one.",
+        f"Right: no point of the placed surface is farther than {100 * RIGHT:.0f} % of the diameter from the true one."
+        " One surface: all poses that an ambiguous answer lists place the same one, within as much.",
         "",
-        "| visible | detections | right | right and registered | right and ambiguous | right and rejected |"
-        " wrong and registered | no pose |",
-        "|---|---|---|---|---|---|---|---|",
+        "| visible | detections | right | right and registered | right and ambiguous: one surface | several surfaces |"
+        " right and rejected | wrong and registered | no pose |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     bands = [(name, [one for one in answers if within(one.visible)]) for name, within in _BANDS]
     for name, some in [*bands, ("all", list(answers))]:
@@ -76,9 +77,14 @@ def listing(answers: Sequence[Answer], others: Sequence[tuple[str, Sequence[Answ
 
 def _counts(answers: Sequence[Answer]) -> tuple[int, ...]:
     right = [one for one in answers if one.right]
+    ambiguous = [one for one in right if one.verdict == "ambiguous"]
+    same = sum(one.spread <= RIGHT for one in ambiguous)
     return (
         len(right),
-        *(sum(one.verdict == verdict for one in right) for verdict in ("registered", "ambiguous", "rejected")),
+        sum(one.verdict == "registered" for one in right),
+        same,
+        len(ambiguous) - same,
+        sum(one.verdict == "rejected" for one in right),
         sum(one.verdict == "registered" and not one.right for one in answers),
         sum(one.pose is None for one in answers),
     )
