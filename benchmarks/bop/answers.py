@@ -31,7 +31,8 @@ class Answer:
     seen.
     Errors: mssd, surface (see :func:`surfaces_apart`) in diameters, listed: the least ``surface`` of the pose and the
     others; spread: how far the others' surfaces are from that of the pose · mspd: pixels. Without a truth: explained,
-    the share of the visible pixels whose measured point lies within 5 mm of the placed surface, along the axis.
+    the share of the visible pixels whose measured point lies within 5 mm of the placed surface, along the axis;
+    truth_explains: the same at the true pose.
     """
 
     scene_id: int
@@ -52,6 +53,7 @@ class Answer:
     listed: float = float("inf")
     spread: float = 0.0
     explained: float = float("nan")
+    truth_explains: float = float("nan")
 
     @property
     def matrix(self) -> Array | None:
@@ -85,6 +87,7 @@ def judged(dataset: Dataset, answer: Answer) -> Answer:
         listed=min(surfaces),
         spread=max((surfaces_apart(pose, each, known.mesh) / known.diameter for each in poses[1:]), default=0.0),
         explained=_explained(dataset, answer, nearest, pose, known.mesh),
+        truth_explains=_explained(dataset, answer, nearest, nearest.pose, known.mesh),
     )
 
 

@@ -62,7 +62,7 @@ def listing(answers: Sequence[Answer], others: Sequence[tuple[str, Sequence[Answ
             one.reason.split(":")[0],
             f"{one.probability:.3f}",
             _percent(one.surface) + (f" ({_percent(one.listed)})" if one.listed < one.surface else ""),
-            _share(one.explained),
+            f"{_share(one.explained)} ({_share(one.truth_explains)})",
             _percent(one.mssd),
             "" if np.isinf(one.mspd) else f"{one.mspd:.1f}",
             f"{one.seconds:.2f}",
