@@ -54,17 +54,17 @@ class _View:
     margin: NDArray[np.float32]
 
 
-def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None) -> SdfField:
+def focused_field(
+    frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None, spread: float = 0.0
+) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
     voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
     nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
+    spread: a standard deviation of depths from frame to frame, beside the noise of each.
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image measured a surface in the region.
     """
-    half = region.size.numpy() / 2.0
-    T_region_world = np.eye(4)
-    T_region_world[:3, :3] = region.rotation.numpy().T
-    T_region_world[:3, 3] = -T_region_world[:3, :3] @ region.center.numpy()
+    T_region_world, half = region_frame(region)
     views = [view for frame in frames if (view := _view(frame, T_region_world, half)) is not None]
     if not views:
         raise DatasetError("no depth image shows a surface in the region", reason="DATASET_NOTHING_IN_BOUNDS")
@@ -74,7 +74,7 @@ def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | N
     low = -half
     axes = (low[k] + edge * np.arange(shape[k]) for k in range(3))
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    free, behind = _carved(nodes, views, edge)
+    free, behind = _carved(nodes, views, edge, spread)
     values = _distances(nodes, points, normals, behind, low, edge, shape)
     observation = _observation(points, free.reshape(shape), low, edge, shape)
     high = low + edge * (np.array(shape) - 1)
@@ -82,6 +82,20 @@ def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | N
     function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step), origin, top, 1.0)
     field = ObservedField(FunctionField(function, torch.from_numpy(np.stack([low, high]))), observation)
     return TransformedField(field, Sim3.from_matrix(T_region_world.tolist()))
+
+
+def region_frame(region: OrientedBox) -> tuple[Floats, Floats]:
+    """T_region_world (4, 4), whose axes are the region's and whose origin is its middle, and half of its size (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = region.rotation.numpy().T
+    T[:3, 3] = -T[:3, :3] @ region.center.numpy()
+    return T, region.size.numpy() / 2.0
+
+
+def surface_in(frame: Frame, T_region_world: Floats, half: Floats, around: float = 0.0) -> tuple[Floats, Floats]:
+    """Points and normals (P, 3) that a frame measured in a region and ``around`` it, in the region's frame."""
+    view = _view(frame, T_region_world, half + around)
+    return (np.zeros((0, 3)), np.zeros((0, 3))) if view is None else (view.points, view.normals)
 
 
 def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
@@ -104,7 +118,7 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
     inside = (np.abs(points) <= half).all(axis=1)
     if not inside.any():
         return None
-    normals = planes.normals[row[inside], column[inside]] @ T_region_camera[:3, :3].T
+    normals = planes.normals[row[inside], column[inside]].astype(np.float64) @ T_region_camera[:3, :3].T
     return _View(points[inside], normals, T_camera_region, K, kept, planes.deviations)
 
 
@@ -127,7 +141,7 @@ def _pixel_width(views: Sequence[_View]) -> float:
 
 
 def _carved(
-    nodes: NDArray[np.float32], views: Sequence[_View], edge: float
+    nodes: NDArray[np.float32], views: Sequence[_View], edge: float, spread: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which nodes (N, 3) an image looked through, and which lie behind what one measured, in no image before it."""
     free, behind = np.zeros(len(nodes), np.bool_), np.zeros(len(nodes), np.bool_)
@@ -143,7 +157,7 @@ def _carved(
         measured = one.depth.ravel()[pixel]
         shown &= measured > 0.0
         gap = measured - local[:, 2]
-        free |= shown & (gap > _MARGIN * (edge + one.margin.ravel()[pixel]))
+        free |= shown & (gap > _MARGIN * (edge + spread + one.margin.ravel()[pixel]))
         behind |= shown & (gap < 0.0)
     return free, behind & ~free
 

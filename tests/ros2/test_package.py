@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +62,15 @@ class Answers:
         return httpx.Response(200, json={"id": "j1", "status": "successful"})
 
 
-def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request], httpx.Response], **given: Any) -> Any:
+def make_node(monkeypatch: pytest.MonkeyPatch, answers: Any, **given: Any) -> Any:
+    """answers: a function of requests, or a transport."""
     monkeypatch.setenv("REGNF_API_TOKEN", "open-sesame")
     usual = {"server": "http://127.0.0.1:1", "scene": SCENE, "objects": f"chair={CHAIR}"}
     monkeypatch.setattr(Node, "given", usual | given)
-    service, transport = part("service").Service, httpx.MockTransport(answers)
+    service = part("service").Service
+    transport = answers if isinstance(answers, httpx.BaseTransport) else httpx.MockTransport(answers)
     monkeypatch.setattr(part("node"), "Service", lambda address, token: service(address, token, transport))
-    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self: None)
+    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self, *what: None)
     return part("node").RegisterObjects()
 
 
@@ -77,6 +80,16 @@ def answered(monkeypatch: pytest.MonkeyPatch, document: Any = None, **given: Any
     node = make_node(monkeypatch, answers, **given)
     node.answer(detections())
     return node, answers.requests[0]
+
+
+@cache
+def contract() -> Any:
+    return yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))["components"]
+
+
+def contract_takes(schema: str, request: dict[str, Any]) -> None:
+    reference = {"$ref": f"#/components/schemas/{schema}", "components": contract()}
+    Draft202012Validator(reference).validate(request)
 
 
 def detections(class_id: str = "chair", frame: str = "map") -> Any:
@@ -117,9 +130,7 @@ def test_a_pose_is_published_in_the_map_with_its_frame(monkeypatch: pytest.Monke
 
 def test_the_request_is_one_that_the_contract_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     _, request = answered(monkeypatch, up_axis="z")
-    contract = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
-    schema = {"$ref": "#/components/schemas/RegisterRequest", "components": contract["components"]}
-    Draft202012Validator(schema).validate(request)
+    contract_takes("RegisterRequest", request)
     assert (request["scene"], request["object"], request["options"]) == (SCENE, CHAIR, {"up_axis": "z"})
     assert (request["detection"]["center"], request["detection"]["size"]) == ([1.0, 0.0, 0.0], [0.5, 0.6, 0.7])
 
@@ -132,6 +143,19 @@ def test_objects_in_meters_bound_the_scale(monkeypatch: pytest.MonkeyPatch, tmp_
     bounds = pytest.approx({"min_scale": 3.88, "max_scale": 4.12})  # an object's meters for each of the field's units
     assert quarter["options"]["robust"] == bounds
     assert metric["options"]["robust"] == {"min_scale": 1.0, "max_scale": 1.0}
+    _, inches = answered(monkeypatch, scale_tolerance="0.1", object_unit="in")
+    bounds = {name: pytest.approx(share / 0.0254) for name, share in (("min_scale", 0.9), ("max_scale", 1.1))}
+    assert inches["options"]["robust"] == {"object_unit": "in", **bounds}
+    _, known = answered(monkeypatch, object_unit="mm")
+    assert known["options"]["robust"] == {"object_unit": "mm"}
+    _, scaled = answered(monkeypatch, dataparser_transforms=str(file), object_unit="mm")
+    assert {name: scaled["options"]["robust"][name] for name in ("min_scale", "max_scale")} == pytest.approx(
+        {"min_scale": 3960.0, "max_scale": 4040.0}
+    )
+    _, free = answered(monkeypatch, object_unit="free", scale_tolerance="0.1")
+    assert free["options"]["robust"] == {"object_unit": "free"}
+    with pytest.raises(ValueError, match="object_unit: 'ft' is none of auto, free, m, cm, mm, in"):
+        make_node(monkeypatch, Answers(result()), object_unit="ft")
     for wrong in ("-0.1", "1", "nan", "little"):
         with pytest.raises(ValueError, match=r"scale_tolerance|could not convert"):
             make_node(monkeypatch, Answers(result()), scale_tolerance=wrong)
@@ -358,7 +382,9 @@ def test_the_launch_file_gives_each_parameter_of_the_node() -> None:
     made = runpy.run_path(str(PACKAGE / "launch" / "regnf.launch.py"))["generate_launch_description"]()
     *declared, node = made
     names = {one.arguments[0] for one in declared}
-    assert names == set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
+    topics = {topic: name.arguments[0] for topic, name in node.named["remappings"]}
+    assert set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
+    assert names == set(part("node").PARAMETERS) | set(topics.values())
     assert (node.named["package"], node.named["executable"]) == ("regnf_ros", "register_objects")
 
 

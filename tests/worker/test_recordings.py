@@ -72,7 +72,7 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
     [
         ({"after": SHA, "frame": "depth"}, frame(), "DATASET_FRAMES_INVALID"),
         ({"after": SHA, "frame": "left"}, frame(png(np.full((24, 32), 700, np.uint16))), "DATASET_SIZES_DIFFER"),
-        ({"after": "c" * 64, "frame": "left"}, frame(), "RECORDING_NOT_FOUND"),
+        ({"after": "c" * 64, "frame": "left"}, frame(), "FIELD_NOT_FOUND"),
         ({}, frame(png(np.zeros(SIZE, np.uint16))), "DATASET_DEPTH_MISSING"),
         ({}, frame(cx=900.0), "DATASET_INTRINSICS_INVALID"),
         ({}, frame(T_world_camera=np.diag([1, 1, -1, 1]).tolist()), "DATASET_POSE_NOT_RIGID"),

@@ -164,7 +164,7 @@ def _joined(context: Context, field: FieldRecord, report: dict[str, Any], folder
     before, name = reference_of(field.owner, field.description["after"]), str(field.description["frame"])
     known, made = context.records.get_field(before), folder / "field.safetensors"
     if known is None or known.state != "ready":
-        raise DatasetError("the recording that the frame was added to was deleted", reason="RECORDING_NOT_FOUND")
+        raise DatasetError("the recording that the frame was added to was deleted", reason="FIELD_NOT_FOUND")
     with context.blobs.local_copy(view_key(before, made.name)) as first:
         joined_recordings(first, made, name, made)
     return joined_reports(known.report, report, name)

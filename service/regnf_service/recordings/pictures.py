@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from pathlib import PurePosixPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from regnf_service.problem import Problem
 
@@ -38,7 +38,8 @@ def frame_picture(file: BinaryIO, wanted: str) -> bytes:
     image = Image.frombytes("RGB" if kind == "color" else "I;16", (shape[2], shape[1]), data)
     if kind == "depth":
         steps = image.convert("I")
-        farthest = max(1, steps.getextrema()[1])
+        ends: Any = steps.getextrema()
+        farthest = max(1, ends[1])
         image = steps.point(lambda step: step * (255.0 / farthest)).convert("L")
     held = io.BytesIO()
     image.save(held, "PNG", compress_level=_FAST)

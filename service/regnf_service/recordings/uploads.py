@@ -99,21 +99,19 @@ class FrameUpload(Upload):
         return await self.finish()
 
 
-class _Pipe:
+class _Pipe(bytearray):
     """What a zip file is written into."""
 
-    def __init__(self) -> None:
-        self._held = bytearray()
-
     def write(self, data: bytes) -> int:
-        self._held += data
+        self.extend(data)
         return len(data)
 
     def flush(self) -> None:
         """Nothing waits."""
 
-    def take(self) -> bytearray:
-        held, self._held = self._held, bytearray()
+    def take(self) -> bytes:
+        held = bytes(self)
+        self.clear()
         return held
 
 

@@ -54,6 +54,11 @@ _PATCHES = (JSON, "application/merge-patch+json")
 _NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
 _PRIVATE_HOUR = "private, max-age=3600"
+FIELD_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"headers": {"ETag": header("For If-None-Match.")}},
+    304: NOT_MODIFIED,
+    **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
+}
 _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
     304: NOT_MODIFIED,
@@ -74,11 +79,7 @@ def require_field(services: Services, caller: str, sha256: str) -> FieldRecord:
     "/fields/{sha256}",
     summary="A field's state and what its import found",
     response_model=FieldDocument,
-    responses={
-        200: {"headers": {"ETag": header("For If-None-Match.")}},
-        304: NOT_MODIFIED,
-        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
-    },
+    responses=FIELD_ANSWERS,
 )
 async def get_field(
     sha256: str,

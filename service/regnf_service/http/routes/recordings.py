@@ -22,7 +22,6 @@ from regnf_service.http.body import (
     PageTokenQuery,
     PrefixDep,
     ServicesDep,
-    WaitQuery,
     boundary_of,
     read_parts,
 )
@@ -37,10 +36,9 @@ from regnf_service.http.routes.documentation import (
     PIECE_REFUSALS,
     UPLOAD_REFUSALS,
     get_and_head,
-    header,
     refusals,
 )
-from regnf_service.http.routes.fields import delete_field, get_field, require_field
+from regnf_service.http.routes.fields import FIELD_ANSWERS, delete_field, get_field, require_field
 from regnf_service.http.routes.uploads import (
     ANSWERS,
     UPLOAD_BYTES,
@@ -154,9 +152,12 @@ async def _taken(
             received = await receive_raw(request, services, upload, digest)
             return await store_upload(services, caller, upload, received, as_)
         frame = await stack.enter_async_context(FrameUpload(services, claim))
-        parts = await _receive_parts(request, frame, digest, ("camera", "name") if as_.said else ("camera", "upload"))
-        if "upload" in parts:
+        parts = await _receive_parts(request, frame, digest)
+        if parts.keys() == {"upload"} and not as_.said:
             return await finish_pieces(services, caller, named_upload(parts["upload"]), as_, RecordingUpload)
+        wanted = ["camera", "depth"] + (["name"] if as_.said else [])
+        if sorted(parts.keys() - {"color"}) != wanted:
+            raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and color if there is one.")
         texts = {"camera.json": camera_of(parts)}
         if as_.said:
             name = parts["name"].decode("utf-8", "replace")
@@ -167,20 +168,13 @@ async def _taken(
         return await store_upload(services, caller, frame, await frame.finish_frame(texts), as_)
 
 
-async def _receive_parts(
-    request: Request, frame: FrameUpload, digest: str | None, texts: tuple[str, str]
-) -> dict[str, bytes]:
-    """The parts of a frame, or `upload` alone. Raises Problem."""
+async def _receive_parts(request: Request, frame: FrameUpload, digest: str | None) -> dict[str, bytes]:
     body.refuse_encoding(request)
     data = body.chunks(request, FRAME_BYTES + 2 * CAMERA_BYTES)
-    most = dict(zip(texts, (CAMERA_BYTES, UPLOAD_BYTES), strict=True))
-    sent = data if digest is None else compared(data, digest)
-    parts = await read_parts(sent, boundary_of(request), frame.images, most)
-    missing = {"depth", *texts} - parts.keys() - {"upload"}
-    if missing if "upload" not in parts else len(parts) > 1:
-        told = "`upload` comes alone." if "upload" in parts else f"The part `{min(missing)}` is missing."
-        raise Problem("MALFORMED_MULTIPART", told)
-    return parts
+    texts = {"camera": CAMERA_BYTES, "name": UPLOAD_BYTES, "upload": UPLOAD_BYTES}
+    return await read_parts(
+        data if digest is None else compared(data, digest), boundary_of(request), frame.images, texts
+    )
 
 
 def camera_of(parts: Mapping[str, bytes]) -> bytes:
@@ -207,27 +201,22 @@ def list_recordings(
     return JSONResponse({"recordings": documents, "next_page_token": encode_token(found.rest)})
 
 
-@get_and_head(
+get_and_head(
     router,
     "/recordings/{sha256}",
+    name="get_recording",
     summary="A recording's state and what its import found",
     response_model=FieldDocument,
-    responses={
-        200: {"headers": {"ETag": header("For If-None-Match.")}},
-        304: NOT_MODIFIED,
-        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
-    },
-)
-async def get_recording(
-    sha256: str,
-    services: ServicesDep,
-    caller: CallerDep,
-    prefix: PrefixDep,
-    held: IfNoneMatchDep,
-    wait: WaitQuery = 0,
-) -> Response:
-    """The same as `GET /fields/{sha256}`."""
-    return await get_field(sha256, services, caller, prefix, held, wait)
+    responses=FIELD_ANSWERS,
+)(get_field)
+router.delete(
+    "/recordings/{sha256}",
+    name="delete_recording",
+    summary="Forget a recording and its bytes",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE", "FIELD_IN_LIBRARY"),
+)(delete_field)
 
 
 @get_and_head(
@@ -264,10 +253,3 @@ def _picture(services: Services, record: FieldRecord, name: str) -> bytes:
     except FileNotFoundError:
         pass  # it was deleted
     raise Problem("RECORDING_FRAME_NOT_FOUND")
-
-
-@router.delete("/recordings/{sha256}", summary="Forget a recording and its bytes", status_code=204,
-               response_class=Response, responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"))  # fmt: skip
-async def delete_recording(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
-    """Refused while an active job needs the recording. Results of finished jobs stay."""
-    return await delete_field(sha256, services, caller)

@@ -25,6 +25,7 @@ from regnf_service.http.body import (
     CallerDep,
     PrefixDep,
     ServicesDep,
+    Sink,
     boundary_of,
     read_json,
     read_parts,
@@ -228,14 +229,16 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         files = {name: await stack.enter_async_context(Upload(services, claim)) for name in _ROLES}
         configs = {name: await stack.enter_async_context(SettingsUpload(services, claim)) for name in _ROLES}
         frame = await stack.enter_async_context(FrameUpload(services, claim))
-        sinks = {**files, **{f"{name}_settings": config for name, config in configs.items()}, **frame.images}
+        sinks: dict[str, Sink] = {**frame.images}
+        for name in _ROLES:
+            sinks |= {name: files[name], f"{name}_settings": configs[name]}
         texts = {"request": settings.max_request_bytes, "camera": CAMERA_BYTES, "mask": settings.max_request_bytes}
         texts |= {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
         parts = await read_parts(body.chunks(request, limit), boundary_of(request), sinks, texts)
         _check_parts(parts)
         spec = await read_text(OneShotRequest, parts["request"], what="The part `request`")
         uploads: dict[str, tuple[Upload, Received, Beside]] = {}
-        for name in [name for name in _ROLES if name in parts]:
+        for name in (name for name in _ROLES if name in parts):
             said = read_description(parts.get(f"{name}_description"))
             beside = Beside(said, await configs[name].received(), role=name)
             uploads[name] = (files[name], await files[name].finish(), beside)
