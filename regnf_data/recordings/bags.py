@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from regnf_core.errors import DatasetError, MissingExtraError
-from regnf_data.recordings.camera import Array, Camera, camera_of_values
+from regnf_data.recordings.camera import Array, Camera, camera_of_values, depth_unit
 from regnf_data.recordings.folders import interpolated, poses_of
 from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, recording_of
 
@@ -124,13 +124,19 @@ def read_bag(path: Path, given: Given) -> Recording:
     Raises DatasetError: DATASET_BAG_INVALID, DATASET_DEPTH_MISSING, DATASET_INTRINSICS_INVALID, ...
     """
     bag = Bag(path)
-    depth, notes = _depth_topic(bag)
+    with bag.errors():
+        return _recording(bag, path.name, given)
+
+
+def _recording(bag: Bag, name: str, given: Given) -> Recording:
+    depth, notes = _depth_topic(bag, (given.layout or "").partition(":")[2])
     stamps, times, frame_id = _stamps(bag, depth)
+    unit = given.depth_unit or _unit(bag, depth.topic)
     info = _info_of(bag, depth)
     camera = given.camera or (_camera(info, depth.topic) if info is not None else None)
     if camera is None:
         raise DatasetError(
-            f"{path.name}: {depth.topic} has no CameraInfo beside it: give --intrinsics fx,fy,cx,cy",
+            f"{name}: {depth.topic} has no CameraInfo beside it: give --intrinsics fx,fy,cx,cy",
             reason="DATASET_INTRINSICS_INVALID",
         )
     poses, how = _poses(bag, frame_id, stamps)
@@ -149,37 +155,59 @@ def read_bag(path: Path, given: Given) -> Recording:
             nearest = int(np.abs(color_times[0] - stamp).argmin())
             if abs(color_times[0][nearest] - stamp) <= _NEAREST_S:
                 picture = _color_reader(bag, color, int(color_times[1][nearest]))
-        reader = _depth_reader(bag, depth, time, given.depth_unit)
+        reader = _depth_reader(bag, depth, time, unit)
         frames.append(StoredFrame(f"{index:06d}", camera, pose, reader, picture, color_camera))
-    return recording_of(path.name, f"a ROS bag, {depth.topic}", frames, notes)
+    return recording_of(name, f"a ROS bag, {depth.topic}", frames, notes)
 
 
-def _depth_topic(bag: Bag) -> tuple[Any, list[str]]:
-    """The topic of depth images: by its encoding; those registered to the color first."""
-    found = []
+def _depth_topic(bag: Bag, wanted: str) -> tuple[Any, list[str]]:
+    """The topic of depth images: by its encoding; those registered to the color first. wanted: its name, or nothing.
+
+    Raises DatasetError (DATASET_DEPTH_MISSING, DATASET_TOPIC_AMBIGUOUS) naming the topics.
+    """
+    found: dict[str, tuple[Any, str]] = {}
     for connection in bag.of_type(_IMAGE, _COMPRESSED):
         for _, _, message in bag.messages([connection]):
-            coding = message.encoding if connection.msgtype == _IMAGE else message.format
-            if coding in ("16UC1", "mono16", "32FC1") or "compressedDepth" in coding:
-                found.append(connection)
+            if _is_depth(connection.msgtype, message):
+                found[connection.topic] = connection, message.header.frame_id or connection.topic.rsplit("/", 1)[0]
             break
-    if not found:
-        listed = ", ".join(sorted({f"{each.topic} ({each.msgtype})" for each in bag.reader.connections})[:12])
+    if not found or (wanted and wanted not in found):
+        listed = ", ".join(sorted(found or {f"{each.topic} ({each.msgtype})" for each in bag.reader.connections})[:12])
+        what = f"depth images on {wanted[:100]}" if wanted else "depth images (16UC1, 32FC1 or compressedDepth)"
         raise DatasetError(
-            f"{bag.name} has no depth images (16UC1, 32FC1 or compressedDepth). It has {listed or 'no messages'}",
-            reason="DATASET_DEPTH_MISSING",
+            f"{bag.name} has no {what}. It has {listed or 'no messages'}", reason="DATASET_DEPTH_MISSING"
         )
 
-    def rank(connection: Any) -> tuple[bool, bool, bool, int, str]:
-        topic = connection.topic
-        aligned = "aligned" in topic or "registered" in topic
-        return ("depth" not in topic, not aligned, "infra" in topic, -connection.msgcount, topic)
+    def rank(topic: str) -> tuple[bool, bool, bool]:
+        lower = topic.lower()
+        return ("depth" not in lower, "aligned" not in lower and "registered" not in lower, "infra" in lower)
 
-    found.sort(key=rank)
-    notes = [f"depth is {found[0].topic}"]
-    if len(found) > 1:
-        notes.append(f"not used: {', '.join(each.topic for each in found[1:])}")
-    return found[0], notes
+    topics = sorted(found, key=lambda topic: (rank(topic), -found[topic][0].msgcount, topic))
+    best = wanted or topics[0]
+    others = [topic for topic in topics if topic != best]
+    alike = [topic for topic in others if rank(topic) == rank(best) and found[topic][1] != found[best][1]]
+    if alike and not wanted:
+        raise DatasetError(
+            f"{bag.name} has depth images of several cameras: {', '.join([best, *alike])}",
+            reason="DATASET_TOPIC_AMBIGUOUS",
+            hint=f"Choose one: --layout rosbag2:{best}",
+        )
+    return found[best][0], [f"depth is {best}"] + ([f"not used: {', '.join(others)}"] if others else [])
+
+
+def _is_depth(kind: str, message: Any) -> bool:
+    if kind == _IMAGE:
+        return message.encoding in ("16UC1", "mono16", "32FC1")
+    return "compressedDepth" in message.format or message.format.startswith(("16UC1", "mono16"))
+
+
+def _unit(bag: Bag, topic: str) -> float | None:
+    """Meters a step, as bags of RealSense's own recorder say it beside their images."""
+    options = [each for each in bag.of_type("std_msgs/msg/Float32") if "depth_units" in each.topic.lower()]
+    connection = _near_topic(topic, options)
+    for _, _, message in bag.messages([connection]) if connection is not None else ():
+        return depth_unit(float(message.data))
+    return None
 
 
 def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
@@ -194,7 +222,7 @@ def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
                 frame = first.header.frame_id
         # The header comes first: CDR has 4 bytes before it, ROS 1 a counter.
         seconds, nanoseconds = struct.unpack_from("<iI", raw, 4)
-        stamps.append(seconds + 1e-9 * nanoseconds)
+        stamps.append(seconds + 1e-9 * nanoseconds if seconds or nanoseconds else 1e-9 * time)
         times.append(time)
     return np.array(stamps), times, frame.lstrip("/")
 
@@ -329,8 +357,10 @@ def _meters(stored: NDArray[Any], unit: float) -> NDArray[np.float32]:
 
 
 def _compressed_depth(message: Any, name: str, unit: float) -> NDArray[np.float32]:
-    """A PNG behind 12 bytes; 32FC1 holds inverse depths: a / (value - b)."""
+    """A PNG, by compressedDepth behind 12 bytes; 32FC1 holds inverse depths: a / (value - b)."""
     data = bytes(message.data)
+    if "compressedDepth" not in message.format:
+        data = bytes(_DEPTH_HEAD.size) + data
     if "rvl" in message.format.lower() or len(data) < _DEPTH_HEAD.size:
         raise DatasetError(
             f"{name}: depth compressed as {message.format!r:.60} is not read", reason="DATASET_IMAGE_INVALID"

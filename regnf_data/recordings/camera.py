@@ -26,6 +26,8 @@ _INVALID = "DATASET_INTRINSICS_INVALID"
 _MOST_BYTES = 1 << 20
 _FOCAL = 0.05, 50.0
 """Focal lengths over the image's width that some lens has."""
+_OFF_MIDDLE = 0.9
+"""Of half of an image: intrinsics of images twice as large have their principal point at the border, give or take."""
 _CENTRAL = 0.25
 """Of half of an image's side: how far its principal point may be from its middle."""
 _UNITS_M = 1e-5, 0.01
@@ -56,18 +58,21 @@ class Camera:
             return replace(self, size=size)
         down, across = size[0] / self.size[0], size[1] / self.size[1]
         if abs(math.log(down / across)) > 0.02:
+            turned = "are its width and height exchanged?" if self.size == size[::-1] else "not the same shape"
             raise DatasetError(
                 f"{name}: the image has {size[1]} x {size[0]} pixels (width x height), its camera"
-                f" {self.size[1]} x {self.size[0]}: not the same shape",
+                f" {self.size[1]} x {self.size[0]}: {turned}",
                 reason=_INVALID,
             )
         return replace(self, K=np.diag([across, down, 1.0]) @ self.K, size=size)
 
+    def off_middle(self, size: Size) -> float:
+        """How far the principal point lies from the middle of images of a size: 1 at their border."""
+        return float(np.abs(2.0 * self.K[:2, 2] / size[::-1] - 1.0).max())
+
     def is_central(self, size: Size) -> bool:
         """Whether the principal point is near the middle of images of this size, as lenses are mounted."""
-        height, width = size
-        off = np.abs(2.0 * self.K[:2, 2] / (width, height) - 1.0)
-        return bool(off.max() <= _CENTRAL)
+        return self.off_middle(size) <= _CENTRAL
 
     def rays(self, pixels: Array) -> Array:
         """(P, 3): directions through image points (P, 2) of a camera without a lens; their z is 1."""
@@ -114,10 +119,10 @@ class Camera:
                 raise DatasetError(
                     f"{name}: focal lengths of {K[0, 0]:g}, {K[1, 1]:g} for {width} x {height}", reason=_INVALID
                 )
-            if not (0.0 <= K[0, 2] <= width and 0.0 <= K[1, 2] <= height):
+            if self.off_middle(self.size) > _OFF_MIDDLE:
                 raise DatasetError(
-                    f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is outside the image, {width} x {height}:"
-                    " are the intrinsics those of another resolution?",
+                    f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is not inside the image, {width} x"
+                    f" {height}: are the intrinsics those of another resolution?",
                     reason=_INVALID,
                 )
             self._check_lens(name)

@@ -27,7 +27,16 @@ from regnf_data.recordings.folders import (
     poses_of,
     read_json,
 )
-from regnf_data.recordings.recording import Recording, StoredFrame, color_file, depth_file, pose_of, recording_of
+from regnf_data.recordings.recording import (
+    MOST_PIXELS,
+    Recording,
+    StoredFrame,
+    checked_size,
+    color_file,
+    depth_file,
+    pose_of,
+    recording_of,
+)
 from regnf_data.sdfstudio import resolve
 
 if TYPE_CHECKING:
@@ -144,8 +153,11 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
         if pose is None or depth is None:
             frames.append(None)
             continue
-        camera = given.camera or _nerfstudio_camera({**values, **each}, name)
         color = _color_path(folder, each.get("file_path"))
+        stated = {**values, **each}
+        if given.camera is None and color is not None and not ("w" in stated and "h" in stated):
+            stated["h"], stated["w"] = checked_size(color)
+        camera = given.camera or _nerfstudio_camera(stated, name)
         frames.append(
             StoredFrame(
                 name,
@@ -288,7 +300,7 @@ def read_colmap(folder: Path, given: Given) -> Recording:
         if depth is None and dense is None:
             frames.append(None)
             continue
-        color = colors / name if colors and (colors / name).is_file() else None
+        color = None if colors is None else _color_path(colors, name)
         is_dense |= depth is None
         reader = depth_file(depth, unit) if depth is not None else _dense(dense)
         frames.append(
@@ -308,10 +320,14 @@ def _dense(path: Path | None) -> Any:
                 while head.count(b"&") < 3 and len(head) < 64:
                     head += file.read(1)
                 width, height, channels = (int(part) for part in head.split(b"&")[:3])
+                if not 0 < width * height <= MOST_PIXELS:
+                    raise ValueError(f"{width} x {height} pixels")
                 values = np.fromfile(file, np.float32, width * height * channels)
                 depth = values.reshape(height, width) if channels == 1 else None
         except ValueError as error:
-            raise DatasetError(f"{path.name} is no depth map of COLMAP", reason="DATASET_IMAGE_INVALID") from error
+            raise DatasetError(
+                f"{path.name} is no depth map of COLMAP: {error}", reason="DATASET_IMAGE_INVALID"
+            ) from error
         if depth is None:
             raise DatasetError(f"{path.name} has {channels} channels", reason="DATASET_IMAGE_INVALID")
         return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))

@@ -105,9 +105,10 @@ def read_tum(folder: Path, given: Given) -> Recording:
 def _tum_list(path: Path) -> list[tuple[float, str]]:
     found = []
     for line in _lines(path) if path.is_file() else ():
-        words = line.split()
-        if len(words) >= 2:
-            found.append((_number(words[0], path.name), words[1]))
+        words = line.split(maxsplit=1)
+        if len(words) == 2:
+            stamp = _number(words[0], path.name)
+            found.append((1e-9 * stamp if stamp > _NANOSECONDS else stamp, words[1]))
     return found
 
 
@@ -129,7 +130,7 @@ def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
         expected = "lines of t tx ty tz qx qy qz qw, or 12 numbers for each depth image"
         raise DatasetError(f"{path.name}: expected {expected}", reason=_INVALID)
     values = np.array(rows)
-    values = values[np.isfinite(values).all(axis=1)]
+    values = values[np.isfinite(values).all(axis=1) & values[:, 4:].any(axis=1)]  # zeros: a tracker was lost
     values = values[np.argsort(values[:, 0], kind="stable")]
     if not len(values):
         raise DatasetError(f"{path.name}: no pose has finite numbers", reason="DATASET_NO_FRAMES")
@@ -140,8 +141,10 @@ def poses_of(places: Array, quaternions: Array, name: str) -> Array:
     """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w. Raises DatasetError (DATASET_POSE_NOT_RIGID)."""
     from scipy.spatial.transform import Rotation
 
-    if (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > 0.05).any():
-        raise DatasetError(f"{name}: a quaternion has not the length 1", reason="DATASET_POSE_NOT_RIGID")
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if (odd := np.flatnonzero(~(np.abs(lengths - 1.0) <= 0.05))).size:
+        said = f"{name}: the quaternion of pose {odd[0]} has the length {lengths[odd[0]]:.3g}, not 1"
+        raise DatasetError(said, reason="DATASET_POSE_NOT_RIGID")
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = places

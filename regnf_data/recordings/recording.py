@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import NO_TERMS, Terms, check_views
 from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array, Camera, Size
 from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
@@ -111,7 +113,7 @@ class StoredFrame:
         if not color or self.color is None:
             return frame
         picture = self.color()
-        colored = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
+        colored = (self.color_camera or with_lens).of_size((picture.shape[0], picture.shape[1]), self.name)
         return replace(frame, color=picture, color_camera=colored.check(self.name))
 
 
@@ -120,8 +122,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world is in
-    meters.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is
+    the meter, as far as files can tell · terms: what the layout's files call things.
     """
 
     name: str
@@ -130,6 +132,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
     is_metric: bool = True
+    terms: Terms = NO_TERMS
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -176,6 +179,35 @@ def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
         bounds=bounds,
         depths=np.stack([frame.depth for frame in frames]),
     )
+
+
+_FRAMES, _ACROSS = 32, 200
+"""Of a recording that are compared, and pixels of them across."""
+_OFFSETS = 0.0, 1.0 / 16.0, 0.25, 0.5
+"""Where frames are taken of each part of a recording: some follow each other closely, whatever its length."""
+
+
+def check_recording(recording: Recording) -> str | None:
+    """As :func:`regnf_data.agreement.check_agreement`, of some frames of a recording, in the words of its layout.
+
+    Frames are read. Raises DatasetError as their readers do, too.
+    """
+    count = len(recording)
+    parts = _FRAMES // len(_OFFSETS)
+    spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
+    if count < 2:
+        return None
+    chosen = sorted(spread) if count > _FRAMES else range(count)
+    frames = [recording.frames[index].read(color=False) for index in chosen]
+    shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
+    step = max(1, shape[1] // _ACROSS)
+    frames = [frame for frame in frames if frame.depth.shape == shape]
+    # Every step-th pixel: the center of the first one stays where it is.
+    smaller = np.array([[1.0 / step, 0.0, 0.5 - 0.5 / step], [0.0, 1.0 / step, 0.5 - 0.5 / step], [0.0, 0.0, 1.0]])
+    depths = np.stack([frame.depth[::step, ::step] for frame in frames])
+    intrinsics = np.stack([smaller @ frame.camera.K for frame in frames])
+    poses = np.stack([frame.T_world_camera for frame in frames])
+    return check_views(depths, intrinsics, poses, recording.terms)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from regnf_core.geometry.box import OrientedBox
 from regnf_data.recordings.recording import Frame
 from regnf_fit.images.focus import region_frame, surface_in
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +53,7 @@ def align_frames(frames: Sequence[Frame], region: OrientedBox) -> Aligned:
     where too few of them are seen by others, and where the others would not agree better with it.
     """
     if len(frames) == 1:
-        return Aligned((frames[0],), 0.0)
+        return Aligned(tuple(frames), 0.0)
     T_region_world, half = region_frame(region)
     reach = _REACH * 2.0 * float(half.max())
     rng = np.random.default_rng(0)
@@ -90,6 +93,8 @@ def _motion(known: tuple[Floats, Floats], own: tuple[Floats, Floats], reach: flo
     of the distances that are left."""
     if min(len(known[0]), len(own[0])) < _FEWEST:
         return None, 0.0
+    from scipy.spatial import cKDTree  # the path of one frame does without
+
     tree = cKDTree(known[0])
     fit, check = ((own[0][k::2], own[1][k::2]) for k in range(2))
     T, within = np.eye(4), reach

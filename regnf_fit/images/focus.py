@@ -102,7 +102,7 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
     """The pixels whose surface lies in the region; those that share a plane with too few others are left out: at edges
     sensors mix two depths."""
     T_region_camera = T_region_world @ frame.T_world_camera
-    T_camera_region = np.linalg.inv(T_region_camera)
+    T_camera_region = np.asarray(np.linalg.inv(T_region_camera), np.float64)
     rows, columns = _part(frame, T_camera_region, half)
     depth, K = frame.depth[rows, columns], frame.camera.K.copy()
     K[:2, 2] -= columns.start, rows.start
@@ -193,7 +193,7 @@ def _distances(
     # Straight above a pixel's patch its plane tells the distance; beside the patch the point does.
     straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
     far = sign * np.where(straight, np.abs(across), apart)
-    return np.where(apart <= _PLANAR * edge, across, far).reshape(shape).astype(np.float32)
+    return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32).reshape(shape)
 
 
 def _observation(

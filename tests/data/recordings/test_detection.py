@@ -175,6 +175,25 @@ def test_a_detection_without_depth_is_refused() -> None:
     assert found.value.reason == "DETECTION_WITHOUT_DEPTH"
 
 
+@pytest.mark.parametrize("kind", ["mask grown", "mask shrunk", "mask shifted", "box loose", "point"])
+def test_the_box_does_not_depend_on_how_the_thing_was_detected(kind: str) -> None:
+    frame, shown = ball_image()
+    rng = np.random.default_rng(1)
+    frame = Frame("0", (frame.depth * (1 + 0.001 * rng.normal(size=(H, W)))).astype(np.float32), CAMERA, np.eye(4))
+    rows, columns = np.nonzero(shown)
+    left, top, right, bottom = columns.min() - 6.0, rows.min() - 6.0, columns.max() + 7.0, rows.max() + 7.0
+    detection = {
+        "mask grown": ImageDetection(mask=grown(shown, 6)),
+        "mask shrunk": ImageDetection(mask=grown(shown, -5)),
+        "mask shifted": ImageDetection(mask=np.roll(shown, (3, -4), axis=(0, 1))),
+        "box loose": ImageDetection(box_2d=(left, top, right, bottom)),
+        "point": ImageDetection(point_2d=(float(columns.mean()), float(rows.mean()))),
+    }[kind]
+    exact, found = (lift(frame, one, diameter=3.5 * RADIUS) for one in (ImageDetection(mask=shown), detection))
+    assert np.abs((found.box.center - exact.box.center).numpy()).max() < 0.05 * RADIUS
+    np.testing.assert_allclose(found.box.size.numpy(), exact.box.size.numpy(), rtol=0.05)
+
+
 @pytest.mark.parametrize("colored", [True, False])
 def test_a_mask_is_in_pixels_of_the_image_with_its_lens(colored: bool, tmp_path: Path) -> None:
     """A lens that bends the image's corner by several pixels; the mask is drawn on the bent image."""
