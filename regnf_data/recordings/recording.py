@@ -200,16 +200,18 @@ def check_recording(recording: Recording) -> str | None:
     if count < 2:
         return None
     chosen = sorted(spread) if count > _FRAMES else range(count)
-    frames = [recording.frames[index].read(color=False) for index in chosen]
-    shape = Counter(frame.depth.shape for frame in frames).most_common(1)[0][0]
-    step = max(1, shape[1] // _ACROSS)
-    frames = [frame for frame in frames if frame.depth.shape == shape]
-    # Every step-th pixel: the center of the first one stays where it is.
-    smaller = np.array([[1.0 / step, 0.0, 0.5 - 0.5 / step], [0.0, 1.0 / step, 0.5 - 0.5 / step], [0.0, 0.0, 1.0]])
-    depths = np.stack([frame.depth[::step, ::step] for frame in frames])
-    intrinsics = np.stack([smaller @ frame.camera.K for frame in frames])
-    poses = np.stack([frame.T_world_camera for frame in frames])
-    return check_views(depths, intrinsics, poses, recording.terms)
+    views = [_smaller(recording.frames[index].read(color=False)) for index in chosen]
+    shape = Counter(depth.shape for depth, _, _ in views).most_common(1)[0][0]
+    depths, intrinsics, poses = zip(*(view for view in views if view[0].shape == shape), strict=True)
+    return check_views(np.stack(depths), np.stack(intrinsics), np.stack(poses), recording.terms)
+
+
+def _smaller(frame: Frame) -> tuple[NDArray[np.float32], Array, Array]:
+    """Depth, intrinsics and pose of every so many pixels: the center of the first one stays where it is."""
+    step = max(1, frame.depth.shape[1] // _ACROSS)
+    shift = 0.5 - 0.5 / step
+    intrinsics = np.array([[1.0 / step, 0.0, shift], [0.0, 1.0 / step, shift], [0.0, 0.0, 1.0]]) @ frame.camera.K
+    return frame.depth[::step, ::step].copy(), intrinsics, frame.T_world_camera
 
 
 @dataclass(frozen=True, eq=False)
