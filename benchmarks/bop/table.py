@@ -15,6 +15,11 @@ _BANDS: tuple[tuple[str, Callable[[float], bool]], ...] = (
     ("not known", lambda share: bool(np.isnan(share))),
 )
 
+_LISTED = (
+    *("scene", "image", "object", "visible", "verdict", "reason", "probability", "surface"),
+    *("explained (by the truth)", "MSSD", "MSPD, px", "s"),
+)
+
 
 def summary(answers: Sequence[Answer], all_poses: Recall, accepted: Recall) -> str:
     """Recalls, verdicts by visible share, and time."""
@@ -47,11 +52,8 @@ def summary(answers: Sequence[Answer], all_poses: Recall, accepted: Recall) -> s
 
 def listing(answers: Sequence[Answer], others: Sequence[tuple[str, Sequence[Answer]]] = ()) -> str:
     """A row a detection; beside it ``surface`` and ``explained`` of other methods for the same object and image."""
-    names = "".join(f" {name} |" for name, _ in others)
-    lines = [
-        f"| scene | image | object | visible | verdict | reason | probability | surface | MSSD | MSPD, px | s |{names}",
-        "|" + "---|" * (11 + len(others)),
-    ]
+    heads = [*_LISTED, *(name for name, _ in others)]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for one in answers:
         cells = [
             str(one.scene_id),
