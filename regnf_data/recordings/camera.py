@@ -22,6 +22,8 @@ Size = tuple[int, int]
 Lens = Literal["none", "brown", "fisheye"]
 """none: a pinhole · brown: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 · fisheye: OpenCV's four, of the angle from the axis."""
 
+HALF_A_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+"""Added to intrinsics of writers that take pixel centers to lie at whole numbers."""
 _INVALID = "DATASET_INTRINSICS_INVALID"
 _MOST_BYTES = 1 << 20
 _FOCAL = 0.05, 50.0
@@ -216,7 +218,7 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             width, height = _first(each, "width", "w", "image_width"), _first(each, "height", "h", "image_height")
             size = (int(height), int(width)) if width and height else None
             lens, coefficients = _lens(each, name)
-            K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+            K = found + HALF_A_PIXEL
             camera = Camera(K, size, lens, coefficients).check(name)
             unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
             if unit is None and each.get("depth_unit") is not None:
@@ -334,5 +336,4 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
         )
     else:
         return None
-    matrix = matrix + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    return CameraFile(Camera(matrix).check(name))
+    return CameraFile(Camera(matrix + HALF_A_PIXEL).check(name))
