@@ -171,11 +171,17 @@ class Camera:
 
 
 def camera_of(
-    fx: float, fy: float, cx: float, cy: float, size: Size | None = None, whole_centers: bool = False
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    size: Size | None = None,
+    lens: tuple[Lens, tuple[float, ...]] = ("none", ()),
+    whole_centers: bool = False,
 ) -> Camera:
-    """A pinhole. whole_centers: its writer takes a pixel's center to lie at whole numbers, as OpenCV does."""
-    shift = 0.5 if whole_centers else 0.0
-    return Camera(np.array([[fx, 0.0, cx + shift], [0.0, fy, cy + shift], [0.0, 0.0, 1.0]]), size)
+    """Of numbers in pixels. whole_centers: a pixel's center lies at whole numbers for its writer, as for OpenCV."""
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(K + HALF_A_PIXEL if whole_centers else K, size, *lens)
 
 
 # Files of intrinsics. Writers of sensors take pixel centers to lie at whole numbers.
@@ -329,11 +335,8 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
     elif len(rows) == 1 and len(rows[0]) == 9:
         matrix = np.array(rows[0]).reshape(3, 3)
     elif len(rows) == 1 and 4 <= len(rows[0]) <= 12:
-        fx, fy, cx, cy = rows[0][:4]
-        lens, coefficients = lens_of(rows[0][4:], False, name)
-        return CameraFile(
-            replace(camera_of(fx, fy, cx, cy, whole_centers=True), lens=lens, distortion=coefficients).check(name)
-        )
+        lens = lens_of(rows[0][4:], False, name)
+        return CameraFile(camera_of(*rows[0][:4], lens=lens, whole_centers=True).check(name))
     else:
         return None
     return CameraFile(Camera(matrix + HALF_A_PIXEL).check(name))

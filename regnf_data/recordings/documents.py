@@ -164,13 +164,16 @@ def _color_path(folder: Path, name: Any) -> Path | None:
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
+def _unsupported(name: str, model: str) -> DatasetError:
+    said = f"{name}: cameras of the model {model[:40]} are not modeled"
+    return DatasetError(said, reason="DATASET_CAMERA_UNSUPPORTED")
+
+
 def _nerfstudio_camera(values: Mapping[str, Any], name: str) -> Camera:
     model = str(values.get("camera_model", "OPENCV"))
     fisheye = model == "OPENCV_FISHEYE"
     if model not in _PINHOLES and not fisheye:
-        raise DatasetError(
-            f"{name}: cameras of the model {model[:40]} are not modeled", reason="DATASET_CAMERA_UNSUPPORTED"
-        )
+        raise _unsupported(name, model)
     try:
         width, height = (int(values[key]) if key in values else None for key in ("w", "h"))
         if "fl_x" in values:
@@ -185,13 +188,13 @@ def _nerfstudio_camera(values: Mapping[str, Any], name: str) -> Camera:
             for key, side in (("cx", width or 0), ("cy", height or 0))
         )
         keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        lens, coefficients = lens_of([float(values.get(key, 0.0) or 0.0) for key in keys], fisheye, name)
+        lens = lens_of([float(values.get(key, 0.0) or 0.0) for key in keys], fisheye, name)
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(
             f"{name}: the camera needs fl_x, fl_y, cx, cy, w and h as numbers: {error}", reason=_INTRINSICS
         ) from error
     size = (height, width) if width and height else None
-    return replace(camera_of(fx, fy, cx, cy, size), lens=lens, distortion=coefficients).check(name)
+    return camera_of(fx, fy, cx, cy, size, lens).check(name)
 
 
 # sdfstudio: meta_data.json. The reader of fits knows it; frames of it are read one at a time here.
@@ -310,15 +313,12 @@ _COLMAP_MODELS = {
 def _colmap_camera(model: str, size: tuple[int, int], numbers: list[float], name: str) -> Camera:
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
     if model in ("FOV", "THIN_PRISM_FISHEYE") or model not in {each for each, _ in _COLMAP_MODELS.values()}:
-        raise DatasetError(
-            f"{name}: cameras of the model {model[:40]} are not modeled", reason="DATASET_CAMERA_UNSUPPORTED"
-        )
+        raise _unsupported(name, model)
     fx, fy, cx, cy = (numbers[0], *numbers[:3]) if single else numbers[:4]
     rest = numbers[3:] if single else numbers[4:]
     if model in ("SIMPLE_RADIAL", "RADIAL", "OPENCV"):
         rest = [*rest, 0.0, 0.0, 0.0, 0.0][:4]
-    lens, coefficients = lens_of(rest, "FISHEYE" in model, name)
-    return replace(camera_of(fx, fy, cx, cy, size), lens=lens, distortion=coefficients).check(name)
+    return camera_of(fx, fy, cx, cy, size, lens_of(rest, "FISHEYE" in model, name)).check(name)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:

@@ -242,7 +242,8 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
 
     def read() -> NDArray[np.float32]:
         depth = read_depth(path, checked_size(path), unit)
-        if unit is not None and path.suffix.lower() == ".npy" and _whole_numbers(path):
+        is_array = path.suffix.lower() == ".npy"
+        if unit is not None and is_array and np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu":
             depth = depth * np.float32(unit)
         if unit is not None and unit <= _MILLIMETER and 0.0 < depth.max() <= _EIGHT_BITS * unit:
             raise DatasetError(
@@ -281,10 +282,6 @@ def checked_size(path: Path) -> Size:
     if size[0] * size[1] > MOST_PIXELS:
         raise DatasetError(f"{path.name} has {size[1]} x {size[0]} pixels", reason="DATASET_TOO_LARGE")
     return size
-
-
-def _whole_numbers(path: Path) -> bool:
-    return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
 
 
 def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) -> Array | None:
@@ -350,7 +347,5 @@ def recording_of(
     if len(found) > MOST_FRAMES:
         raise DatasetError(f"{name}: {len(found)} frames; at most {MOST_FRAMES}", reason="DATASET_TOO_LARGE")
     lost = len(frames) - len(found)
-    said = (
-        (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
-    )
-    return Recording(name, layout, found, said, T_metric_world, is_metric)
+    told = (f"{lost} of {len(frames)} frames have no pose or no depth and are left out",) if lost else ()
+    return Recording(name, layout, found, (*notes, *told), T_metric_world, is_metric)
