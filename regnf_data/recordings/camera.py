@@ -335,8 +335,9 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
     elif len(rows) == 1 and len(rows[0]) == 9:
         matrix = np.array(rows[0]).reshape(3, 3)
     elif len(rows) == 1 and 4 <= len(rows[0]) <= 12:
+        fx, fy, cx, cy = rows[0][:4]
         lens = lens_of(rows[0][4:], False, name)
-        return CameraFile(camera_of(*rows[0][:4], lens=lens, whole_centers=True).check(name))
+        return CameraFile(camera_of(fx, fy, cx, cy, None, lens, whole_centers=True).check(name))
     else:
         return None
     return CameraFile(Camera(matrix + HALF_A_PIXEL).check(name))

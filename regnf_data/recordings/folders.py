@@ -253,8 +253,7 @@ def is_scannet(path: Path) -> bool:
 
 def read_scannet(folder: Path, given: Given) -> Recording:
     """Millimeters; color and depth have cameras of their own; rows of -inf are lost frames."""
-    depths, colors = _subfolder(folder, _DEPTH_FOLDERS), _subfolder(folder, _COLOR_FOLDERS)
-    assert depths is not None
+    depths, colors = _subfolder(folder, _DEPTH_FOLDERS) or folder / "depth", _subfolder(folder, _COLOR_FOLDERS)
     found = _named_camera(folder, "intrinsic_depth") or camera_beside(folder)
     camera, unit, _ = _camera_of(folder.name, found, given, _MILLIMETER)
     of_color = _named_camera(folder, "intrinsic_color")

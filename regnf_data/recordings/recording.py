@@ -159,8 +159,7 @@ class Recording:
         frames: list[Frame] = []
         for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
             frame = self.frames[index].read()
-            gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
-            frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
+            frames.append(frame if frame.color is None else replace(frame, color=frame.registered(frame.color)))
         return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
 
 
