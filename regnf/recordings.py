@@ -210,8 +210,6 @@ def _detection(scene: Any, given: Any) -> OrientedBox | Sequence[ImageDetection]
 
 def _box(given: DetectionLike) -> BoxLike:
     """The detection in a field: a box. Raises InvalidDetectionError."""
-    if given is None:
-        raise InvalidDetectionError("no detection is given", hint="Give the box in the scene's frame.")
     if is_image_detection(given):
         raise image_detection_in_field()
     return given  # type: ignore[return-value]
