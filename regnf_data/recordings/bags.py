@@ -7,7 +7,7 @@ import math
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -52,9 +52,16 @@ class Bag:
             self.reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self.reader.open()
 
-    def errors(self) -> _Errors:
+    @contextmanager
+    def errors(self) -> Iterator[None]:
         """Turns whatever the library raises of a broken file into DatasetError (DATASET_BAG_INVALID)."""
-        return _Errors(self.name)
+        try:
+            yield
+        except DatasetError:
+            raise
+        except Exception as error:
+            told = re.sub(r"(/[^\s/]+)+/", "", str(error))  # paths of this machine are nobody's business
+            raise DatasetError(f"{self.name} cannot be read as a bag: {told}"[:400], reason=_INVALID) from error
 
     def of_type(self, *types: str) -> list[Any]:
         """The connections whose messages are of one of the types."""
@@ -67,6 +74,11 @@ class Bag:
         with self.errors():
             for connection, time, raw in self.reader.messages(connections, start, stop):
                 yield connection, time, self.reader.deserialize(raw, connection.msgtype)
+
+    def first(self, connection: Any | None) -> Any:
+        """The first message of a connection, if there is one."""
+        found = () if connection is None else self.messages([connection])
+        return next((message for _, _, message in found), None)
 
     def at(self, connection: Any, time: int) -> Any:
         """The message of a time. Raises DatasetError (DATASET_BAG_INVALID) where the bag lost it."""
@@ -86,17 +98,8 @@ class Bag:
             self.reader.close()
 
 
-class _Errors:
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, Exception) and not isinstance(error, DatasetError):
-            told = re.sub(r"(/[^\s/]+)+/", "", str(error))  # paths of this machine are nobody's business
-            raise DatasetError(f"{self._name} cannot be read as a bag: {told}"[:400], reason=_INVALID) from error
+def _numbers(place: Any, turn: Any) -> tuple[float, ...]:
+    return place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
 
 
 @dataclass
@@ -107,6 +110,10 @@ class Link:
     static: bool
     stamps: list[float] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, stamp: Any, place: Any, turn: Any) -> None:
+        self.stamps.append(stamp.sec + 1e-9 * stamp.nanosec)
+        self.values.append(_numbers(place, turn))
 
     def at(self, stamps: Array) -> list[Array | None]:
         """T_parent_child at each of the times; None where none is near."""
@@ -142,7 +149,7 @@ def _recording(bag: Bag, name: str, given: Given) -> Recording:
     poses, how = _poses(bag, frame_id, stamps)
     notes.append(how)
     color = _color_topic(bag, depth)
-    color_times, color_camera, same = _color_side(bag, color, depth)
+    color_times, color_camera, same = _color_side(bag, color, frame_id)
     if color is not None and not same:
         notes.append(f"{color.topic} is taken as seen from the depth camera's place")
     frames: list[StoredFrame | None] = []
@@ -167,10 +174,9 @@ def _depth_topic(bag: Bag, wanted: str) -> tuple[Any, list[str]]:
     """
     found: dict[str, tuple[Any, str]] = {}
     for connection in bag.of_type(_IMAGE, _COMPRESSED):
-        for _, _, message in bag.messages([connection]):
-            if _is_depth(connection.msgtype, message):
-                found[connection.topic] = connection, message.header.frame_id or connection.topic.rsplit("/", 1)[0]
-            break
+        message = bag.first(connection)
+        if message is not None and _is_depth(connection.msgtype, message):
+            found[connection.topic] = connection, message.header.frame_id or connection.topic.rsplit("/", 1)[0]
     if not found or (wanted and wanted not in found):
         listed = ", ".join(sorted(found or {f"{each.topic} ({each.msgtype})" for each in bag.reader.connections})[:12])
         what = f"depth images on {wanted[:100]}" if wanted else "depth images (16UC1, 32FC1 or compressedDepth)"
@@ -204,10 +210,8 @@ def _is_depth(kind: str, message: Any) -> bool:
 def _unit(bag: Bag, topic: str) -> float | None:
     """Meters a step, as bags of RealSense's own recorder say it beside their images."""
     options = [each for each in bag.of_type("std_msgs/msg/Float32") if "depth_units" in each.topic.lower()]
-    connection = _near_topic(topic, options)
-    for _, _, message in bag.messages([connection]) if connection is not None else ():
-        return depth_unit(float(message.data))
-    return None
+    message = bag.first(_near_topic(topic, options))
+    return None if message is None else depth_unit(float(message.data))
 
 
 def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
@@ -240,10 +244,7 @@ def _near_topic(topic: str, connections: Sequence[Any]) -> Any | None:
 
 def _info_of(bag: Bag, image: Any) -> Any | None:
     """The first CameraInfo beside a topic of images."""
-    connection = _near_topic(image.topic, bag.of_type(_INFO))
-    for _, _, message in bag.messages([connection]) if connection is not None else ():
-        return message
-    return None
+    return bag.first(_near_topic(image.topic, bag.of_type(_INFO)))
 
 
 def _camera(info: Any, topic: str) -> Camera:
@@ -266,22 +267,14 @@ def _camera(info: Any, topic: str) -> Camera:
 def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str]:
     """T_world_camera at the times, and where from."""
     links = _links(bag)
-    chain: list[Link] = []
-    at = frame
-    while at in links and len(chain) < _LONGEST_CHAIN:
-        chain.append(links[at])
-        at = links[at].parent
+    chain, at = _chain(links, frame)
     if any(not link.static for link in chain):
         return _chained(chain, stamps), f"poses are tf's, from {at!r} to {frame!r}"
     odometry = bag.of_type(*_POSES)
     if odometry:
         best = max(odometry, key=lambda each: (each.msgtype == _POSES[0], each.msgcount))
         body, child = _odometry(bag, best)
-        below: list[Link] = []
-        at = frame
-        while at in links and at != child and len(below) < _LONGEST_CHAIN:
-            below.append(links[at])
-            at = links[at].parent
+        below, at = _chain(links, frame, child)
         if child and at != child:
             below = []
         return _chained([*below, body], stamps), f"poses are those of {best.topic}" + (
@@ -294,6 +287,15 @@ def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str
     return [np.eye(4) for _ in stamps], "the bag has no poses: use one frame at a time"
 
 
+def _chain(links: dict[str, Link], frame: str, top: str | None = None) -> tuple[list[Link], str]:
+    """The links from a frame up to ``top``, or as far as they go, and the frame at their end."""
+    chain: list[Link] = []
+    while frame in links and frame != top and len(chain) < _LONGEST_CHAIN:
+        chain.append(links[frame])
+        frame = links[frame].parent
+    return chain, frame
+
+
 def _links(bag: Bag) -> dict[str, Link]:
     links: dict[str, Link] = {}
     connections = bag.of_type(_TF)
@@ -303,9 +305,7 @@ def _links(bag: Bag) -> dict[str, Link]:
             child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
             link = links.setdefault(child, Link(parent, static))
             link.static &= static
-            place, turn = each.transform.translation, each.transform.rotation
-            link.stamps.append(each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec)
-            link.values.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+            link.add(each.header.stamp, each.transform.translation, each.transform.rotation)
     return links
 
 
@@ -316,11 +316,8 @@ def _odometry(bag: Bag, connection: Any) -> tuple[Link, str]:
         while hasattr(pose, "pose"):
             pose = pose.pose
         child = getattr(message, "child_frame_id", "").lstrip("/")
-        place, turn = pose.position, pose.orientation
-        values = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
-        if all(map(math.isfinite, values)):
-            link.stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-            link.values.append(values)
+        if all(map(math.isfinite, _numbers(pose.position, pose.orientation))):
+            link.add(message.header.stamp, pose.position, pose.orientation)
     if not link.values:
         raise DatasetError(f"{bag.name}: {connection.topic} has no pose of finite numbers", reason="DATASET_NO_FRAMES")
     return link, child
@@ -415,23 +412,20 @@ def _color_topic(bag: Bag, depth: Any) -> Any | None:
     for connection in bag.of_type(_IMAGE, _COMPRESSED):
         if connection.topic == depth.topic:
             continue
-        for _, _, message in bag.messages([connection]):
-            coding = message.encoding if connection.msgtype == _IMAGE else message.format
-            if coding in ("rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "8UC4") or (
-                ("jpeg" in coding or "png" in coding) and "Depth" not in coding
-            ):
-                found.append(connection)
-            break
+        message = bag.first(connection)
+        coding = "" if message is None else message.encoding if connection.msgtype == _IMAGE else message.format
+        is_file = ("jpeg" in coding or "png" in coding) and "Depth" not in coding
+        if is_file or coding in ("rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "8UC4"):
+            found.append(connection)
     return _near_topic(depth.topic, found)
 
 
-def _color_side(bag: Bag, color: Any | None, depth: Any) -> tuple[tuple[Array, Array], Camera | None, bool]:
+def _color_side(bag: Bag, color: Any | None, depth_frame: str) -> tuple[tuple[Array, Array], Camera | None, bool]:
     """Stamps and bag times of the color images, their camera, and whether it is the depth camera's own place."""
     if color is None:
         return (np.zeros(0), np.zeros(0)), None, True
     stamps, times, frame = _stamps(bag, color)
     info = _info_of(bag, color)
-    _, _, depth_frame = next(((0, 0, m.header.frame_id.lstrip("/")) for _, _, m in bag.messages([depth])), (0, 0, ""))
     return (stamps, np.array(times)), None if info is None else _camera(info, color.topic), frame == depth_frame
 
 

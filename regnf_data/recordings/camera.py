@@ -22,6 +22,8 @@ Size = tuple[int, int]
 Lens = Literal["none", "brown", "fisheye"]
 """none: a pinhole · brown: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 · fisheye: OpenCV's four, of the angle from the axis."""
 
+HALF_A_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+"""Added to intrinsics of writers that take pixel centers to lie at whole numbers."""
 _INVALID = "DATASET_INTRINSICS_INVALID"
 _MOST_BYTES = 1 << 20
 _FOCAL = 0.05, 50.0
@@ -169,11 +171,17 @@ class Camera:
 
 
 def camera_of(
-    fx: float, fy: float, cx: float, cy: float, size: Size | None = None, whole_centers: bool = False
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    size: Size | None = None,
+    lens: tuple[Lens, tuple[float, ...]] = ("none", ()),
+    whole_centers: bool = False,
 ) -> Camera:
-    """A pinhole. whole_centers: its writer takes a pixel's center to lie at whole numbers, as OpenCV does."""
-    shift = 0.5 if whole_centers else 0.0
-    return Camera(np.array([[fx, 0.0, cx + shift], [0.0, fy, cy + shift], [0.0, 0.0, 1.0]]), size)
+    """Of numbers in pixels. whole_centers: a pixel's center lies at whole numbers for its writer, as for OpenCV."""
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(K + HALF_A_PIXEL if whole_centers else K, size, *lens)
 
 
 # Files of intrinsics. Writers of sensors take pixel centers to lie at whole numbers.
@@ -216,7 +224,7 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             width, height = _first(each, "width", "w", "image_width"), _first(each, "height", "h", "image_height")
             size = (int(height), int(width)) if width and height else None
             lens, coefficients = _lens(each, name)
-            K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+            K = found + HALF_A_PIXEL
             camera = Camera(K, size, lens, coefficients).check(name)
             unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
             if unit is None and each.get("depth_unit") is not None:
@@ -328,11 +336,8 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
         matrix = np.array(rows[0]).reshape(3, 3)
     elif len(rows) == 1 and 4 <= len(rows[0]) <= 12:
         fx, fy, cx, cy = rows[0][:4]
-        lens, coefficients = lens_of(rows[0][4:], False, name)
-        return CameraFile(
-            replace(camera_of(fx, fy, cx, cy, whole_centers=True), lens=lens, distortion=coefficients).check(name)
-        )
+        lens = lens_of(rows[0][4:], False, name)
+        return CameraFile(camera_of(fx, fy, cx, cy, None, lens, whole_centers=True).check(name))
     else:
         return None
-    matrix = matrix + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    return CameraFile(Camera(matrix).check(name))
+    return CameraFile(Camera(matrix + HALF_A_PIXEL).check(name))

@@ -161,8 +161,7 @@ class Recording:
         frames: list[Frame] = []
         for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
             frame = self.frames[index].read()
-            gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
-            frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
+            frames.append(frame if frame.color is None else replace(frame, color=frame.registered(frame.color)))
         return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
 
 
@@ -360,7 +359,5 @@ def recording_of(
     if len(found) > MOST_FRAMES:
         raise DatasetError(f"{name}: {len(found)} frames; at most {MOST_FRAMES}", reason="DATASET_TOO_LARGE")
     lost = len(frames) - len(found)
-    said = (
-        (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
-    )
-    return Recording(name, layout, found, said, T_metric_world, is_metric)
+    told = (f"{lost} of {len(frames)} frames have no pose or no depth and are left out",) if lost else ()
+    return Recording(name, layout, found, (*notes, *told), T_metric_world, is_metric)
