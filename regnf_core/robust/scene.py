@@ -331,7 +331,9 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
         half = (detection.size / detection.diagonal / 2).to(observed.points)
         outside = ~((observed.points @ detection.rotation.to(observed.points)).abs() <= half).all(-1)
     edges = detection.rotation.mT * (detection.size / detection.diagonal)[:, None]
-    foreground = observed[~support_planes(observed, generator, edges, outside)]
+    foreground = observed
+    if observation is None or not observation.of_thing:  # else what the thing stands on is known
+        foreground = observed[~support_planes(observed, generator, edges, outside)]
     if len(foreground) < SCENE.min_foreground:
         foreground = observed if len(observed) >= SCENE.min_foreground else everything
     share = float(removed.float().mean())

@@ -44,19 +44,28 @@ _MARGIN = 1.5
 class _View:
     """What one image measured in the region, in the region's frame. points, normals: (P, 3) · T_camera_region: (4, 4) ·
     K: (3, 3), of the part of the image that shows the region · depth: (H, W) of that part, 0 for none ·
-    margin: (H, W), a standard deviation of the depth."""
+    margin: (H, W), a standard deviation of the depth · told: (P,) 1 for points
+    of the thing of a detection, -1 for those beside it, 0 where the image has none."""
 
     points: Floats
     normals: Floats
+    told: NDArray[np.int8]
     T_camera_region: Floats
     K: Floats
     depth: NDArray[np.float32]
     margin: NDArray[np.float32]
 
 
-def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None) -> SdfField:
+def focused_field(
+    frames: Sequence[Frame],
+    region: OrientedBox,
+    voxel: float | None = None,
+    things: Sequence[NDArray[np.bool_]] = (),
+) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
+    things: of the first frames, (H, W) each, where they show the thing of a detection. What they show beside it hides
+    and is in the way, but nobody saw the thing there: its surface counts as unobserved.
     voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
     nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image measured a surface in the region.
@@ -65,10 +74,14 @@ def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | N
     T_region_world = np.eye(4)
     T_region_world[:3, :3] = region.rotation.numpy().T
     T_region_world[:3, 3] = -T_region_world[:3, :3] @ region.center.numpy()
-    views = [view for frame in frames if (view := _view(frame, T_region_world, half)) is not None]
+    shown = [*things, *(None for _ in frames[len(things) :])]
+    pairs = zip(frames, shown, strict=True)
+    views = [view for frame, thing in pairs if (view := _view(frame, T_region_world, half, thing)) is not None]
     if not views:
         raise DatasetError("no depth image shows a surface in the region", reason="DATASET_NOTHING_IN_BOUNDS")
-    points, normals = (np.concatenate([getattr(one, name) for one in views]) for name in ("points", "normals"))
+    points, normals, told = (
+        np.concatenate([getattr(one, name) for one in views]) for name in ("points", "normals", "told")
+    )
     edge = max(voxel or _pixel_width(views), float(np.prod(2.0 * half) / _MOST_NODES) ** (1.0 / 3.0))
     shape = tuple(int(n) for n in np.ceil(2.0 * half / edge) + 1)
     low = -half
@@ -76,7 +89,7 @@ def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | N
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     free, behind = _carved(nodes, views, edge)
     values = _distances(nodes, points, normals, behind, low, edge, shape)
-    observation = _observation(points, free.reshape(shape), low, edge, shape)
+    observation = _observation(points, told, free.reshape(shape), low, edge, shape)
     high = low + edge * (np.array(shape) - 1)
     origin, top, step = (torch.from_numpy(v.astype(np.float32)) for v in (low, high, np.full(3, edge)))
     function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step), origin, top, 1.0)
@@ -84,7 +97,7 @@ def focused_field(frames: Sequence[Frame], region: OrientedBox, voxel: float | N
     return TransformedField(field, Sim3.from_matrix(T_region_world.tolist()))
 
 
-def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
+def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.bool_] | None) -> _View | None:
     """The pixels whose surface lies in the region; those that share a plane with too few others are left out: at edges
     sensors mix two depths."""
     T_region_camera = T_region_world @ frame.T_world_camera
@@ -105,7 +118,8 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
     if not inside.any():
         return None
     normals = planes.normals[row[inside], column[inside]] @ T_region_camera[:3, :3].T
-    return _View(points[inside], normals, T_camera_region, K, kept, planes.deviations)
+    told = np.zeros(len(points), np.int8) if thing is None else np.where(thing[rows, columns][row, column], 1, -1)
+    return _View(points[inside], normals, told[inside], T_camera_region, K, kept, planes.deviations)
 
 
 def _part(frame: Frame, T_camera_region: Floats, half: Floats) -> tuple[slice, slice]:
@@ -183,9 +197,15 @@ def _distances(
 
 
 def _observation(
-    points: Floats, free: NDArray[np.bool_], low: Floats, edge: float, shape: tuple[int, ...]
+    points: Floats,
+    told: NDArray[np.int8],
+    free: NDArray[np.bool_],
+    low: Floats,
+    edge: float,
+    shape: tuple[int, ...],
 ) -> Observation:
-    """Voxels of two nodes' edge: free where all their nodes are, a surface where a point lies."""
+    """Voxels of two nodes' edge: free where all their nodes are, a surface where a point lies, but for those where
+    points beside the thing lie and none of it."""
     counts = tuple(max(1, -(-(n - 1) // 2)) for n in shape)
     states = np.full(counts, UNSEEN, np.uint8)
     padded = np.zeros(tuple(2 * n for n in counts), np.bool_)
@@ -195,6 +215,15 @@ def _observation(
     blocks = padded.reshape(counts[0], 2, counts[1], 2, counts[2], 2)
     states[blocks.all(axis=(1, 3, 5))] = FREE
     cells = np.floor((points - low) / (2.0 * edge)).astype(np.int64)
-    cells = cells[((cells >= 0) & (cells < np.array(counts))).all(axis=1)]
-    states[tuple(cells.T)] = SURFACE
-    return Observation(torch.from_numpy(states), torch.from_numpy(low.copy()), 2.0 * edge)
+    within = ((cells >= 0) & (cells < np.array(counts))).all(axis=1)
+    surfaces = []
+    for which in (0, -1, 1):
+        surfaces.append(np.zeros(counts, np.bool_))
+        surfaces[-1][tuple(cells[within & (told == which)].T)] = True
+    somebody, beside, thing = surfaces
+    states[somebody] = SURFACE
+    if beside.any():
+        states[beside | (somebody & ndimage.binary_dilation(beside, iterations=2))] = UNSEEN
+    states[thing] = SURFACE
+    of_thing = bool((told != 0).any())
+    return Observation(torch.from_numpy(states), torch.from_numpy(low.copy()), 2.0 * edge, of_thing=of_thing)

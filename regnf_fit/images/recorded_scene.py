@@ -61,7 +61,7 @@ def recorded_scene(
     """
     options = options or RegistrationOptions()
     if isinstance(detection, OrientedBox):
-        box, own, extent = detection, [], float(detection.size.max())
+        box, own, first, extent = detection, [], [], float(detection.size.max())
         unit = _unit(options.robust.object_unit, extent, object_bounds)
     else:
         if not detection:
@@ -84,7 +84,7 @@ def recorded_scene(
         others = [recording.frames[index].read() for index in chosen.indices]
         others = [frame for frame in others if frame.name not in names]
     frames = [*own, *others]
-    field = focused_field(frames, region)
+    field = focused_field(frames, region, things=[one.pixels for one in first])
     frame = own[0] if own else max(frames, key=lambda one: _shown(one, box))
     camera = CameraView(frame.name, Sim3.from_matrix(frame.T_world_camera.tolist()), METERS.get(unit))
     known = replace(options, robust=replace(options.robust, object_unit=unit))
