@@ -19,20 +19,25 @@ import regnf_core
 from regnf_core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from regnf.fitting import fit
+    from regnf.fitting import fit, fuse
+    from regnf.recordings import Frame
+    from regnf.recordings import register as register
+    from regnf.recordings import register_batch as register_batch
+    from regnf.recordings import search as search
     from regnf_client import AsyncClient, Client, Pair, PairResult
-    from regnf_core import *  # noqa: F403 - every name that it lists
+    from regnf_core import *  # type: ignore[assignment]  # noqa: F403 - every other name that it lists
 
 _HOMES = {
     "AsyncClient": "regnf_client",
     "Client": "regnf_client",
     "Pair": "regnf_client",
     "PairResult": "regnf_client",
-    "fit": "regnf.fitting",
+    **dict.fromkeys(("fit", "fuse"), "regnf.fitting"),
+    **dict.fromkeys(("Frame", "register", "register_batch", "search"), "regnf.recordings"),
 }
 """Every other name is regnf_core's."""
 
-__all__ = ["AsyncClient", "Client", "Pair", "PairResult", "fit"]
+__all__ = ["AsyncClient", "Client", "Frame", "Pair", "PairResult", "fit", "fuse"]
 __all__ += regnf_core.__all__
 
 

@@ -1,4 +1,4 @@
-"""``fit`` as users call it: a neural field from a mesh or from posed images."""
+"""``fit`` and ``fuse`` as users call them: a neural field from a mesh or from posed images, a map of depth images."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from regnf_core.errors import InvalidInputError, InvalidOptionsError, suggestion
 from regnf_core.field_files import require_file
 from regnf_core.fields.observation import SdfField
 from regnf_core.in_memory import field_of
 from regnf_core.options import seed_of
-from regnf_data.sdfstudio import load_dataset
+from regnf_data.recordings.images import images_of
+from regnf_data.recordings.opening import is_recording
 from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.fusion import FusionOptions, FusionReport, fuse_images
 from regnf_fit.mesh import fit_field, mesh_target
 from regnf_fit.options import FitOptions, FitReport, ReconstructionOptions, ReconstructionReport
 
@@ -33,7 +38,7 @@ def fit(
 ) -> FitReport | ReconstructionReport:
     """Fit a field, write it to ``output``, a .safetensors file, and say how well it agrees.
 
-    source: a mesh file, any field, a mesh of trimesh or Open3D, or a folder of posed RGB-D images (docs/fitting.md) ·
+    source: a mesh file, any field, a mesh of trimesh or Open3D, or a recording of posed images (docs/datasets.md) ·
     options: entries of FitOptions, or for images of ReconstructionOptions · extent: of a mesh file, the length of its
     longest edge after it has been moved to the origin.
     Raises InvalidOptionsError, InvalidInputError (NO_SURFACE_IN_TARGET ...).
@@ -44,16 +49,36 @@ def fit(
     if not isinstance(source, str | os.PathLike):
         return fit_field(field_of(source, "object"), path, _options(FitOptions, options), seed, progress, label)
     given = Path(source)
-    if given.is_dir():
+    if given.is_dir() or is_recording(given):
         if extent is not None:
             raise InvalidOptionsError("extent is for meshes: a dataset has its own frame", hint="Leave extent out.")
         files = FitFiles(path, path.with_suffix(".checkpoint"))
         chosen = _options(ReconstructionOptions, options)
-        named = {"dataset": given.resolve().name}
-        return reconstruct(load_dataset(given), files, chosen, seed=seed, progress=progress, label=label, source=named)
+        images, named = images_of(given).images, {"dataset": given.resolve().name}
+        return reconstruct(images, files, chosen, seed=seed, progress=progress, label=label, source=named)
     require_file(given)
     target = mesh_target(given, extent)
     return fit_field(target.field, path, _options(FitOptions, options), seed, progress, label, target.source)
+
+
+def fuse(
+    recording: str | os.PathLike[str],
+    output: str | Path,
+    options: Mapping[str, Any] | None = None,
+    bounds: ArrayLike | None = None,
+    progress: Callable[[int], None] | None = None,
+    label: str | None = None,
+) -> FusionReport:
+    """Fuse a recording's depth images to a map, write it to ``output``, a .safetensors file, and say what was made.
+
+    recording: a path, in any layout of docs/datasets.md · options: entries of FusionOptions · bounds: (2, 3), lowest
+    and highest corner of what the map covers; None: what the images show · progress: told of the images that are fused.
+    Raises InvalidOptionsError, InvalidInputError, DatasetError (DATASET_FRAMES_DISAGREE ...).
+    """
+    path, chosen = _checked_output(Path(output)), _options(FusionOptions, options)
+    box = None if bounds is None else np.asarray(bounds, np.float64).reshape(2, 3)
+    images = images_of(recording, None, box).images
+    return fuse_images(images, path, chosen, progress, label, {"dataset": Path(recording).resolve().name})
 
 
 def _checked_output(path: Path) -> Path:

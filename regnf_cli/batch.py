@@ -20,9 +20,10 @@ import typer
 
 from regnf_cli.batch_file import FilePair, ResultsFile, read_pairs
 from regnf_cli.guard import require
-from regnf_cli.options import Server, Token, WorkerTimeout, client_of
+from regnf_cli.options import Server, Token, WorkerTimeout, client_of, is_recording
+from regnf_cli.registration import place_of
 from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, progress, tell
-from regnf_core.detections import parse_detection, require_in_scene
+from regnf_core.detections.images import read_detection
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.field_source import find_source
 from regnf_core.options import RegistrationOptions, RobustOptions
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from regnf_client import Client, PairResult
     from regnf_core.fields.observation import SdfField
     from regnf_core.library import ObjectModel
+    from regnf_data.recordings.recording import Recording
 
 
 # Registering many pairs here: processes that keep fields and object models open from one pair to the next.
@@ -121,32 +123,33 @@ def failure(error: RegnfError) -> dict[str, Any]:
 
 def _document(pair: FilePair) -> dict[str, Any]:
     from regnf_core.document import ranking_document, result_document
-    from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.library import LibraryObject, register, search_library
 
     request = pair.request or {}
     options = RegistrationOptions.from_dict(request["options"])
-    detection, scene = parse_detection(request["detection"]), _field(pair.scene, "scene")
-    lower, upper = scene.bounds.tolist()
-    require_in_scene(detection, (lower, upper))
-    box = OrientedBox.from_detection(detection)
+    where = partial(place_of, _scene(pair.scene), read_detection(request["detection"]), options, Path(pair.scene))
     start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
     if pair.is_search:
         _require_nothing_of_one_object(request)
         samples = options.robust.object_samples
         library = [LibraryObject(one, partial(_field, one, "object"), _model(one, samples)) for one in pair.objects]
-        found = search_library(scene, box, library, options, request["seed"], clouds=False)
+        place = where()
+        found = search_library(place.field, place.box, library, place.options, request["seed"], clouds=False)
         ranking = ranking_document(found.ranking, {})
-        return dict(result_document(found.result, object_name=found.ranking[0].name, candidates=ranking))
+        result = replace(found.result, camera=place.camera)
+        return dict(result_document(result, object_name=found.ranking[0].name, candidates=ranking))
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
     initial = None if start is None else Sim3.from_matrix(start)
     # errors against a truth are those of the clouds' points
     clouds = truth is not None
     obj = _field(name, "object")
-    result = register(scene, obj, box, options, request["seed"], None, initial, model, clouds)
-    return dict(result_document(result, None if truth is None else Sim3.from_matrix(truth)))
+    place = where(obj, model)
+    result = register(place.field, obj, place.box, place.options, request["seed"], None, initial, model, clouds)
+    return dict(
+        result_document(replace(result, camera=place.camera), None if truth is None else Sim3.from_matrix(truth))
+    )
 
 
 def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
@@ -157,6 +160,15 @@ def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
             hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
             message = f"`{name}` applies to one object, not to several candidates"
             raise InvalidInputError(message, reason=reason, hint=hint)
+
+
+@lru_cache(_FIELDS_OPEN)
+def _scene(path: str) -> SdfField | Recording:
+    if is_recording(Path(path)):
+        from regnf_data.recordings.opening import open_recording
+
+        return open_recording(path)
+    return _field(path, "scene")
 
 
 @lru_cache(_FIELDS_OPEN)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from regnf_cli.options import as_transform, is_json
-from regnf_core.detections import parse_detection
+from regnf_core.detections.images import plain_values, read_detection
 from regnf_core.errors import InvalidInputError, RegnfError, suggestion
 from regnf_core.options import RegistrationOptions
 from regnf_core.texts import TextError, decode_text, json_value
@@ -201,7 +201,7 @@ def _request(folder: Path, given: Mapping[str, Any]) -> dict[str, Any]:
         raise _wrong("`seed` is no number from 0 to 2^32 - 1")
     if not isinstance(given.get("pictures", True), bool):
         raise _wrong("`pictures` is neither true nor false")
-    detection = parse_detection(box, given.get("detection_index")).canonical()
+    detection = plain_values(read_detection(box, given.get("detection_index"), folder))
     more = {name: given[name] for name in _MORE if given.get(name) is not None}
     for name in {"initial_transform", "ground_truth"} & more.keys():
         more[name] = as_transform(_value(folder, more[name]), f"`{name}`")

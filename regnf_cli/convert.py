@@ -7,26 +7,29 @@ import tempfile
 from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from rich.progress import TimeElapsedColumn
 
 from regnf_cli.guard import require
-from regnf_cli.options import Config, Description, Field, NoConfig, check_output, choice_of, existing, folder, source_of
+from regnf_cli.options import (
+    CameraAxes,
+    Config,
+    Description,
+    Field,
+    NoConfig,
+    check_output,
+    choice_of,
+    existing,
+    folder,
+    source_of,
+)
 from regnf_cli.report import err, progress, say, tell, warn
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.field_source import FieldSource
 
 # What is said of cameras at the command line: the options, and the entries of a description that they become.
-
-
-CameraAxes = Annotated[
-    Literal["opencv", "opengl"] | None,
-    typer.Option(
-        "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
-    ),
-]
 
 
 def with_cameras(description: dict[str, Any] | None, intrinsics: str | None, axes: str | None) -> dict[str, Any] | None:
@@ -141,8 +144,8 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
 
 
 def _keep_what_was_seen(field: Path, images: Path, opengl: bool) -> None:
+    from regnf_data.agreement import check_agreement
     from regnf_data.sdfstudio import load_dataset
-    from regnf_fit.images.checks import check_agreement
     from regnf_fit.images.observing import attach_observation
 
     given = load_dataset(images, opengl=opengl)

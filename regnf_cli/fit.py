@@ -8,21 +8,28 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.progress import MofNCompleteColumn
 
-from regnf_cli.convert import CameraAxes
 from regnf_cli.guard import require
-from regnf_cli.options import Seed, check_output
+from regnf_cli.options import CameraAxes, DepthUnit, Intrinsics, Layout, Seed, check_output, given_of, is_recording
 from regnf_cli.report import out, progress, tell, warn
 from regnf_core.errors import InvalidOptionsError
+
+if TYPE_CHECKING:
+    from regnf_data.posed_images import PosedImages
+    from regnf_data.recordings.recording import Given
 
 _LONGEST_LABEL = 200  # of the safe format
 
 
 SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
+Bounds = Annotated[
+    str | None,
+    typer.Option(help="Images: what the field covers, world. By default what they show.", metavar="X,Y,Z,X,Y,Z"),
+]
 Label = Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")]
 
 
@@ -41,14 +48,15 @@ def print_report(figures: dict[str, Any]) -> None:
     warn(warnings)
 
 
-_OF_IMAGES_UNSAID = (None, None, False, "auto", False, "auto", None)
+_OF_IMAGES_UNSAID = (None, None, False, "auto", False, "auto", None, None, None, None)
 
 
 def fit(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True
+            help="A mesh (glb, obj, ply, stl), or a recording: posed images in any layout of docs/datasets.md.",
+            exists=True,
         ),
     ],
     output: SafeField,
@@ -89,6 +97,10 @@ def fit(
         bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
     ] = False,
     device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Images: where to compute.")] = "auto",
+    bounds: Bounds = None,
+    depth_unit: DepthUnit = None,
+    intrinsics: Intrinsics = None,
+    layout: Layout = None,
     axes: CameraAxes = None,
 ) -> None:
     """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
@@ -101,7 +113,6 @@ def fit(
     check_field_to_write(output, label)
     if extent is not None and not 0.0 < extent < math.inf:
         raise InvalidOptionsError("the extent must be positive")
-    from regnf_data.sdfstudio import load_dataset
     from regnf_fit.images.fit import FitFiles, reconstruct
     from regnf_fit.mesh import fit_field, mesh_target
     from regnf_fit.options import FitOptions, ReconstructionOptions
@@ -109,7 +120,7 @@ def fit(
     given = {"iterations": iterations, "hidden_width": hidden_width}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     rest: dict[str, Any] = {"seed": seed, "label": label}
-    if source.is_dir():
+    if source.is_dir() or layout is not None or is_recording(source):
         if extent is not None:
             raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
         wanted = ReconstructionOptions(**settings, table_log2=table_log2, start=start, refine_poses=refine_poses)
@@ -118,13 +129,15 @@ def fit(
         rest |= {"device": device, "source": {"dataset": source.resolve().name}}
         with _fitting() as (say, report):
             say("reading the images")
-            images = load_dataset(source, opengl=axes == "opengl")
+            images = _taken(source, given_of(depth_unit, intrinsics, layout, axes), bounds)
             say("laying out the rays")
             fitted = reconstruct(images, files, wanted, progress=report, **rest)
         print_report(asdict(fitted))
         return
-    if (snapshots, sdfstudio, pictures, start, refine_poses, device, axes) != _OF_IMAGES_UNSAID:
-        named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device and --camera-axes"
+    of_images = snapshots, sdfstudio, pictures, start, refine_poses, device, bounds, depth_unit, intrinsics, axes
+    if of_images != _OF_IMAGES_UNSAID:
+        named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device, --bounds, --depth-unit,"
+        named += " --intrinsics, --layout and --camera-axes"
         raise InvalidOptionsError(f"{named} are for images")
     options = FitOptions(**settings)
     if table_log2 is not None:
@@ -172,13 +185,17 @@ def shares(percents: str | None) -> tuple[float, ...]:
 
 
 def fuse(
-    images: Annotated[
-        Path, typer.Argument(help="A folder of posed RGB-D images with meta_data.json.", exists=True, file_okay=False)
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="Depth images with cameras and poses: a folder in any layout of docs/datasets.md, or a bag.",
+            exists=True,
+        ),
     ],
     output: SafeField,
     voxel: Annotated[
         float | None,
-        typer.Option(help="From node to node, the dataset's units; without it as wide as a pixel is at its surface."),
+        typer.Option(help="From node to node, the recording's units; without it as wide as a pixel is at its surface."),
     ] = None,
     truncation: Annotated[
         float | None,
@@ -189,9 +206,15 @@ def fuse(
         ),
     ] = None,
     label: Label = None,
+    bounds: Bounds = None,
+    depth_unit: DepthUnit = None,
+    intrinsics: Intrinsics = None,
+    layout: Layout = None,
     axes: CameraAxes = None,
 ) -> None:
     """Fuse posed depth images to a map, with what they have seen of it: seconds, where a fit takes minutes.
+
+    Images that contradict each other, as by a wrong unit or wrong axes, are refused with what mends it.
 
     Example: **regnf fuse room-images room.safetensors**
     """
@@ -199,20 +222,41 @@ def fuse(
     check_field_to_write(output, label)
     if voxel is not None and not 1e-9 <= voxel <= 1e6:
         raise InvalidOptionsError("the voxel's edge must lie between 1e-9 and 1e6")
-    from regnf_data.sdfstudio import load_dataset
     from regnf_fit.images.fusion import FusionOptions, fuse_images
 
+    said = given_of(depth_unit, intrinsics, layout, axes)
     with progress(MofNCompleteColumn()) as bar:
         task = bar.add_task("reading the images", total=None)
-        given = load_dataset(images, opengl=axes == "opengl")
-        bar.update(task, description="fusing", total=len(given))
+        taken = _taken(recording, said, bounds, lambda done, total: bar.update(task, completed=done, total=total))
+        bar.update(task, description="fusing", completed=0, total=len(taken))
         report = fuse_images(
-            given,
+            taken,
             output,
             FusionOptions(voxel, truncation),
             progress=lambda done: bar.update(task, completed=done),
             label=label,
-            source={"dataset": images.resolve().name},
+            source={"dataset": recording.resolve().name},
         )
-        bar.update(task, completed=len(given))
+        bar.update(task, completed=len(taken))
     print_report(asdict(report))
+
+
+def _taken(
+    source: Path, said: Given, bounds: str | None, report: Callable[[int, int], None] | None = None
+) -> PosedImages:
+    """The images of a recording; what was taken for granted is said."""
+    import numpy as np
+
+    from regnf_data.recordings.images import images_of
+
+    box = None
+    if bounds is not None:
+        try:
+            box = np.array([float(one) for one in bounds.split(",")]).reshape(2, 3)
+        except ValueError as error:
+            message = f"--bounds {bounds[:200]}: expected six numbers, the lowest corner and the highest"
+            raise InvalidOptionsError(message, hint="Give for example --bounds=-1,-1,0,1,1,2.") from error
+    taken = images_of(source, said, box, progress=report)
+    for note in taken.notes:
+        tell(f"note: {note}")
+    return taken.images

@@ -1,31 +1,49 @@
-"""``regnf inspect``: what a file holds, and whether it looks like a signed distance field."""
+"""``regnf inspect``: what a file holds, and whether it looks like a signed distance field; or what a recording is."""
 
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from regnf_cli.guard import require
-from regnf_cli.options import Config, Description, Field, NoConfig, choice_of, source_of
+from regnf_cli.options import (
+    CameraAxes,
+    Config,
+    DepthUnit,
+    Description,
+    FieldOrRecording,
+    Intrinsics,
+    Layout,
+    NoConfig,
+    choice_of,
+    given_of,
+    is_recording,
+    source_of,
+)
 from regnf_cli.report import out, say, tell
-from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError, filled_folder
+from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError, atomic_path, filled_folder
 from regnf_core.library_entries import shown_number
+
+if TYPE_CHECKING:
+    from regnf_data.recordings.recording import Given
 
 
 def inspect(
-    field: Field,
+    field: FieldOrRecording,
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
     picture: Annotated[
-        Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
+        Path | None,
+        typer.Option(help="A PNG to write: two views and a section; of a recording images and a plan.", dir_okay=False),
     ] = None,
     candidates: Annotated[
         Path | None,
@@ -36,8 +54,13 @@ def inspect(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    depth_unit: DepthUnit = None,
+    intrinsics: Intrinsics = None,
+    layout: Layout = None,
+    axes: CameraAxes = None,
 ) -> None:
-    """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility.
+    """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility. Or what a
+    recording is (depth images with their cameras): layout, units, cameras, and whether its frames agree.
 
     Example: **regnf inspect step-000030000.ckpt --picture chair.png**
 
@@ -50,6 +73,12 @@ def inspect(
     if candidates is not None and not candidates.parent.is_dir():
         message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
         raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
+    said = given_of(depth_unit, intrinsics, layout, axes)
+    if layout is not None or is_recording(field):
+        more = {"--depth-unit": depth_unit, "--intrinsics": intrinsics, "--layout": layout, "--camera-axes": axes}
+        named = [str(field), *(word for name, value in more.items() if value for word in (name, value))]
+        _inspect_recording(field, said, picture, as_json, shlex.join(named))
+        return
     from regnf_core.importing.gate.gate import import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
 
@@ -67,6 +96,26 @@ def inspect(
         out.print_json(json.dumps(report))
     else:
         _show(report)
+
+
+def _inspect_recording(path: Path, said: Given, picture: Path | None, as_json: bool, named: str) -> None:
+    """named: the recording, as the commands that come next name it."""
+    from regnf_data.recordings.opening import open_recording
+    from regnf_fit.images.inspecting import inspect_recording
+
+    recording = open_recording(path, said)
+    found = inspect_recording(recording, said)
+    if picture is not None:
+        with atomic_path(picture) as temporary:
+            found.picture.save(temporary, "PNG")
+    if as_json:
+        out.print_json(json.dumps({"name": recording.name, **found.report}))
+        return
+    _show({"name": recording.name, **found.report})
+    out.print("next:")
+    say(f"  regnf register {named} object.stl --detection detection.json --output out/")
+    if len(recording) > 1:
+        say(f"  regnf fuse {named} map.safetensors")
 
 
 @contextmanager

@@ -5,16 +5,19 @@ The name of an option is its parameter's. Its default stands in the command's si
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from regnf_cli.report import tell
-from regnf_core.detections import Detection, parse_detection
+from regnf_core.detections import images as detections
+from regnf_core.detections.images import AnyDetection
 from regnf_core.errors import (
     RECORDING_SUFFIX,
+    DatasetError,
     FieldFormatError,
     InvalidDetectionError,
     InvalidInputError,
@@ -23,12 +26,13 @@ from regnf_core.errors import (
 )
 from regnf_core.field_files import require_field_file, require_file
 from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
-from regnf_core.options import Preset, RegistrationOptions
+from regnf_core.options import METERS, Preset, RegistrationOptions, Unit
 from regnf_core.rotations import Rows, transform_rows
 from regnf_core.texts import json_value
 
 if TYPE_CHECKING:
     from regnf_client import Client
+    from regnf_data.recordings.recording import Given
 
 # Files named at the command line: a name that cannot be used is refused with the one that was meant.
 
@@ -57,8 +61,19 @@ folder = _parser(_no_folder, folders=True)
 existing = _parser(require_file, folders=True)
 field_path = _parser(lambda path: find_source(path, config=False))
 """Of a field: a file, a training run's folder or an archive."""
+scene_path = _parser(lambda path: is_recording(path) or find_source(path, config=False), folders=True)
+"""Of a field, or of a recording: depth images with their cameras."""
 library_path = _parser(require_field_file, folders=True)
 """A folder of fields, or a field."""
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a recording's; never without the engine's extra, which reads them."""
+    try:
+        from regnf_data.recordings.opening import is_recording as known
+    except ModuleNotFoundError:
+        return False
+    return known(path)
 
 
 def output_folder(text: str) -> Path:
@@ -111,10 +126,10 @@ _TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: s
 _TRANSFORM += ' or {"T_scene_object": ...}: object coordinates to scene coordinates.'
 
 
-def read_detection(path: Path, index: int | None = None) -> Detection:
+def read_detection(path: Path, index: int | None = None) -> AnyDetection:
     """The detection in a file, in any form. Raises InvalidInputError (MALFORMED_JSON) and InvalidDetectionError."""
     try:
-        return parse_detection(read_json(path, "detection"), index)
+        return detections.read_detection(read_json(path, "detection"), index, path.parent)
     except InvalidDetectionError as error:
         message = f"{path}: {error}"
         raise InvalidDetectionError(message, reason=error.reason, hint=error.hint, place=error.place) from error
@@ -129,8 +144,10 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
     raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
 
 
-def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
-    """Plain options: those of a file, or none, with the preset that was asked for by name.
+def read_options(
+    path: Path | None, preset: Preset | None, unit: Unit | None = None, scale: str = "known"
+) -> dict[str, Any]:
+    """Plain options: those of a file, or none, with the preset that was asked for by name, and the object's unit.
 
     Raises InvalidOptionsError when the file names another preset, or holds what is no option.
     """
@@ -139,6 +156,9 @@ def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
     if preset is not None and named != preset:
         raise InvalidOptionsError(f"options.preset: {path} says {named!r}, --preset {preset}: leave one of them out")
     options = values | {"preset": named} if named is not None else values
+    if unit is not None or scale == "free":
+        robust = options.get("robust", {})
+        options = options | {"robust": robust | {"object_unit": "free" if scale == "free" else unit}}
     try:
         RegistrationOptions.from_dict(options)
     except InvalidOptionsError as error:
@@ -203,12 +223,28 @@ def source_of(
     path: Path, said: Mapping[str, Any] | None, settings: SettingsChoice = None, role: Role | None = None
 ) -> FieldSource:
     """What a path stands for; the settings that were found are said. Raises what ``find_source`` does."""
-    source = find_source(path, said, settings, role)
+    try:
+        source = find_source(path, said, settings, role)
+    except FieldFormatError as error:
+        if error.reason != "RUN_WITHOUT_CHECKPOINT" or role == "object" or not path.is_dir():
+            raise
+        raise FieldFormatError(f"{error}. {_no_recording(path)}", reason=error.reason, hint=error.hint) from error
     if source.file != path:
         tell(f"checkpoint: {source.file}")
     if source.settings:
         tell(f"settings: {', '.join(source.settings_names)}")
     return source
+
+
+def _no_recording(path: Path) -> str:
+    """Why a folder is no recording either, in words."""
+    from regnf_data.recordings.opening import open_recording
+
+    try:
+        open_recording(path.resolve())
+    except DatasetError as error:
+        return str(error)
+    return ""
 
 
 DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
@@ -218,6 +254,12 @@ DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
 # a field by itself
 
 Field = Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)]
+FieldOrRecording = Annotated[
+    Path,
+    typer.Argument(
+        help="A field, or a recording: a folder of depth images, a bag.", parser=scene_path, metavar="FIELD|RECORDING"
+    ),
+]
 Description = Annotated[
     dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
 ]
@@ -230,10 +272,17 @@ NoConfig = Annotated[bool, typer.Option("--no-config", help="Leave settings that
 
 Scene = Annotated[
     Path,
-    typer.Argument(help="The scene's field: a file, a run's folder or an archive.", **FIELD | {"metavar": "SCENE"}),
+    typer.Argument(
+        help="The scene: a field (a file, a run's folder or an archive), or a recording (depth images, a bag).",
+        parser=scene_path,
+        metavar="SCENE",
+    ),
 ]
 DetectionFile = Annotated[
-    Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **FILE)
+    Path,
+    typer.Option(
+        help="JSON: a box in the scene's frame and units, or of a recording a mask, box or point in an image.", **FILE
+    ),
 ]
 DetectionIndex = Annotated[
     int | None, typer.Option(min=0, help="Which one, where the file holds a list of detections; 0 is the first.")
@@ -245,6 +294,73 @@ NoConfigs = Annotated[bool, typer.Option("--no-config", help="Leave settings tha
 SceneDescription = Annotated[
     dict[str, Any] | None, typer.Option(help="What the scene's file does not say: a file or JSON.", **DESCRIPTION)
 ]
+
+ObjectUnit = Annotated[
+    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 1 %.")
+]
+Scale = Annotated[
+    Literal["known", "free"], typer.Option(help="free: whatever the object's unit is, the scale is not known.")
+]
+
+# what a recording does not say, or says wrongly
+
+CameraAxes = Annotated[
+    Literal["opencv", "opengl"] | None,
+    typer.Option(
+        "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
+    ),
+]
+DepthUnit = Annotated[
+    str | None,
+    typer.Option(help="Of depth images: m, cm, mm, meters a step or steps a meter. By default what the layout says."),
+]
+Intrinsics = Annotated[
+    str | None,
+    typer.Option(help="Of the depth images' camera: a file, or numbers in pixels.", metavar="FILE|FX,FY,CX,CY[,W,H]"),
+]
+Layout = Annotated[str | None, typer.Option(help="Of the recording, where another one is found: bop, tum ...")]
+
+
+def given_of(
+    depth_unit: str | None = None,
+    intrinsics: str | None = None,
+    layout: str | None = None,
+    axes: Literal["opencv", "opengl"] | None = None,
+) -> Given:
+    """What these options say of a recording. Raises InvalidOptionsError, DatasetError (DATASET_INTRINSICS_INVALID)."""
+    from regnf_data.recordings.camera import camera_of, read_camera_file
+    from regnf_data.recordings.camera import depth_unit as step_of
+    from regnf_data.recordings.recording import Given
+
+    step = None
+    if depth_unit is not None:
+        step = {str(name): meters for name, meters in METERS.items()}.get(depth_unit) or step_of(_positive(depth_unit))
+        if step is None:
+            hint = "Give mm, m, or meters a step such as 0.001 or 0.0002, or steps a meter such as 5000."
+            raise InvalidOptionsError(f"--depth-unit {depth_unit}: no unit of depth images", hint=hint)
+    camera = None
+    if intrinsics is not None and Path(intrinsics).is_file():
+        found = read_camera_file(Path(intrinsics))
+        camera, step = (found.camera, step or found.depth_unit) if found else (None, step)
+    elif intrinsics is not None and len(numbers := [_positive(one) for one in intrinsics.split(",")]) in (4, 6):
+        size = (int(numbers[5]), int(numbers[4])) if numbers[4:] else None
+        fx, fy, cx, cy = numbers[:4]
+        if all(numbers):
+            camera = camera_of(fx, fy, cx, cy, size, whole_centers=True).check("--intrinsics")
+    if intrinsics is not None and camera is None:
+        hint = "Give fx,fy,cx,cy in pixels, or a file of Open3D, RealSense, ROS or a 3x3 matrix."
+        raise InvalidOptionsError(f"--intrinsics {intrinsics[:200]}: no intrinsics", hint=hint)
+    return Given(camera, step, layout, axes)
+
+
+def _positive(text: str) -> float:
+    """The number in a text; 0 where there is none above 0, or no finite one."""
+    try:
+        number = float(text)
+    except ValueError:
+        return 0.0
+    return number if 0.0 < number < math.inf else 0.0
+
 
 # the work and its result
 

@@ -7,20 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.registration import Files, answer, check_box
+from regnf_cli.registration import Files, answer, check_box, image_detection_in_field
 from regnf_cli.report import tell
 from regnf_core.detections import Detection
+from regnf_core.detections.images import AnyDetection, plain_values
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.field_files import library_files, stored_bounds
-from regnf_core.field_source import FieldSource
+from regnf_core.field_source import FieldSource, SettingsChoice
 from regnf_core.library_folder import LibraryFolder
 from regnf_core.options import Preset, RegistrationOptions
+
+if TYPE_CHECKING:
+    from regnf_data.recordings.recording import Recording
 
 LibraryObject = Annotated[
     Path, typer.Argument(help="The library object's field, in the same forms.", **cli.FIELD | {"metavar": "OBJECT"})
@@ -52,6 +56,12 @@ def register(
     ground_truth: Annotated[
         Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **cli.FILE)
     ] = None,
+    object_unit: cli.ObjectUnit = None,
+    scale: cli.Scale = "known",
+    depth_unit: cli.DepthUnit = None,
+    intrinsics: cli.Intrinsics = None,
+    layout: cli.Layout = None,
+    camera_axes: cli.CameraAxes = None,
     seed: cli.Seed = 0,
     output: cli.Output = None,
     recording: cli.Recording = None,
@@ -67,8 +77,8 @@ def register(
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.
     """
-    box = cli.read_detection(detection, detection_index)
-    request = _request(box, cli.read_options(options, preset), seed)
+    found = cli.read_detection(detection, detection_index)
+    request = _request(found, cli.read_options(options, preset, object_unit, scale), seed)
     if initial_transform and RegistrationOptions.from_dict(request["options"]).preset != "robust":
         raise InvalidInputError(
             "only the preset robust starts from a given transform",
@@ -84,18 +94,40 @@ def register(
     elif recording is not None:
         hint = "Leave --server out, or look at the page of the job."
         raise InvalidOptionsError("--recording is for registrations that are done here", hint=hint)
-    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
+    said = depth_unit, intrinsics, layout, camera_axes
     thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
-    if place.file.samefile(thing.file):
-        tell(f"warning: scene and object are the same file, {scene}")
-    check_box(place.file, box, stored_bounds(place.file), stored_bounds(thing.file))
+    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), thing, said)
     client = cli.client_of(server, token, worker_timeout)
     answer(place, thing, request, Files(output, recording), client, None, cancel_on_interrupt, as_json)
 
 
-def _request(box: Detection, options: dict[str, Any], seed: int) -> dict[str, Any]:
-    asked = {"detection": box.canonical(), "options": options, "seed": seed}
+def _request(detection: AnyDetection, options: dict[str, Any], seed: int) -> dict[str, Any]:
+    asked = {"detection": plain_values(detection), "options": options, "seed": seed}
     return asked | {"initial_transform": None, "ground_truth": None}
+
+
+def _place(
+    scene: Path,
+    detection: AnyDetection,
+    description: dict[str, Any] | None,
+    settings: SettingsChoice,
+    thing: FieldSource | None,
+    said: tuple[Any, ...],
+) -> FieldSource | Recording:
+    """The scene's field, or a recording; a box outside of it is refused. thing: the only object · said: of the
+    recording, as ``cli.given_of`` takes it."""
+    if any(said) or cli.is_recording(scene):
+        from regnf_data.recordings.opening import open_recording
+
+        return open_recording(scene, cli.given_of(*said))
+    place = cli.source_of(scene, description, settings, "scene")
+    if not isinstance(detection, Detection):
+        raise image_detection_in_field(scene)
+    if thing is not None and place.file.samefile(thing.file):
+        tell(f"warning: scene and object are the same file, {scene}")
+    bounds = None if thing is None else stored_bounds(thing.file)
+    check_box(place.file, detection, stored_bounds(place.file), bounds)
+    return place
 
 
 # The objects of a search: entries of libraries by their names, and fields by their files.
@@ -123,6 +155,12 @@ def search(
     object_description: Annotated[
         dict[str, Any] | None, typer.Option(help="The same of every object.", **cli.DESCRIPTION)
     ] = None,
+    object_unit: cli.ObjectUnit = None,
+    scale: cli.Scale = "known",
+    depth_unit: cli.DepthUnit = None,
+    intrinsics: cli.Intrinsics = None,
+    layout: cli.Layout = None,
+    camera_axes: cli.CameraAxes = None,
     seed: cli.Seed = 0,
     output: cli.Output = None,
     server: cli.Server = None,
@@ -138,16 +176,16 @@ def search(
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
     """
-    box = cli.read_detection(detection, detection_index)
-    request = _request(box, cli.read_options(options, None), seed)
+    found = cli.read_detection(detection, detection_index)
+    request = _request(found, cli.read_options(options, None, object_unit, scale), seed)
     if RegistrationOptions.from_dict(request["options"]).preset != "robust":
         message = f"{options}: only the preset robust searches a library"
         hint = "Leave the preset out of the options."
         raise InvalidInputError(message, reason="PRESET_UNSUITABLE", hint=hint)
     if server is None:
         require("engine")
-    place = cli.source_of(scene, scene_description, cli.choice_of(scene_config, no_config), "scene")
-    check_box(place.file, box, stored_bounds(place.file))
+    said = depth_unit, intrinsics, layout, camera_axes
+    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), None, said)
     objects: list[FieldSource] = []
     if server is None or library:
         for one in _objects_of(library, tag):

@@ -6,7 +6,7 @@ The request is the same in both places: the members of POST /register but the fi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,24 +14,27 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from regnf_cli.report import exit_code, reporting, show, tell
-from regnf_core.detections import Bounds, Detection, parse_detection, require_in_scene
+from regnf_core.detections import Bounds, Detection, require_in_scene
+from regnf_core.detections.images import AnyDetection, read_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfaceError, filled_folder, require_writable
 from regnf_core.field_source import FieldSource
 from regnf_core.options import RegistrationOptions, RobustOptions
 
 if TYPE_CHECKING:
     from regnf_client import Client, Job
-    from regnf_core.document import RegistrationResult
+    from regnf_core.document import CameraView, RegistrationResult
+    from regnf_core.field_notes import FieldNotes
     from regnf_core.fields.observation import SdfField
     from regnf_core.geometry.box import OrientedBox
-    from regnf_core.library import LibraryObject
+    from regnf_core.library import LibraryObject, ObjectModel
+    from regnf_data.recordings.recording import Frame, Recording
 
 Objects = FieldSource | list[FieldSource]
 """One object to register, or several to search among."""
 
 
 def answer(
-    scene: FieldSource,
+    scene: FieldSource | Recording,
     objects: Objects,
     request: dict[str, Any],
     files: Files,
@@ -70,14 +73,21 @@ class Files:
             if folder is not None:
                 require_writable(folder)
 
-    def write(self, result: RegistrationResult, box: OrientedBox, **said: Any) -> None:
-        """Write what is wanted, each file whole or not at all; ``said`` goes on to ``write_artifacts``."""
+    def write(
+        self, result: RegistrationResult, box: OrientedBox, more: Callable[[Path], None] | None = None, **said: Any
+    ) -> None:
+        """Write what is wanted, each file whole or not at all; ``said`` goes on to ``write_artifacts``.
+
+        more: writes into the folder too.
+        """
         from regnf_core.viewing.artifacts import write_artifacts
         from regnf_core.viewing.recording import write_recording
 
         if self.output is not None:
             with filled_folder(self.output) as folder:
                 write_artifacts(result, folder, **said)
+                if more is not None:
+                    more(folder)
         if self.recording is not None:
             write_recording(result, self.recording, box, said["object_name"])
 
@@ -92,45 +102,121 @@ class Files:
 # In this process.
 
 
-def register_here(scene: FieldSource, objects: Objects, request: dict[str, Any], files: Files) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where one thing is looked for: a scene's field and a box, or the region of a recording. image: that of the
+    detection, for the overlay."""
+
+    field: SdfField
+    box: OrientedBox
+    options: RegistrationOptions
+    camera: CameraView | None = None
+    image: Frame | None = None
+    notes: tuple[str, ...] = ()
+
+
+def register_here(
+    scene: FieldSource | Recording, objects: Objects, request: dict[str, Any], files: Files
+) -> dict[str, Any]:
     """The result document, once the files are written."""
     from regnf_core.document import ranking_document, result_document
-    from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.library import register, search_library
-    from regnf_core.loading import import_smallest_first, load_field, safe_field
+    from regnf_core.loading import import_smallest_first, load_field
+    from regnf_core.object_models import object_model
 
-    options = RegistrationOptions.from_dict(request["options"])
-    detection = parse_detection(request["detection"])
-    box, seed = OrientedBox.from_detection(detection), request["seed"]
+    options, seed = RegistrationOptions.from_dict(request["options"]), request["seed"]
+    detection = read_detection(request["detection"])
     wanted = files != Files()
     said: dict[str, Any] = {}
     files.check()
+    named = [scene, *(objects if isinstance(objects, list) else [objects])]
     with reporting("loading") as report:
-        if isinstance(objects, list):
-            import_smallest_first((scene, *objects))
+        import_smallest_first([one for one in named if isinstance(one, FieldSource)])
+        notes: dict[str, FieldNotes] = {}
+        seen: SdfField | Recording
+        if isinstance(scene, FieldSource):
             opened = load_field(scene)
-            check_box(scene.named, detection, _bounds_of(opened.field))
+            seen, notes["scene"] = opened.field, opened.notes
+        else:
+            seen = scene
+        where = partial(place_of, seen, detection, options, scene_name(scene))
+        if isinstance(objects, list):
+            place = where()
             library, unusable = _modeled(objects, options.robust, partial(report, "library"))
-            found = search_library(opened.field, box, library, options, seed, report, clouds=wanted)
+            found = search_library(place.field, place.box, library, place.options, seed, report, clouds=wanted)
             result, name = found.result, found.ranking[0].name
             said["candidates"] = ranking_document(found.ranking, unusable)
-            notes = safe_field(next(one for one in objects if str(one.named) == name)).notes
+            obj = load_field(next(one for one in objects if str(one.named) == name))
         else:
-            import_smallest_first((scene, objects))
             obj = load_field(objects)
-            opened = load_field(scene)
-            check_box(scene.named, detection, _bounds_of(opened.field), _bounds_of(obj.field))
+            model = None if notes else object_model(objects, options.robust)
+            place = where(obj.field, model)
             start, truth = request["initial_transform"], request["ground_truth"]
             initial = Sim3.from_matrix(start) if start else None
             said["truth"] = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
-            result = register(opened.field, obj.field, box, options, seed, report, initial, clouds=wanted)
-            name, notes = str(objects.named), obj.notes
+            result = register(
+                place.field, obj.field, place.box, place.options, seed, report, initial, model, clouds=wanted
+            )
+            name = str(objects.named)
+        result = replace(result, camera=place.camera)
         report("exporting", 1.0)
-    said |= {"object_name": name, "fields": {"scene": opened.notes, "object": notes}}
-    files.write(result, box, **said)
+    for note in place.notes:
+        tell(f"note: {note}")
+    said |= {"object_name": name, "fields": notes | {"object": obj.notes}}
+    files.write(result, place.box, partial(_overlay, result, place.image, obj.field), **said)
     document: dict[str, Any] = result_document(result, **said)
     return document
+
+
+def place_of(
+    scene: SdfField | Recording,
+    detection: AnyDetection,
+    options: RegistrationOptions,
+    named: Path,
+    obj: SdfField | None = None,
+    model: ObjectModel | None = None,
+) -> Place:
+    """named: the scene's path · obj, model: of the only object; of a recording, the object's size tells its unit.
+
+    Raises InvalidDetectionError, DatasetError.
+    """
+    from regnf_core.geometry.box import OrientedBox
+    from regnf_data.recordings.recording import Recording
+
+    box = OrientedBox.from_detection(detection) if isinstance(detection, Detection) else None
+    if not isinstance(scene, Recording):
+        if box is None or not isinstance(detection, Detection):
+            raise image_detection_in_field(named)
+        check_box(named, detection, _bounds_of(scene), None if obj is None else _bounds_of(obj))
+        return Place(scene, box, options)
+    from regnf_fit.images.recorded_scene import recorded_scene
+
+    bounds = None if model is None else model.bounds.numpy()
+    where = box if isinstance(detection, Detection) else detection
+    assert where is not None
+    seen = recorded_scene(scene, where, bounds, options)
+    return Place(seen.field, seen.box, seen.options, seen.camera, seen.frame, seen.notes)
+
+
+def scene_name(scene: FieldSource | Recording) -> Path:
+    """As the user named it."""
+    return scene.named if isinstance(scene, FieldSource) else Path(scene.name)
+
+
+def image_detection_in_field(scene: object) -> InvalidDetectionError:
+    """The error for a mask, a box in pixels or a point where the scene has no images."""
+    return InvalidDetectionError(
+        f"the detection is about an image, and {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
+    )
+
+
+def _overlay(result: RegistrationResult, image: Frame | None, obj: SdfField, folder: Path) -> None:
+    """Write overlay.png into ``folder``, where the scene is a recording."""
+    if image is not None:
+        from regnf_fit.images.overlay import object_mesh, overlay_picture
+
+        overlay_picture(result, image, *object_mesh(obj)).save(folder / "overlay.png")
 
 
 def check_box(scene: Path, box: Detection, bounds: Bounds | None, obj: Bounds | None = None) -> None:

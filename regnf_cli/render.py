@@ -11,6 +11,7 @@ import typer
 import regnf_cli.options as cli
 from regnf_cli.guard import require
 from regnf_cli.report import progress, say
+from regnf_core.detections.images import plain_values
 from regnf_core.errors import InvalidInputError, InvalidOptionsError, filled_folder, require_writable
 from regnf_core.field_source import FieldSource, find_source
 from regnf_core.rendering.request import MOST_FRAMES, RenderRequest
@@ -149,7 +150,7 @@ def request_of(
     values |= {name: value for name, value in {"edits": edits, "poses": poses}.items() if value is not None}
     orbit: dict[str, Any] = {name: said[name] for name in ("frames", "elevation_deg", "distance", "up") if name in said}
     if around is not None:
-        orbit["detection"] = cli.read_detection(around).canonical()
+        orbit["detection"] = plain_values(cli.read_detection(around))
     options: dict[str, Any] = {name: said[name] for name in ("mode", "antialias", "up", "cut_away") if name in said}
     for name, part in {"orbit": orbit, "options": options}.items():
         if part:

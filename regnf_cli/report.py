@@ -142,6 +142,12 @@ def show_pose(document: dict[str, Any]) -> None:
     if (center := document.get("center_scene")) is not None:
         sure = f", ± {_numbers(sigmas['center_scene'])} scene units" if sigmas else ""
         _line("center", f"{' '.join(f'{value:.4f}' for value in center)} in the scene{sure}")
+    if (camera := document.get("camera")) is not None:
+        turn = camera["T_camera_object"]["rotation_quaternion_xyzw"]
+        _line(
+            "camera", f"center {' '.join(f'{value:.4f}' for value in camera['center_camera'])} m before the camera of"
+        )
+        _line("", f"frame {camera['frame']}; rotation {' '.join(f'{value:.4f}' for value in turn)} (x, y, z, w)")
     deviation = sigmas.get("scale_percent")
     give_or_take = "" if deviation is None else f", ± {deviation:.2g} %"
     _line("scale", f"{1.0 / transform['scale']:.6f} object units for each scene unit{give_or_take}")

@@ -134,12 +134,13 @@ class Registered(RegistrationResult):
     """The outcome of one registration, with what is needed to show it.
 
     object_name: the object's path, if it was given by one · notes: what the imports of scene and object said ·
-    detection: the box, scene frame.
+    detection: the box, scene frame · overlay: of depth images, the object's outline on the image.
     """
 
     object_name: str | None = None
     notes: Mapping[str, FieldNotes] | None = None
     detection: OrientedBox | None = None
+    overlay: Image | None = None
 
     @classmethod
     def of(
@@ -171,6 +172,21 @@ class Registered(RegistrationResult):
         """The result document: plain values, as result.json has them."""
         return result_document(self, object_name=self.object_name, fields=self.notes)
 
+    def to_bop_csv(self, scene_id: int, image_id: int, object_id: int, seconds: float = -1.0) -> str:
+        """The line of BOP's results: scene_id, im_id, obj_id, score, R, t in millimeters, time.
+
+        The object's frame is its file's; poses are those in the camera's frame, so the scene is depth images.
+        Raises InvalidInputError (NO_CAMERA).
+        """
+        pose = self.T_camera_object
+        if pose is None:
+            hint = "Register in a depth image: regnf.Frame, or the path of a recording."
+            raise InvalidInputError("the result is of a field, not of an image", reason="NO_CAMERA", hint=hint)
+        R, t = pose.rotation.flatten().tolist(), (1000.0 * pose.translation).tolist()
+        score = self.probability if self.probability is not None else float(self.verdict == "registered")
+        numbers = " ".join(f"{value:.8f}" for value in R), " ".join(f"{value:.6f}" for value in t)
+        return f"{scene_id},{image_id},{object_id},{score:.6f},{numbers[0]},{numbers[1]},{seconds:.6f}"
+
     def save(self, folder: str | Path) -> list[Path]:
         """Write result.json, the clouds, the pose and a picture into a folder, as ``regnf register --output`` does."""
         self._require_clouds()
@@ -180,6 +196,9 @@ class Registered(RegistrationResult):
             raise InvalidInputError(f"{target}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
         with filled_folder(target) as folder:
             names = write_artifacts(self, folder, object_name=self.object_name, fields=self.notes)
+            if self.overlay is not None:
+                self.overlay.save(folder / "overlay.png")
+                names.append("overlay.png")
         return [target / name for name in names]
 
     def plot(self, path: str | Path | None = None, window: bool | None = None) -> Image:

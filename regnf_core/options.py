@@ -18,7 +18,7 @@ from regnf_core.errors import InvalidOptionsError, nearest_name
 Unit = Literal["auto", "m", "cm", "mm", "in", "free"]
 METERS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Of the units that are known."""
-_UNIT_TOLERANCE = 0.03
+_UNIT_TOLERANCE = 0.01
 """How far a scale that follows from a unit may be off: sensors' errors of scale are within."""
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
@@ -139,7 +139,7 @@ class RobustOptions:
     """Maximum scale factor of T_object_scene; see ``min_scale``. Where both are the same number, the scale is fixed."""
     object_unit: Unit = "auto"
     """The unit of the object's file. Where the scene is metric, a recording or a field in meters, it tells the scale
-    within 3 %. `auto`: for recordings, the unit in which the object is as large as what was seen, else unknown.
+    within 1 %. `auto`: for recordings, the unit in which the object is as large as what was seen, else unknown.
     `free`: unknown."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.5
     """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from regnf_core.geometry.box import OrientedBox
+if TYPE_CHECKING:
+    from regnf_core.geometry.box import OrientedBox
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class PosedImages:
         T_world_local[:3, 3] = origin
 
         def box(one: OrientedBox) -> OrientedBox:
-            return replace(one, center=scale * (one.center - torch.from_numpy(origin)), size=scale * one.size)
+            return replace(one, center=scale * (one.center - one.center.new_tensor(origin)), size=scale * one.size)
 
         def of_local(T: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
             return None if T is None else T @ T_world_local

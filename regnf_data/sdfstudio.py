@@ -12,16 +12,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
 from regnf_core.errors import DatasetError, InvalidDetectionError
-from regnf_core.geometry.box import OrientedBox
 from regnf_data.posed_images import Instance, PosedImages
+
+if TYPE_CHECKING:
+    from regnf_core.geometry.box import OrientedBox
 
 # Numbers and matrices out of a dataset's JSON, checked.
 
@@ -486,6 +487,10 @@ def _read(entry: Any, name: str | None) -> Instance:
 
 def _box(entry: dict[str, Any], label: str) -> OrientedBox:
     """What says most about the box comes first: box, box_corners, box_min with box_max."""
+    import torch  # recordings are read without
+
+    from regnf_core.geometry.box import OrientedBox
+
     try:
         if isinstance(entry.get("box"), dict):
             shapes = {"center": (3,), "size": (3,), "rotation": (3, 3)}

@@ -48,7 +48,9 @@ def test_commands_named_in_the_readme_exist(
 
 
 def test_python_of_the_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
     monkeypatch.chdir(ROOT)
-    exec(compile(code, "README.md", "exec"), {})
-    assert capsys.readouterr().out.startswith("registered")
+    for code in blocks:
+        exec(compile(code, "README.md", "exec"), {})
+        assert capsys.readouterr().out.startswith("registered")
+    assert len(blocks) == 2

@@ -186,7 +186,7 @@ def simulate(folders: tuple[Path, ...], part: Part, seed: int) -> Simulated:
     )
     placed = _hidden(placed, known, rooms, wanted, (K, pose), longest, furniture, rng)
     kind: Kind = KINDS[rng.integers(len(KINDS))]
-    count = int(rng.integers(2, 6)) if rng.random() < 0.4 else 1
+    count = int(rng.integers(2, 6)) if rng.random() < 0.25 else 1
     poses = [pose] + [
         _pose(middle, _turned(direction, place, rng), distance * rng.uniform(0.8, 1.25), rng) for _ in range(count - 1)
     ]

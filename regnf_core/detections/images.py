@@ -17,13 +17,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from regnf_core.detections.bounds import Detection
+from regnf_core.detections.parsing import parse_detection
 from regnf_core.errors import InvalidDetectionError
 
 HINT = (
     'Write for example {"frame": "000003", "box_2d": [left, top, right, bottom]}, {"mask": "mask.png"} or'
     ' {"point_2d": [u, v]}, in pixels.'
 )
-_NAMES = ("mask", "box_2d", "point_2d", "segmentation", "bbox", "segments", "box", "annotations")
+_NAMES = ("mask", "box_2d", "point_2d", "segmentation", "segments", "annotations")
 _MOST_MASK_BYTES = 4 << 20
 """Of a mask's file that is put into a detection."""
 _MOST_DETECTIONS = 10_000
@@ -74,8 +76,35 @@ class ImageDetection:
 
 def is_image_detection(values: Any) -> bool:
     """Whether a detection's JSON is about an image: it has a mask, a box in pixels or a point."""
-    first = values[0] if isinstance(values, list) and values else values
-    return isinstance(first, Mapping) and any(key in first for key in _NAMES)
+    first = values[0] if isinstance(values, list | tuple) and values else values
+    if isinstance(first, ImageDetection):
+        return True
+    if not isinstance(first, Mapping):
+        return False
+    box, flat = first.get("box"), first.get("bbox")
+    in_pixels = (isinstance(box, Mapping) and "x1" in box) or (isinstance(flat, list | tuple) and len(flat) == 4)
+    return in_pixels or any(key in first for key in _NAMES)
+
+
+AnyDetection = Detection | tuple[ImageDetection, ...]
+"""A box in the scene's frame; or one thing in one image, or in several."""
+
+
+def read_detection(values: Any, index: int | None = None, folder: Path | None = None) -> AnyDetection:
+    """A detection of either kind. index: which one, of a list · folder: of masks that are named as files, which are
+    put into the detection.
+
+    Raises InvalidDetectionError.
+    """
+    if not is_image_detection(values):
+        return parse_detection(values, index)
+    found = read_image_detections(values, index)
+    return found if folder is None else tuple(one.beside(folder) for one in found)
+
+
+def plain_values(detection: AnyDetection) -> Any:
+    """JSON values that ``read_detection`` reads again: what a request holds."""
+    return detection.canonical() if isinstance(detection, Detection) else [one.values() for one in detection]
 
 
 def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageDetection, ...]:
@@ -87,6 +116,8 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
     """
     listed = values.get("annotations", values) if isinstance(values, Mapping) else values
     entries = list(listed) if isinstance(listed, list | tuple) else [listed]
+    if entries and all(isinstance(entry, ImageDetection) for entry in entries):
+        return tuple(entries)
     if not entries or len(entries) > _MOST_DETECTIONS or not all(isinstance(entry, Mapping) for entry in entries):
         raise InvalidDetectionError("no detection is listed", hint=HINT)
     ours = all(any(key in entry for key in ("mask", "box_2d", "point_2d")) for entry in entries)

@@ -261,6 +261,12 @@ class ObjectModel(Bundle):
     symmetry: SelfSymmetry
     signature: Tensor
 
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64, the object's frame: of the samples."""
+        points = self.frame.out_of(self.samples.on_surface())
+        return torch.stack([points.amin(0), points.amax(0)])
+
     @cached_property
     def distance_grid(self) -> DistanceGrid:
         """Distances to the samples, on a grid."""

@@ -22,7 +22,7 @@ from regnf_data.recordings.folders import interpolated, poses_of
 from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, recording_of
 
 if TYPE_CHECKING:
-    from regnf_data.recordings.opening import Given
+    from regnf_data.recordings.recording import Given
 
 _INVALID = "DATASET_BAG_INVALID"
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -184,11 +184,14 @@ def _depth_topic(bag: Bag) -> tuple[Any, list[str]]:
 
 def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
     """Times of the headers (s), times in the bag (ns), and the frame of the camera."""
-    stamps, times, frame = [], [], ""
+    stamps: list[float] = []
+    times: list[int] = []
+    frame = ""
     for time, raw in bag.times(connection):
         if not times:
             with bag.errors():
-                frame = bag.reader.deserialize(raw, connection.msgtype).header.frame_id
+                first: Any = bag.reader.deserialize(raw, connection.msgtype)
+                frame = first.header.frame_id
         # The header comes first: CDR has 4 bytes before it, ROS 1 a counter.
         seconds, nanoseconds = struct.unpack_from("<iI", raw, 4)
         stamps.append(seconds + 1e-9 * nanoseconds)
@@ -235,7 +238,8 @@ def _camera(info: Any, topic: str) -> Camera:
 def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str]:
     """T_world_camera at the times, and where from."""
     links = _links(bag)
-    chain, at = [], frame
+    chain: list[Link] = []
+    at = frame
     while at in links and len(chain) < _LONGEST_CHAIN:
         chain.append(links[at])
         at = links[at].parent

@@ -86,7 +86,7 @@ class Camera:
             column, row = np.floor(found).T
             inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         index = (np.where(inside, value, 0).astype(np.int64).reshape(self.size) for value in (row, column))
-        return ideal, (*index, inside.reshape(self.size))  # type: ignore[return-value]
+        return ideal, (*index, inside.reshape(self.size))
 
     def check(self, name: str) -> Camera:
         """This camera. Raises DatasetError (DATASET_INTRINSICS_INVALID, DATASET_CAMERA_UNSUPPORTED) with ``name``."""
@@ -152,7 +152,8 @@ class Camera:
         sideways = np.stack(
             [2.0 * p1 * x * y + p2 * (r + 2.0 * x * x), p1 * (r + 2.0 * y * y) + 2.0 * p2 * x * y], axis=1
         )
-        return slopes * radial[:, None] + sideways
+        bent: Array = slopes * radial[:, None] + sideways
+        return bent
 
 
 def camera_of(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
-from regnf_core.geometry.box import OrientedBox
 from regnf_data.recordings.camera import Array
 from regnf_data.recordings.recording import Frame, Recording
+
+if TYPE_CHECKING:
+    from regnf_core.geometry.box import OrientedBox
 
 _LOOKED_AT = 240
 """Frames whose depths are looked at, evenly spread over the recording."""

@@ -178,7 +178,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
 
 def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float, float] | None]:
     """(H, W) of the depth image: the pixels that the detection is about, and the pixel (row, column) it points at."""
-    given: Size = frame.depth.shape if frame.color is None else frame.color.shape[:2]  # type: ignore[assignment]
+    given: Size = frame.depth.shape if frame.color is None else frame.color.shape[:2]
     height, width = given
     mask, seed = None, None
     if detection.mask is not None:
@@ -270,7 +270,8 @@ def _plane(points: Array, rng: np.random.Generator) -> tuple[Array, float] | Non
 
 def _points(frame: Frame, pixels: Mask) -> Array:
     """(P, 3): the measured points of pixels (H, W), camera frame."""
-    return frame.camera.rays(np.stack(np.nonzero(pixels)[::-1], axis=1) + 0.5) * frame.depth[pixels][:, None]
+    middles = np.stack(np.nonzero(pixels)[::-1], axis=1).astype(np.float64) + 0.5
+    return frame.camera.rays(middles) * frame.depth[pixels][:, None]
 
 
 def _largest(depth: NDArray[np.float32], measured: Mask, seed: tuple[float, float] | None, clicked: bool) -> Mask:
@@ -284,7 +285,7 @@ def _largest(depth: NDArray[np.float32], measured: Mask, seed: tuple[float, floa
         apart = np.hypot(rows - seed[0], columns - seed[1])
         if clicked:
             return _of(int(labels[apart.argmin()]), labels, measured)
-        spread = 0.25 * max(np.ptp(rows), np.ptp(columns), 1)
+        spread = 0.25 * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
         weight = np.exp(-0.5 * (apart / spread) ** 2)
     sizes = np.bincount(labels, weight, minlength=count)
     best = int(sizes.argmax())

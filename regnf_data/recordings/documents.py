@@ -31,7 +31,7 @@ from regnf_data.recordings.recording import Recording, StoredFrame, color_file, 
 from regnf_data.sdfstudio import resolve
 
 if TYPE_CHECKING:
-    from regnf_data.recordings.opening import Given
+    from regnf_data.recordings.recording import Given
 
 _INVALID = "DATASET_METADATA_INVALID"
 _INTRINSICS = "DATASET_INTRINSICS_INVALID"

@@ -28,7 +28,7 @@ from regnf_data.recordings.recording import (
 )
 
 if TYPE_CHECKING:
-    from regnf_data.recordings.opening import Given
+    from regnf_data.recordings.recording import Given
 
 _INVALID = "DATASET_METADATA_INVALID"
 _MILLIMETER = 0.001

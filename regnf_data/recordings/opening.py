@@ -4,41 +4,42 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
 
 from regnf_core.errors import DatasetError
 from regnf_data.recordings import documents, folders
-from regnf_data.recordings.camera import Camera
-from regnf_data.recordings.recording import Recording
+from regnf_data.recordings.recording import Given, Recording
+from regnf_data.recordings.stored import is_stored, read_stored
 
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MOST_LISTED = 12
 _NEAR = 3
 """Folders below the one that was given in which recordings are looked for, to name them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Given:
-    """What a person says where a layout does not, or says it wrongly.
-
-    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in :data:`LAYOUTS`.
-    """
-
-    camera: Camera | None = None
-    depth_unit: float | None = None
-    layout: str | None = None
-
-
 @dataclass(frozen=True)
 class Layout:
     """name: for `--layout` · words: for people · fits: whether a folder or file has it · read: its recording ·
-    looks_for: the files that tell it."""
+    looks_for: the files that tell it · axes: of its cameras."""
 
     name: str
     words: str
     looks_for: str
     fits: Callable[[Path], bool]
     read: Callable[[Path, Given], Recording]
+    axes: Literal["opencv", "opengl"] = "opencv"
+
+    def recording(self, path: Path, given: Given) -> Recording:
+        """That at ``path``, with cameras whose axes are those that were given."""
+        found = self.read(path, given)
+        if given.axes in (None, self.axes):
+            return found
+        turned = (replace(one, T_world_camera=one.T_world_camera @ _OPENGL) for one in found.frames)
+        return replace(found, frames=tuple(turned))
 
 
 def _bag(path: Path, given: Given) -> Recording:
@@ -52,9 +53,10 @@ def _is_bag(path: Path) -> bool:
 
 
 LAYOUTS = (
+    Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
     Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop),
     Layout("sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio),
-    Layout("nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio),
+    Layout("nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio, "opengl"),
     Layout("rosbag2", "a ROS bag", "metadata.yaml, *.mcap, *.db3", _is_bag, _bag),
     Layout("tum", "TUM RGB-D", "depth.txt, groundtruth.txt", folders.is_tum, folders.read_tum),
     Layout("scannet", "ScanNet, extracted", "pose/, depth/", folders.is_scannet, folders.read_scannet),
@@ -82,10 +84,10 @@ def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> 
             raise DatasetError(
                 f"no layout is called {given.layout[:40]!r}: {', '.join(named)}", reason="DATASET_NOT_RECOGNIZED"
             )
-        return named[given.layout].read(source, given)
+        return named[given.layout].recording(source, given)
     for layout in LAYOUTS:
         if layout.fits(source):
-            return layout.read(source, given)
+            return layout.recording(source, given)
     below = _recordings_below(source) if source.is_dir() else []
     if below:
         names = ", ".join(str(each.relative_to(source)) for each in below[:_MOST_LISTED])
@@ -98,6 +100,11 @@ def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> 
     raise DatasetError(
         f"{source.name} is no recording that is known. Looked for {known}", reason="DATASET_NOT_RECOGNIZED"
     )
+
+
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a folder or file, and it has the layout of a recording."""
+    return Path(path).exists() and any(layout.fits(Path(path)) for layout in LAYOUTS)
 
 
 def _recordings_below(folder: Path) -> list[Path]:

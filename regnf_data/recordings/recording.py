@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,22 +132,43 @@ class Recording:
 
     def posed_images(self, chosen: Sequence[int], bounds: Array) -> PosedImages:
         """The chosen frames as images of one size, the most common among them. bounds: (2, 3), world."""
-        frames = [self.frames[index].read() for index in chosen]
-        shapes = [frame.depth.shape for frame in frames]
-        shape = max(set(shapes), key=shapes.count)
-        frames = [frame for frame in frames if frame.depth.shape == shape]
-        colors = [
-            np.full((*shape, 3), 128, np.uint8) if frame.color is None else frame.registered(frame.color)
-            for frame in frames
-        ]
-        return PosedImages(
-            colors=np.stack(colors),
-            intrinsics=np.stack([frame.camera.K for frame in frames]),
-            T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
-            bounds=bounds,
-            depths=np.stack([frame.depth for frame in frames]),
-            T_metric_world=self.T_metric_world,
-        )
+        frames: list[Frame] = []
+        for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
+            frame = self.frames[index].read()
+            gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
+            frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
+        return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
+
+
+def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
+    """Frames as images of one size, the most common among them; gray where a frame has no color of that size. bounds:
+    (2, 3), world."""
+    shapes = [frame.depth.shape for frame in frames]
+    shape = max(set(shapes), key=shapes.count)
+    frames = [frame for frame in frames if frame.depth.shape == shape]
+    gray = np.full((*shape, 3), 128, np.uint8)
+    colors = [gray if one.color is None or one.color.shape[:2] != shape else one.color for one in frames]
+    return PosedImages(
+        colors=np.stack(colors),
+        intrinsics=np.stack([frame.camera.K for frame in frames]),
+        T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
+        bounds=bounds,
+        depths=np.stack([frame.depth for frame in frames]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a person says where a layout does not, or says it wrongly.
+
+    camera: of the depth images · depth_unit: meters a step of them · layout: by its name in ``LAYOUTS`` · axes: of the
+    cameras, opencv look along z, opengl against it.
+    """
+
+    camera: Camera | None = None
+    depth_unit: float | None = None
+    layout: str | None = None
+    axes: Literal["opencv", "opengl"] | None = None
 
 
 def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[Any]]:
@@ -224,7 +245,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
         raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")
     if not np.isfinite(given).all():
         return None
-    pose = np.eye(4)
+    pose: Array = np.eye(4)
     pose[:3] = given[:3]
     rotation = pose[:3, :3]
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID:
@@ -243,7 +264,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
     pose[:3, :3] = u @ vt
     pose[:3, 3] *= unit
     if inverse:
-        pose = np.linalg.inv(pose)
+        pose = np.asarray(np.linalg.inv(pose), np.float64)
     if np.abs(pose[:3, 3]).max() > _FARTHEST:
         raise DatasetError(
             f"{name}: the camera is {np.abs(pose[:3, 3]).max():.3g} m from the origin", reason="DATASET_POSE_NOT_RIGID"

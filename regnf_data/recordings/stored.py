@@ -1,6 +1,6 @@
 """A recording in one file of plain arrays: what a service keeps, and what is sent to it. No image is decoded from it.
 
-A safetensors file. depth: (N, H, W) uint16, steps of ``depth_unit`` meters along the camera's axis, 0 where nothing was
+A safetensors file. depth: (N, H, W) int16, steps of ``depth_unit`` meters along the camera's axis, 0 where nothing was
 measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4, 4) float64, OpenCV's axes · color:
 (N, H', W', 3) uint8 and color_K: (N, 3, 3), where the frames have colors. Its metadata: an entry ``recording``, JSON.
 """
@@ -8,7 +8,8 @@ measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,51 +17,101 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from regnf_core.errors import DatasetError, atomic_path
 from regnf_data.recordings.camera import Array, Camera
 from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
 
 _KEY = "recording"
-_STEPS = 65_535
+_STEPS = 32_767
 _FINEST = 1e-4
-"""Meters a step of stored depths, where they reach no farther than 6.5 m; else as many as reach asks for."""
+"""Meters a step of stored depths, where they reach no farther than 3.2 m; else as many as reach asks for."""
 
 
-def write_recording(recording: Recording, indices: Sequence[int], path: Path) -> list[str]:
-    """Write the frames of these numbers to ``path``; the names of those that were left out: of another size.
+def write_recording(recording: Recording, indices: Sequence[int], path: Path) -> dict[str, Any]:
+    """Write the frames of these numbers to ``path``, one at a time: those with the most common size of a depth image,
+    and their colors of the most common size.
 
-    The most common sizes of depth and of color images are kept. Raises DatasetError as the frames' readers do.
+    What was written: frames (their names), size and color_size ([height, width]), depth_range (m).
+    Raises DatasetError as the frames' readers do, and DATASET_DEPTH_MISSING.
     """
-    frames = [recording.frames[index].read() for index in indices]
-    shape = _most_common([frame.depth.shape for frame in frames])
-    kept = [frame for frame in frames if frame.depth.shape == shape]
-    colored = [frame for frame in kept if frame.color is not None]
-    size = _most_common([frame.color.shape for frame in colored if frame.color is not None]) if colored else None
-    reach = max(float(frame.depth.max()) for frame in kept)
-    unit = max(_FINEST, reach / _STEPS)
-    arrays: dict[str, NDArray[Any]] = {
-        "depth": np.stack([np.round(frame.depth / unit).astype(np.uint16) for frame in kept]),
-        "K": np.stack([frame.camera.K for frame in kept]),
-        "T_world_camera": np.stack([frame.T_world_camera for frame in kept]),
-    }
-    if size is not None:
-        blank = np.zeros(size, np.uint8)
-        of_size = [frame.color is not None and frame.color.shape == size for frame in kept]
-        arrays["color"] = np.stack([f.color if ok else blank for f, ok in zip(kept, of_size, strict=True)])  # type: ignore[misc]
-        cameras = [(frame.color_camera or frame.camera) for frame in kept]
-        arrays["color_K"] = np.stack([c.K if ok else np.zeros((3, 3)) for c, ok in zip(cameras, of_size, strict=True)])
+    sizes, ends = {}, []
+    for index in indices:
+        depth = recording.frames[index].read(color=False).depth
+        sizes[index] = depth.shape
+        if (depth > 0.0).any():
+            ends.append((float(depth[depth > 0.0].min()), float(depth.max())))
+    if not ends:
+        raise DatasetError(f"{recording.name}: no frame has a measured depth", reason="DATASET_DEPTH_MISSING")
+    shape = _most_common([*sizes.values()])
+    kept = [recording.frames[index] for index in indices if sizes[index] == shape]
+    colors = [(0, 0) if one.color is None else one.color().shape[:2] for one in kept]
+    color = _most_common([*filter(any, colors)] or [None])
+    near, far = min(low for low, _ in ends), max(high for _, high in ends)
+    unit = max(_FINEST, far / _STEPS)
+    matrices: list[Array] = []
+    taken: list[Camera | None] = []
+    names = [frame.name for frame in kept]
+
+    def depths() -> Iterator[NDArray[Any]]:
+        for one in kept:
+            frame = one.read(color=False)
+            matrices.append(frame.camera.K)
+            yield np.round(frame.depth / unit).astype(np.int16)
+
+    def pictures() -> Iterator[NDArray[Any]]:
+        for one, size in zip(kept, colors, strict=True):
+            frame = one.read() if size == color else None
+            taken.append(None if frame is None else frame.color_camera)
+            yield np.zeros((*color, 3), np.uint8) if frame is None or frame.color is None else frame.color
+
+    count = len(kept)
     said = {
-        "names": [frame.name for frame in kept],
+        "names": names,
         "depth_unit": unit,
         "layout": recording.layout,
         "notes": list(recording.notes),
         "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
     }
+    arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]] = {
+        "depth": ("I16", (count, *shape), depths),
+        "K": ("F64", (count, 3, 3), lambda: iter(matrices)),
+        "T_world_camera": ("F64", (count, 4, 4), lambda: (one.T_world_camera for one in kept)),
+    }
+    if color is not None:
+        arrays["color"] = ("U8", (count, *color, 3), pictures)
+        none = np.zeros((3, 3))
+        arrays["color_K"] = ("F64", (count, 3, 3), lambda: (none if one is None else one.K for one in taken))
     with atomic_path(path) as target:
-        save_file({name: np.ascontiguousarray(a) for name, a in arrays.items()}, target, {_KEY: json.dumps(said)})
-    return [frame.name for frame in frames if frame.depth.shape != shape]
+        _write(target, arrays, {_KEY: json.dumps(said)})
+    return {"frames": names, "size": shape, "color_size": color, "depth_range": [near, far]}
+
+
+_ITEM = {"U8": 1, "I16": 2, "F64": 8}
+
+
+def _write(
+    path: Path,
+    arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]],
+    metadata: dict[str, str],
+) -> None:
+    """A safetensors file, array by array and part by part: type, shape, and what gives the parts in their order.
+
+    The format: https://github.com/huggingface/safetensors, 8 bytes of the header's length, the header, the bytes.
+    """
+    header: dict[str, Any] = {"__metadata__": metadata}
+    at = 0
+    for name, (kind, shape, _) in arrays.items():
+        end = at + _ITEM[kind] * math.prod(shape)
+        header[name] = {"dtype": kind, "shape": list(shape), "data_offsets": [at, end]}
+        at = end
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    with path.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for _, _, parts in arrays.values():
+            for part in parts():
+                file.write(np.ascontiguousarray(part).tobytes())
 
 
 def is_stored(path: Path) -> bool:
@@ -93,6 +144,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
             fits = fits and len(color) == 4 and (color[0], color[3]) == (count, 3) and color_K.shape == (count, 3, 3)
         if not (fits and 0.0 < unit < 1.0):
             raise ValueError("its arrays do not fit together")
+        colors = None if color is None or color_K is None else ((color[1], color[2]), color_K)
         metric = None if said.get("T_metric_world") is None else np.array(said["T_metric_world"], np.float64)
         layout, notes = str(said["layout"])[:100], tuple(str(one)[:500] for one in said["notes"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
@@ -103,7 +155,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
         pose = pose_of(poses[number], names[number])
         if pose is None:
             raise DatasetError(f"{names[number]}: the pose is not finite", reason="DATASET_POSE_NOT_RIGID")
-        colored = color is not None and color_K is not None and color_K[number].any()
+        colored = colors is not None and colors[1][number].any()
         frames.append(
             StoredFrame(
                 names[number],
@@ -111,7 +163,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
                 pose,
                 partial(_depth, path, number, unit),
                 partial(_color, path, number) if colored else None,
-                Camera(color_K[number].astype(np.float64), color[1:3]) if colored else None,
+                Camera(colors[1][number].astype(np.float64), colors[0]) if colored and colors is not None else None,
             )
         )
     return Recording(name or path.name, layout, tuple(frames), notes, metric)

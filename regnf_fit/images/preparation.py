@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.geometry.box import OrientedBox, ray_box_interval
+from regnf_data.agreement import check_agreement
 from regnf_data.posed_images import PosedImages
-from regnf_fit.images.checks import check_agreement, check_images, check_seen
+from regnf_fit.images.checks import check_images, check_seen
 from regnf_fit.images.observing import NO_SPREAD, DepthSpread, LocalPlanes, depth_spread, local_planes
 from regnf_fit.network import StartShape
 from regnf_fit.options import Start

@@ -17,9 +17,10 @@ from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import METERS, RegistrationOptions, Unit
+from regnf_data.agreement import check_agreement
 from regnf_data.recordings.choosing import choose_frames
 from regnf_data.recordings.detection import lift
-from regnf_data.recordings.recording import Frame, Recording
+from regnf_data.recordings.recording import Frame, Recording, as_posed_images
 from regnf_fit.images.focus import focused_field
 
 Floats = NDArray[np.float64]
@@ -84,11 +85,15 @@ def recorded_scene(
         others = [recording.frames[index].read() for index in chosen.indices]
         others = [frame for frame in others if frame.name not in names]
     frames = [*own, *others]
+    disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)))) if len(frames) > 1 else None
     field = focused_field(frames, region, things=[one.pixels for one in first])
     frame = own[0] if own else max(frames, key=lambda one: _shown(one, box))
     camera = CameraView(frame.name, Sim3.from_matrix(frame.T_world_camera.tolist()), METERS.get(unit))
     known = replace(options, robust=replace(options.robust, object_unit=unit))
-    return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), recording.notes)
+    notes = recording.notes if disagreement is None else (*recording.notes, disagreement)
+    if unit in METERS and options.robust.object_unit == "auto":
+        notes += (f"the object's unit is taken to be {unit}, by its size: say --object-unit, or --scale free",)
+    return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), notes)
 
 
 def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:

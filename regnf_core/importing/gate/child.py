@@ -53,23 +53,31 @@ class FairClock:
 # What the parent sees of a child while it runs: limits that the kernel has for a file or a user, not a child.
 
 MAX_THREADS = 64
-_MAX_ENTRIES = 64
+MAX_ENTRIES = 64
 _BLOCK = 512
 
 Trespass = Literal["threads", "output"]
 Watch = Callable[[], Trespass | None]
 
 
-def trespass_of(pid: int, folder: Path, folder_bytes: int) -> Trespass | None:
-    """Which limit the child is beyond, if any: how many threads it has, how much lies in its folder."""
+def trespass_of(pid: int, folder: Path, folder_bytes: int, most: int = MAX_ENTRIES) -> Trespass | None:
+    """Which limit the child is beyond, if any: how many threads it has, how much lies in its folder.
+
+    most: entries, those of folders in it included.
+    """
     if _threads(pid) > MAX_THREADS:
         return "threads"
-    total = 0
-    with suppress(FileNotFoundError), os.scandir(folder) as entries:  # a file may just be renamed
-        for count, entry in enumerate(entries):
-            total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
-            if count >= _MAX_ENTRIES or total > folder_bytes:
-                return "output"
+    count = total = 0
+    waiting = [str(folder)]
+    while waiting:
+        with suppress(FileNotFoundError), os.scandir(waiting.pop()) as entries:  # a file may just be renamed
+            for entry in entries:
+                count += 1
+                total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
+                if count > most or total > folder_bytes:
+                    return "output"
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
     return None
 
 
@@ -109,10 +117,11 @@ def run_child(
     environment: dict[str, str],
     wall_s: float,
     folder_bytes: int = 1 << 32,
+    entries: int = MAX_ENTRIES,
 ) -> ChildOutcome:
     """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds by a fair clock.
 
-    It is stopped too when it has many threads, or more than ``folder_bytes`` in ``folder``. The child
+    It is stopped too when it has many threads, or more than ``folder_bytes`` or ``entries`` in ``folder``. The child
     leads a process group of its own; at the end the whole group is killed, whatever became of the child.
     ``request`` must fit into a pipe (64 KiB).
     """
@@ -129,7 +138,7 @@ def run_child(
     clock = FairClock(process.pid, wall_s)
     _inherit_priority(process.pid)
     stopped: Stopped | None = "late"
-    watch = partial(trespass_of, process.pid, folder, folder_bytes)
+    watch = partial(trespass_of, process.pid, folder, folder_bytes, entries)
     said = (bytearray(), bytearray())
     try:
         with contextlib.suppress(BrokenPipeError):

@@ -15,15 +15,19 @@ import stat
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from regnf_core.errors import MOST_CANDIDATES, Candidate, FieldFormatError
 from regnf_core.importing.containers.safetensors_header import read_header
-from regnf_core.importing.gate.child import ChildOutcome, run_child
+from regnf_core.importing.gate.child import MAX_ENTRIES, ChildOutcome, run_child
 from regnf_core.importing.gate.picture import CANDIDATE_BYTES, PICTURE_NAME, candidate_name, is_sound_picture
 from regnf_core.importing.gate.report import ImportLimits, ImportReport
+
+T = TypeVar("T")
 
 # What the gate's process says a file may stand for, checked before anybody is asked: entries, names, pictures.
 
@@ -66,9 +70,10 @@ _ENTRY = """
 import sys
 if sys.argv[1] not in sys.path:
     sys.path.insert(0, sys.argv[1])
-from regnf_core.importing.gate.convert import main
-sys.exit(main(sys.argv[2:]))
+from importlib import import_module
+sys.exit(import_module(sys.argv[2]).main(sys.argv[3:]))
 """
+_FIELDS = "regnf_core.importing.gate.convert"
 _REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
 _MAX_DETAIL = 1000
 _OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
@@ -107,14 +112,35 @@ def import_field(
     shown = {"picture": picture, "ask_by_picture": picture or ask_by_picture}
     request = _request(description, limits, shown, settings, cameras)
     files = [path.resolve(strict=True) for path in (upload, settings, cameras) if path is not None]
+    return confined(_FIELDS, files, out_dir, request, limits, _report)
+
+
+Read = Callable[[dict[str, Any], ChildOutcome, ImportLimits, Path, float], T]
+"""What the child has said, how it ended, its limits, the file that it wrote, seconds -> what that is worth here."""
+
+
+def confined(
+    module: str,
+    files: list[Path],
+    out_dir: Path,
+    request: bytes,
+    limits: ImportLimits,
+    read: Read[T],
+    entries: int = MAX_ENTRIES,
+) -> T:
+    """Have ``module``'s ``main`` turn ``files`` into ``out_dir``/field.safetensors, in a throw-away process.
+
+    entries: files and folders that it may have at once. Raises what ``import_field`` does.
+    """
     out_dir.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
+    once = partial(_import_once, module, files, out_dir, request, limits, started, read, entries)
     try:
-        return _import_once(files, out_dir, request, limits, started)
+        return once()
     except _KilledError:
         _log.warning("the import's process was killed from outside; it is started once more")
     try:
-        return _import_once(files, out_dir, request, limits, started)
+        return once()
     except _KilledError as error:
         raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY") from error
 
@@ -124,18 +150,26 @@ class _KilledError(Exception):
 
 
 def _import_once(
-    files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, started: float
-) -> ImportReport:
+    module: str,
+    files: list[Path],
+    out_dir: Path,
+    request: bytes,
+    limits: ImportLimits,
+    started: float,
+    read: Read[T],
+    entries: int,
+) -> T:
     """One child, within what is left of the time since ``started``. Raises _KilledError, and as ``import_field``."""
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
     left_s = max(0.0, limits.longest_s - (time.monotonic() - started))
     try:
-        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(work.resolve()), *map(str, files)]
-        outcome = run_child(command, request, work, _environment(), left_s, limits.file_bytes + _PICTURE_BYTES)
+        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), module, str(work.resolve()), *map(str, files)]
+        room = limits.file_bytes + _PICTURE_BYTES
+        outcome = run_child(command, request, work, _environment(), left_s, room, entries)
         values = _values_of(outcome, work, limits, time.monotonic() - started)
-        report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
+        report = read(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
-        if json.loads(request)["picture"] and is_sound_picture(work / PICTURE_NAME):
+        if json.loads(request).get("picture") and is_sound_picture(work / PICTURE_NAME):
             os.replace(work / PICTURE_NAME, out_dir / PICTURE_NAME)
         return report
     finally:
@@ -222,7 +256,7 @@ def _report(
 ) -> ImportReport:
     """The report from the child's own words and this side's measurements, after a look at the file it left."""
     try:
-        size = _checked_size(field, limits.file_bytes)
+        size = checked_size(field, limits.file_bytes)
         isolation = {str(key): bool(value) for key, value in values["isolation"].items()}
         lower, upper = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["bounds"])
         lowest, highest = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["surface_bounds"])
@@ -274,7 +308,7 @@ def _isolation_warnings(isolation: dict[str, bool]) -> list[str]:
     return ["NOT_ISOLATED: the kernel granted the import neither a network namespace nor a system call filter"]
 
 
-def _checked_size(field: Path, most: int) -> int:
+def checked_size(field: Path, most: int) -> int:
     """The file's size, if it is a plain file of its own (no link) with a sound safetensors header."""
     found = field.lstat()
     if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= most:

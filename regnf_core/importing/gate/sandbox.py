@@ -95,6 +95,11 @@ set_robust_list  273  99  a new thread's locks
 rseq             334 293  a new thread
 """
 """In addition where a library cannot do without threads: the surface through a cloud of points."""
+_FOR_FOLDERS = """
+mkdir             83   -  a folder of a recording's archive
+mkdirat          258  34  a folder of a recording's archive
+"""
+"""In addition where an archive of files is unpacked into its folders."""
 
 _PROT_WRITE, _PROT_EXEC, _MAP_ANONYMOUS = 2, 4, 0x20
 _FUTEX_FLAGS = 128 | 256
@@ -132,9 +137,9 @@ class Machine:
     relocates_code: bool
     """Whether the loader marks code as executable after it has mapped it (branch targets on ARM)."""
 
-    def calls(self, threads: bool) -> Mapping[str, int]:
-        """The number of each call on the list, with those that new threads need if they are allowed."""
-        listed = _NEEDED + _FOR_THREADS if threads else _NEEDED
+    def calls(self, threads: bool, folders: bool = False) -> Mapping[str, int]:
+        """The number of each call on the list, with those that new threads and folders need, if they are allowed."""
+        listed = _NEEDED + threads * _FOR_THREADS + folders * _FOR_FOLDERS
         rows = (line.split() for line in listed.splitlines() if line)
         return {row[0]: int(row[self.column]) for row in rows if row[self.column] != "-"}
 
@@ -180,13 +185,8 @@ def conditions(machine: Machine, itself: int) -> Mapping[str, Alternatives]:
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # the same on every architecture
 _VERSION_FLAG, _PATH_BENEATH = 1, 1
-_WRITE_FILE, _READ_FILE, _READ_DIR, _REMOVE_FILE, _MAKE_REGULAR, _TRUNCATE = (
-    1 << 1,
-    1 << 2,
-    1 << 3,
-    1 << 5,
-    1 << 8,
-    1 << 14,
+_WRITE_FILE, _READ_FILE, _READ_DIR, _REMOVE_FILE, _MAKE_FOLDER, _MAKE_REGULAR, _TRUNCATE = (
+    1 << bit for bit in (1, 2, 3, 5, 7, 8, 14)
 )
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: (1 << 14) - 1, 3: (1 << 15) - 1, 5: (1 << 16) - 1}
 """All rights of a version and those after it: naming a right is what forbids it."""
@@ -201,11 +201,11 @@ Place = int | Path
 """An open file descriptor, or a path."""
 
 
-def restrict_files(readable: Iterable[Place], folder: Path) -> bool:
+def restrict_files(readable: Iterable[Place], folder: Path, folders: bool = False) -> bool:
     """From now on this process reads ``readable``, and what lies below, and works in ``folder``; all else is refused.
 
-    Returns False, having changed nothing, where the kernel has no Landlock. Needs no_new_privs to be set, and to be
-    called before there are other threads.
+    folders: it may make further ones there. Returns False, having changed nothing, where the kernel has no Landlock.
+    Needs no_new_privs to be set, and to be called before there are other threads.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     version = libc.syscall(_CREATE_RULESET, None, 0, _VERSION_FLAG)
@@ -219,7 +219,7 @@ def restrict_files(readable: Iterable[Place], folder: Path) -> bool:
     try:
         for place in readable:
             _allow(libc, ruleset, place, _READ & handled)
-        _allow(libc, ruleset, folder, _OWN & handled)
+        _allow(libc, ruleset, folder, (_OWN | folders * _MAKE_FOLDER) & handled)
         return bool(libc.syscall(_RESTRICT_SELF, ruleset, 0) == 0)
     finally:
         os.close(ruleset)
@@ -265,15 +265,15 @@ class _Program(ctypes.Structure):
     _fields_ = (("length", ctypes.c_ushort), ("instructions", ctypes.c_void_p))
 
 
-def refuse_system_calls(threads: bool = False) -> bool:
+def refuse_system_calls(threads: bool = False, folders: bool = False) -> bool:
     """Install the filter. False where the kernel or the machine has none. Needs no_new_privs to be set.
 
-    threads: allow new ones; never new processes.
+    threads, folders: allow new ones; never new processes.
     """
     machine = MACHINES.get(platform.machine())
     if machine is None:
         return False
-    code = b"".join(filter_code(machine, os.getpid(), threads))
+    code = b"".join(filter_code(machine, os.getpid(), threads, folders))
     buffer = ctypes.create_string_buffer(code, len(code))
     program = _Program(len(code) // 8, ctypes.cast(buffer, ctypes.c_void_p))
     syscall = ctypes.CDLL(None, use_errno=True).syscall
@@ -281,14 +281,14 @@ def refuse_system_calls(threads: bool = False) -> bool:
     return bool(syscall(number, _SET_MODE_FILTER, _ALL_THREADS, ctypes.byref(program)) == 0)
 
 
-def filter_code(machine: Machine, itself: int, threads: bool) -> list[bytes]:
+def filter_code(machine: Machine, itself: int, threads: bool, folders: bool = False) -> list[bytes]:
     """The classic BPF program. The two numbers of a jump are how many instructions to skip if true, if false."""
     code = [_op(_LOAD_WORD, _ARCHITECTURE_AT), _op(_JUMP_EQUAL, machine.audit_code, 1, 0), _op(_RETURN, _KILL)]
     code += [_op(_LOAD_WORD, _NUMBER_AT)]
     if machine.has_x32:
         code += [_op(_JUMP_AT_LEAST, _X32_BIT, 0, 1), _op(_RETURN, _KILL)]
     restricted = conditions(machine, itself)
-    for name, number in machine.calls(threads).items():
+    for name, number in machine.calls(threads, folders).items():
         body = _any_of(restricted[name]) if name in restricted else [_op(_RETURN, _ALLOW)]
         code += [_op(_JUMP_EQUAL, number, 0, len(body)), *body]
     return [*code, _op(_RETURN, _ERROR | _ENOSYS)]
@@ -331,13 +331,19 @@ _SYSTEM = """
 
 
 def confine(
-    limits: ImportLimits, parent_pid: int, opened: Sequence[int], folder: Path, threads: bool = False
+    limits: ImportLimits,
+    parent_pid: int,
+    opened: Sequence[int],
+    folder: Path,
+    threads: bool = False,
+    folders: bool = False,
 ) -> dict[str, bool]:
     """Confine this process for the rest of its life; returns which confinements the kernel granted.
 
     ``opened`` are the files it was given, ``folder`` is where it may write. Resource limits always hold. A network
     namespace without interfaces and the system call filter each keep the process off the network; containers often
-    forbid the first and allow the second. threads: allow new ones; whoever started this process counts them.
+    forbid the first and allow the second. threads: allow new ones; whoever started this process counts them. folders:
+    allow new ones in ``folder``.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     die_with_parent(parent_pid)
@@ -352,8 +358,8 @@ def confine(
         "network_namespace": no_network,
         "no_capabilities": no_capabilities,
         "no_new_privileges": no_new_privileges,
-        "files_restricted": no_new_privileges and restrict_files([*opened, *_readable()], folder),
-        "system_call_filter": no_new_privileges and refuse_system_calls(threads),
+        "files_restricted": no_new_privileges and restrict_files([*opened, *_readable()], folder, folders),
+        "system_call_filter": no_new_privileges and refuse_system_calls(threads, folders),
     }
 
 

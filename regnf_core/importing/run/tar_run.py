@@ -190,6 +190,11 @@ class TarRun:
                 return taken
         raise archive_error("the archive reads otherwise the second time")
 
+    def each(self) -> Iterator[tuple[str, bytes]]:
+        """Name and content of each plain file, in their order."""
+        for name, size, stream in self._members():
+            yield name, b"".join(stream.pieces(size))
+
     def _members(self) -> Iterator[tuple[str, int, _Forward]]:
         """Name and size of each plain file in order, and the stream, which stands at its content."""
         packing = self._packing

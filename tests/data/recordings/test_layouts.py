@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from regnf_core.errors import DatasetError
-from regnf_data.recordings import Recording, open_recording
+from regnf_data.recordings.opening import open_recording
+from regnf_data.recordings.recording import Recording
 from tests.data.recordings import writers
 from tests.data.recordings.truth import HEIGHT, WIDTH, K, Truth, walk
 

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.worlds.trajectories import look_at
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import check_agreement
 from regnf_data.posed_images import PosedImages
 from regnf_data.sdfstudio import load_dataset, write_dataset
-from regnf_fit.images.checks import check_agreement
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.fusion import fuse_images
 from tests.fit.images import scenes
@@ -93,8 +93,8 @@ WRONG: dict[str, tuple[Callable[[PosedImages], PosedImages], str]] = {
     "disparity": (with_depths(lambda depths: 20.0 / depths), "Write depths"),
     "half the size": (lambda images: replace(images, intrinsics=images.intrinsics * [[0.5], [0.5], [1.0]]), "pixels"),
     "turned": (lambda images: replace(images, intrinsics=images.intrinsics[:, [1, 0, 2]][:, :, [1, 0, 2]]), "pixels"),
-    "reversed": (with_poses(lambda T: T[::-1]), "each frame's own camtoworld"),
-    "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each frame's own camtoworld"),
+    "reversed": (with_poses(lambda T: T[::-1]), "each image its own pose"),
+    "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each image its own pose"),
     "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions anew"),
     "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions anew"),
     "mirrored": (with_depths(lambda depths: depths[:, :, ::-1]), "Mirror the depth images"),

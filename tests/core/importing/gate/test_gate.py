@@ -124,8 +124,8 @@ def test_a_persons_own_import_may_have_the_memory_of_the_machine(
 ) -> None:
     asked: list[ImportLimits] = []
 
-    def once(files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, started: float) -> None:
-        del files, out_dir, started
+    def once(module: str, files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, *_: object) -> None:
+        del module, files, out_dir
         asked.append(limits)
         assert json.loads(request)["limits"]["memory_bytes"] == limits.memory_bytes
         raise FieldFormatError("seen")
