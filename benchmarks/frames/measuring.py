@@ -151,9 +151,8 @@ def _answered(made: Simulated, question: Question) -> Row:
     """What is found in the frames, by the way that the product goes."""
     frames = Frames("simulated", "simulated", tuple(_stored(view.frame) for view in made.views))
     known, scale = question.known, question.scale
-    options = RegistrationOptions.from_dict(
-        {"robust": {"object_unit": "m", "min_scale": (1.0 - _KNOWN_WITHIN) / scale, "max_scale": (1.0 + _KNOWN_WITHIN) / scale}}
-    )  # fmt: skip
+    low, high = ((1.0 + sign * _KNOWN_WITHIN) / scale for sign in (-1.0, 1.0))
+    options = RegistrationOptions.from_dict({"robust": {"object_unit": "m", "min_scale": low, "max_scale": high}})
     model = known.model
     row: Row = {
         "asked": question.asked,

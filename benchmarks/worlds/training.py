@@ -143,10 +143,10 @@ def trained(
 
     alone: the model of a pose alone, by which poses are chosen and lead: the one that is made knows a pose ``among``
     its candidates. None: it knows a pose ``alone`` · left_out: one world at a time, or a part with all of its meshes,
-    which no other part has, or an eighth of the worlds · calibrated_on: the poses that the probabilities are to be right of on average, all or
-    those that registrations chose · measured: further rows, which nothing is trained with; objects are compared in
-    these. Of the features those count that all rows have: some rows are older than a feature. beside: rows of other scenes, which are trained with at a small weight, and neither
-    calibrated on nor in the table.
+    which no other part has, or an eighth of the worlds · calibrated_on: the poses that the probabilities are to be
+    right of on average, all or those that registrations chose · measured: further rows, which nothing is trained with;
+    objects are compared in these · beside: rows of other scenes, which are trained with at a small weight, and neither
+    calibrated on nor in the table. Of the features those count that all rows have: some rows are older than a feature.
     """
     own = len(rows)
     taught = np.arange(own + len(beside) + len(measured)) < own + len(beside)

@@ -200,6 +200,7 @@ class SearchConstants:
     # worlds]
     box_width: float = 0.25
     min_face_distance: float = 0.2  # diagonals: shorter edges count as so long; flat things' boxes are not [by hand]
+    facing_cosine: float = -0.2  # of normal and line of sight, below: surface that faces the camera [by hand]
     seed_tolerance: float = 2.0  # so many times as far as poses may seeds, which are rough, leave the box [by hand]
     batch: int = 512  # poses at once: bounds memory, and stays in the processor's cache [by hand]
     grid_cells: int = 40  # along each edge of a distance grid [by hand]

@@ -62,4 +62,4 @@ def make_problem(
 def pose_bound(view: SceneView, model: ObjectModel, options: RobustOptions) -> PoseBound:
     """What the detection and the options say of poses between the working frames."""
     scale = ScaleBound.of(options, view.frame.length, model.frame.length)
-    return PoseBound.of(view.detection, model.extremal_points, options.box_tolerance, scale)
+    return PoseBound.of(view.detection, model.extremal_points, options.box_tolerance, scale, view.of_thing)

@@ -285,6 +285,12 @@ class SceneView(Bundle):
     evaluations: int
     observation: WorkingObservation | None = None
 
+    @property
+    def of_thing(self) -> bool:
+        """Whether a detection in an image said which surface is the thing's, see
+        :class:`regnf_core.fields.observation.Observation`; the box has that camera's axes then."""
+        return self.observation is not None and self.observation.of_thing
+
     def field(self, scene: SdfField) -> WorkingField:
         """The scene's field, the one that this view is of, in the working frame."""
         return WorkingField(scene, self.frame)
