@@ -261,6 +261,8 @@ class VerdictConstants:
     # Share of the object's samples that may be hidden, wherever they lie: of 696 right poses of scenes of which it is
     # known none has more than .935, so the probability knows nothing of poses beyond. [random worlds]
     max_hidden: float = 0.95
+    # The same where a detection in an image says which surface is the thing's. [simulated frames]
+    max_hidden_of_thing: float = 0.98
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
     # better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right
     # after it, and 11 instead of 17 answers are wrong. [random worlds]
