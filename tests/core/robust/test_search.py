@@ -194,7 +194,7 @@ def test_the_side_that_the_camera_sees_is_laid_on_what_was_seen() -> None:
     seeds = bounds.seen_seeds(scene, 0.5 * normals, normals, axes, super_fibonacci(24), 1.5)
     middle = seeds.inverse().apply(torch.zeros(1, 3).double())[:, 0]
     assert len(seeds) == 48
-    assert torch.allclose(middle, truth.inverse().translation.expand_as(middle), atol=0.01)
+    assert torch.allclose(middle, truth.inverse().translation.expand_as(middle), atol=0.02)
 
 
 def test_too_small_a_cloud_gives_no_seed() -> None:
