@@ -96,7 +96,9 @@ def register(
         raise InvalidOptionsError("--recording is for registrations that are done here", hint=hint)
     said = depth_unit, intrinsics, layout, camera_axes
     thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
-    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), thing, said)
+    place = _place(
+        scene, found, scene_description, cli.choice_of(scene_config, no_config), thing, said, server is not None
+    )
     client = cli.client_of(server, token, worker_timeout)
     answer(place, thing, request, Files(output, recording), client, None, cancel_on_interrupt, as_json)
 
@@ -113,10 +115,18 @@ def _place(
     settings: SettingsChoice,
     thing: FieldSource | None,
     said: tuple[Any, ...],
-) -> FieldSource | Recording:
-    """The scene's field, or a recording; a box outside of it is refused. thing: the only object · said: of the
-    recording, as ``cli.given_of`` takes it."""
+    remote: bool,
+) -> FieldSource | Recording | Path:
+    """The scene's field, or a recording (its path, where it is sent elsewhere); a box outside of it is refused.
+
+    thing: the only object · said: of the recording, as ``cli.given_of`` takes it.
+    """
     if any(said) or cli.is_recording(scene):
+        if remote and any(said):
+            hint = "Write it into the recording's files: docs/datasets.md says where."
+            raise InvalidOptionsError("options of recordings are for registrations that are done here", hint=hint)
+        if remote:
+            return scene
         from regnf_data.recordings.opening import open_recording
 
         return open_recording(scene, cli.given_of(*said))
@@ -185,7 +195,9 @@ def search(
     if server is None:
         require("engine")
     said = depth_unit, intrinsics, layout, camera_axes
-    place = _place(scene, found, scene_description, cli.choice_of(scene_config, no_config), None, said)
+    place = _place(
+        scene, found, scene_description, cli.choice_of(scene_config, no_config), None, said, server is not None
+    )
     objects: list[FieldSource] = []
     if server is None or library:
         for one in _objects_of(library, tag):

@@ -34,7 +34,7 @@ Objects = FieldSource | list[FieldSource]
 
 
 def answer(
-    scene: FieldSource | Recording,
+    scene: FieldSource | Recording | Path,
     objects: Objects,
     request: dict[str, Any],
     files: Files,
@@ -46,9 +46,12 @@ def answer(
 ) -> None:
     """Register or search, print the result, write the files, and leave with the verdict's exit code.
 
-    client: None does the work here · tag, cancel: see ``_register_remotely`` · top: how many candidates are shown.
+    scene: a path is that of a recording that is sent · client: None does the work here · tag, cancel: see
+    ``_register_remotely`` · top: how many candidates are shown.
     """
-    if client is not None:
+    if isinstance(scene, Path) or client is not None:
+        assert client is not None
+        assert isinstance(scene, Path | FieldSource)
         document = _register_remotely(client, scene, objects, request, tag, files.output, cancel)
     else:
         document = register_here(scene, objects, request, files)
@@ -268,7 +271,7 @@ def _modeled(
 
 def _register_remotely(
     client: Client,
-    scene: FieldSource,
+    scene: FieldSource | Path,
     objects: Objects,
     request: dict[str, Any],
     tag: str | None,
@@ -288,7 +291,8 @@ def _register_remotely(
             hint = "`regnf library add NAME FIELD --server ...` adds one."
             raise InvalidInputError(f"the library has no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
         more = {name: value for name, value in request.items() if name != "detection"}
-        job = client.submit(scene, searched, request["detection"], more=more, progress=report)
+        place: Any = client.recordings.upload(scene, progress=report) if isinstance(scene, Path) else scene
+        job = client.submit(place, searched, request["detection"], more=more, progress=report)
         page = f"{client.address}/jobs/{job.id}/view"
         tell(f"job          {job.id}\npage         {page}")
         try:

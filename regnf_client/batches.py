@@ -14,8 +14,9 @@ from pydantic import BeforeValidator, Field
 from regnf_client.answers import checked, object_of, refusal, service_error
 from regnf_client.fields import FieldLike, known_sha256, upload
 from regnf_client.models import Alternative, Array, Document, Matrix
+from regnf_client.recordings import detection_body
 from regnf_client.steps import Asking, Deadline, Flow, Pause, retry_after_s
-from regnf_core.detections.parsing import BoxLike, detection_of
+from regnf_core.detections.parsing import BoxLike
 from regnf_core.document import Verdict
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.field_source import FieldSource, Role
@@ -109,7 +110,7 @@ def request_body(
     """What a registration asks for beside its fields, as it is sent. initial_transform: a T_object_scene, or
     ``{"T_scene_object": ...}``. Raises InvalidDetectionError and InvalidOptionsError."""
     body = {
-        "detection": detection_of(detection).canonical(),
+        "detection": detection_body(detection),
         "options": None if options is None else options_of(options).to_dict(),
         "seed": seed,
         "initial_transform": plain(initial_transform),

@@ -11,12 +11,14 @@ from urllib.parse import quote
 from uuid import uuid4
 
 import regnf_client.fields as fields
+import regnf_client.recordings as recordings
 from regnf_client.answers import ServiceError, checked, parsed, refusal
 from regnf_client.batches import BatchReader, Pair, plain, request_body
 from regnf_client.fields import FieldLike, Sendable, known_sha256, smallest_first, source_of
 from regnf_client.models import BatchOutcome, Entry, Field, Job, Rendering, Result
+from regnf_client.recordings import detection_body
 from regnf_client.steps import Asking, Connection, Download, Flow, Report, work
-from regnf_core.detections.parsing import BoxLike, detection_of
+from regnf_core.detections.parsing import BoxLike
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_source import Role, SettingsChoice
 from regnf_core.library_entries import EntryNotes, checked_name
@@ -129,7 +131,7 @@ class Calls:
 
         A pair that fails does not stop the others.
         """
-        boxes, several = [detection_of(box) for box in detections], _several(objects)
+        boxes, several = [detection_body(box) for box in detections], _several(objects)
         chosen = None if options is None else options_of(options)
         wanted = pairs_of(pairs, len(boxes), len(several))
         asking = self._connection.asking(progress, timeout_s)
@@ -221,6 +223,65 @@ class Calls:
             paths.append((yield from _download(asking, _artifact_address(found, one.name), target, one.sha256)))
         asking.tell("downloading", 1.0)
         return paths
+
+
+class RecordingCalls:
+    """Recordings: depth images with their camera. One may be given as the scene wherever a field may; the detection may
+    then be in its images: ``{"frame": ..., "mask" | "box_2d" | "point_2d": ...}``, or a list of these."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def upload(
+        self,
+        path: str | Path,
+        label: str | None = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+        wait: bool = True,
+    ) -> Flow[Field]:
+        """A folder, an archive of one, a bag or a stored recording; once its import has ended, unless ``wait`` is
+        False. Raises ServiceError with the import's reason."""
+        return recordings.upload(self._connection.asking(progress, timeout_s), Path(path), label, wait)
+
+    def frame(
+        self,
+        depth: recordings.Image,
+        camera: Any,
+        color: recordings.Image = None,
+        depth_unit: float | None = None,
+        T_world_camera: Any = None,
+        after: Field | str | None = None,
+        name: str | None = None,
+        wait: bool = True,
+    ) -> Flow[Field]:
+        """One frame: paths, bytes or arrays (depth: (H, W), meters, or whole numbers of ``depth_unit`` meters; color:
+        (H, W, 3) uint8). camera: a document of intrinsics, its path, or K. after: the recording whose frames come
+        before, to which this one is added as ``name``."""
+        more = {"depth_unit": depth_unit, "T_world_camera": T_world_camera}
+        form = recordings.frame_form(depth, camera, color, more)
+        asking, address = self._connection.asking(), "/recordings"
+        if after is not None:
+            address, form["name"] = f"/recordings/{known_sha256(after)}/frames", (None, name or "")
+        found = yield from asking.document(Field, "POST", address, files=form)
+        return (yield from fields.ready(asking, found)) if wait else found
+
+    def entries(self, label: str | None = None) -> Flow[list[Field]]:
+        """All recordings, newest first."""
+        found = yield from _pages(self._connection.asking(), "recordings", {"label": label})
+        return [parsed(Field, one) for one in found]
+
+    def picture(self, recording: Field | str, frame: str | int = 0) -> Flow[bytes]:
+        """A PNG of a frame's color image, or of its depth. Raises ServiceError (RECORDING_FRAME_NOT_FOUND)."""
+        address = f"/recordings/{known_sha256(recording)}/frames/{quote(str(frame), safe='')}/color.png"
+        answer = yield from self._connection.asking().call("GET", address)
+        if not answer.is_success:
+            raise refusal(answer)
+        return answer.content
+
+    def delete(self, recording: Field | str) -> Flow[None]:
+        """Forget a recording. Raises ServiceError (FIELD_IN_USE)."""
+        return _done(self._connection.asking(), "DELETE", f"/recordings/{known_sha256(recording)}")
 
 
 class LibraryCalls:

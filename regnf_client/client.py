@@ -14,7 +14,7 @@ import httpx
 
 from regnf_client.answers import refusal, unreachable
 from regnf_client.batches import BatchReader, PairLike, PairResult
-from regnf_client.calls import Calls, JobLike, LibraryCalls, id_of
+from regnf_client.calls import Calls, JobLike, LibraryCalls, RecordingCalls, id_of
 from regnf_client.models import Event, EventReader
 from regnf_client.steps import ADDRESS, WORKER_TIMEOUT_S, Call, Connection, Download, Flow, Pause, Report, Step, Tries
 
@@ -158,6 +158,22 @@ class AsyncLibrary(_Library[AsyncDriver]):
     """The same, to be awaited."""
 
 
+class _Recordings(_Performing[_Driver]):
+    upload = _Method(RecordingCalls.upload)
+    frame = _Method(RecordingCalls.frame)
+    entries = _Method(RecordingCalls.entries)
+    picture = _Method(RecordingCalls.picture)
+    delete = _Method(RecordingCalls.delete)
+
+
+class Recordings(_Recordings[SyncDriver]):
+    """Depth images with their camera. What comes of them may be given as a scene."""
+
+
+class AsyncRecordings(_Recordings[AsyncDriver]):
+    """The same, to be awaited."""
+
+
 class _Client(_Performing[_Driver]):
     """What both clients have."""
 
@@ -230,6 +246,11 @@ class Client(_Client[SyncDriver]):
         """Objects by name, with tags."""
         return Library(LibraryCalls(self._connection), self._driver)
 
+    @property
+    def recordings(self) -> Recordings:
+        """Depth images with their camera."""
+        return Recordings(RecordingCalls(self._connection), self._driver)
+
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
     ) -> Iterator[PairResult]:
@@ -296,6 +317,11 @@ class AsyncClient(_Client[AsyncDriver]):
     def library(self) -> AsyncLibrary:
         """Objects by name, with tags."""
         return AsyncLibrary(LibraryCalls(self._connection), self._driver)
+
+    @property
+    def recordings(self) -> AsyncRecordings:
+        """Depth images with their camera."""
+        return AsyncRecordings(RecordingCalls(self._connection), self._driver)
 
     async def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None

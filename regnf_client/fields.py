@@ -109,7 +109,7 @@ def upload_all(
             found.append((yield from _sent(asking, one)))
     for number, one in enumerate(sources if wait else ()):
         with _naming(one):
-            found[number] = yield from _ready(asking, found[number])
+            found[number] = yield from ready(asking, found[number])
     return found
 
 
@@ -155,7 +155,7 @@ def find(asking: Asking, field: FieldLike) -> Flow[Field]:
     return (yield from asking.document(Field, "GET", f"/fields/{sha256}"))
 
 
-def _ready(asking: Asking, field: Field) -> Flow[Field]:
+def ready(asking: Asking, field: Field) -> Flow[Field]:
     """The field once its import has ended. Raises ServiceError with the gate's reason when it was rejected."""
     deadline = asking.deadline()
     while field.state == "validating":
@@ -180,7 +180,7 @@ def _send(asking: Asking, source: FieldSource, sha256: str) -> Flow[Field]:
         asking.tell("uploading", 0.0)
         form: dict[str, Any] = {"file": (source.file.name, (yield from work(source.file.read_bytes)), _BYTES)}
     else:
-        held = yield from _send_pieces(asking, source.file, f"/fields/{sha256}", size)
+        held = yield from send_pieces(asking, source.file, f"/fields/{sha256}", size)
         if held is not None:
             return held
         form = {"upload": (None, sha256)}
@@ -189,7 +189,7 @@ def _send(asking: Asking, source: FieldSource, sha256: str) -> Flow[Field]:
     return field
 
 
-def _send_pieces(asking: Asking, file: Path, address: str, size: int) -> Flow[Field | None]:
+def send_pieces(asking: Asking, file: Path, address: str, size: int) -> Flow[Field | None]:
     """All pieces that have not arrived. The field, if the service has come to have it."""
 
     def put(data: bytes, span: str) -> Flow[httpx.Response]:

@@ -313,7 +313,7 @@ class CameraDocument(Outgoing):
     """The object in the frame of the camera whose image the detection was made in: x right, y down, z forward."""
 
     frame: str = Field(description="The image's name.")
-    T_camera_object: TransformDocument = Field(description="Object to camera coordinates, meters.")
+    T_camera_object: TransformDocument = Field(description="Object to camera coordinates, in meters if the scene is.")
     T_scene_camera: TransformDocument = Field(description="Camera to scene coordinates; the scene is the recording.")
     center_camera: list[float] = Field(description="Where `center_object` is, camera frame, meters.")
     object_unit_m: float | None = Field(default=None, description="Meters of the object's unit, where it is known.")

@@ -33,6 +33,7 @@ ARTIFACTS: dict[str, str] = {
     "aligned.glb": "model/gltf-binary",
     "recording.rrd": _BINARY,
     "preview.png": "image/png",
+    "overlay.png": "image/png",
     "result.json": "application/json",
     "before-after.png": "image/png",
     "animation.webp": "image/webp",

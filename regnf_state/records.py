@@ -144,6 +144,8 @@ SETTINGS = "settings"
 CAMERAS = "cameras_file"
 """The same of the file that says where its cameras stood."""
 _BESIDE = (SETTINGS, CAMERAS)
+RECORDING = "recording"
+"""What the entry `as` of a recording's description says. No description that comes with a field says so."""
 
 
 class SettingsFile(NamedTuple):
@@ -197,6 +199,11 @@ class FieldRecord:
     def said(self) -> dict[str, Any]:
         """The description without the files that came."""
         return {name: value for name, value in self.description.items() if name not in _BESIDE}
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether the upload is a recording: frames of a camera in place of a field."""
+        return self.description.get("as") == RECORDING
 
     @property
     def settings(self) -> SettingsFile | None:

@@ -10,6 +10,7 @@ from pydantic import TypeAdapter
 
 from regnf_core.cost import Cost, estimate
 from regnf_core.detections import Detection
+from regnf_core.detections.images import AnyDetection, read_image_detections
 from regnf_core.editing.request import EditRequest
 from regnf_core.options import RegistrationOptions
 from regnf_core.rendering import request as rendering_cost
@@ -36,7 +37,8 @@ class RegistrationRequest:
     scene: str
     object: str | None
     candidates: tuple[str, ...] | None
-    detection: Detection
+    detection: AnyDetection
+    """A box in the scene, or one thing in images of a scene that is a recording."""
     options: RegistrationOptions
     seed: int = 0
     initial_transform: Rows | None = None
@@ -70,7 +72,7 @@ class RegistrationRequest:
             "scene": self.scene,
             "object": self.object,
             "candidates": None if self.candidates is None else list(self.candidates),
-            "detection": self.detection.values(),
+            "detection": values_of(self.detection),
             "options": self.options.to_dict(),
             "seed": self.seed,
             "initial_transform": self.initial_transform,
@@ -104,8 +106,15 @@ class RegistrationRequest:
         )
 
 
-def _recorded(values: Mapping[str, Any]) -> Detection:
+def values_of(detection: AnyDetection) -> Any:
+    """A detection as plain (JSON) values: a list of those in images."""
+    return detection.values() if isinstance(detection, Detection) else [one.values() for one in detection]
+
+
+def _recorded(values: Any) -> AnyDetection:
     """The box of recorded values, as they are: to normalize the quaternion again might change its last bits."""
+    if isinstance(values, list):
+        return read_image_detections(values)
     members: dict[str, Any] = {n: tuple(one) if isinstance(one, list) else one for n, one in values.items()}
     return Detection(**members)
 

@@ -29,7 +29,7 @@ FORBIDDEN = {
     "regnf_fit": HTTP | {"rq", "redis"} | OURS - {"regnf_core", "regnf_data", "regnf_fit"},
     "regnf_state": HTTP | HEAVY | OURS - {"regnf_core", "regnf_state"},
     "regnf_service": HEAVY | {"regnf_worker", "regnf_cli", "regnf_client", "regnf_fit", "regnf_data"},
-    "regnf_worker": HTTP | {"regnf_service", "regnf_cli", "regnf_client", "regnf_fit", "regnf_data"},
+    "regnf_worker": HTTP | {"regnf_service", "regnf_cli", "regnf_client"},
 }
 
 

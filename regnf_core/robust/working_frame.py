@@ -100,7 +100,9 @@ def clearance(observation: Observation) -> float:
     measured = drawn[states.view(-1)[drawn] == SURFACE][: OCCLUSION.voxels_asked]
     if len(measured) == 0:
         return OCCLUSION.min_clearance
-    centers = torch.stack(torch.unravel_index(measured, states.shape), -1)[:, None] + 0.5
+    _, down, across = states.shape  # torch.unravel_index loads a library of symbols, which takes half a second
+    places = [measured // (down * across), measured // across % down, measured % across]
+    centers = torch.stack(places, -1)[:, None] + 0.5
     directions = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)
     directions = normalize(directions[directions.any(1)])
     grid = replace(observation, low=torch.zeros(3).double(), voxel=1.0, T_grid_frame=None)

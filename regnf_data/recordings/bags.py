@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, MissingExtraError
 from regnf_data.recordings.camera import Array, Camera, camera_of_values
 from regnf_data.recordings.folders import interpolated, poses_of
 from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, recording_of
@@ -40,14 +40,12 @@ class Bag:
     """A bag that stays open while its frames are used."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DatasetError (DATASET_BAG_INVALID, MISSING_DEPENDENCY)."""
+        """Raises DatasetError (DATASET_BAG_INVALID) and MissingExtraError."""
         try:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise DatasetError(
-                "ROS bags need the library rosbags", reason="MISSING_DEPENDENCY", hint="pip install 'regnf[recordings]'"
-            ) from error
+            raise MissingExtraError.of(["rosbags"], ["engine"]) from error
         self.name, self._lock = path.name, Lock()
         with self.errors():
             self.reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))

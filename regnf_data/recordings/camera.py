@@ -26,6 +26,8 @@ _INVALID = "DATASET_INTRINSICS_INVALID"
 _MOST_BYTES = 1 << 20
 _FOCAL = 0.05, 50.0
 """Focal lengths over the image's width that some lens has."""
+_CENTRAL = 0.25
+"""Of half of an image's side: how far its principal point may be from its middle."""
 _UNITS_M = 1e-5, 0.01
 """Meters that a step of a depth image may stand for."""
 _ROUNDS = 8
@@ -60,6 +62,12 @@ class Camera:
                 reason=_INVALID,
             )
         return replace(self, K=np.diag([across, down, 1.0]) @ self.K, size=size)
+
+    def is_central(self, size: Size) -> bool:
+        """Whether the principal point is near the middle of images of this size, as lenses are mounted."""
+        height, width = size
+        off = np.abs(2.0 * self.K[:2, 2] / (width, height) - 1.0)
+        return bool(off.max() <= _CENTRAL)
 
     def rays(self, pixels: Array) -> Array:
         """(P, 3): directions through image points (P, 2) of a camera without a lens; their z is 1."""
@@ -152,8 +160,7 @@ class Camera:
         sideways = np.stack(
             [2.0 * p1 * x * y + p2 * (r + 2.0 * x * x), p1 * (r + 2.0 * y * y) + 2.0 * p2 * x * y], axis=1
         )
-        bent: Array = slopes * radial[:, None] + sideways
-        return bent
+        return np.asarray(slopes * radial[:, None] + sideways)
 
 
 def camera_of(
@@ -169,10 +176,12 @@ def camera_of(
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What a file says of a camera. depth_unit: meters a step of its depth images, or None."""
+    """What a file says of a camera. depth_unit: meters a step of its depth images, or None · pose: what stands under
+    T_world_camera, or None."""
 
     camera: Camera
     depth_unit: float | None = None
+    pose: Any = None
 
 
 def read_camera_file(path: Path) -> CameraFile | None:
@@ -204,7 +213,8 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             lens, coefficients = _lens(each, name)
             K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
             camera = Camera(K, size, lens, coefficients).check(name)
-            return CameraFile(camera, depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit")))
+            unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def mask_of(value: Any, size: Size | None = None) -> Mask:
             with Image.open(io.BytesIO(data), formats=_MASK_FORMATS) as image:
                 if image.width * image.height <= MOST_PIXELS:
                     return np.asarray(image.convert("L")) > 0
-        except (OSError, ValueError, SyntaxError) as error:
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             raise InvalidDetectionError(f"the mask is no image as base64: {error}"[:200]) from error
     raise InvalidDetectionError("the mask is no file, no image as base64 and no run lengths of COCO", hint=HINT)
 
@@ -102,17 +102,21 @@ def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
 
 _FEWEST = 30
 """Measured pixels of a thing, at least."""
-_JUMP = 0.02
+_JUMP = 0.015
 """A share of the depth: neighbors that differ by more lie on different surfaces."""
-_RING = 0.3
-"""Of a box's sides: how far around it the background is looked at."""
-_TRIALS, _PLANES = 200, 3
-_ON_PLANE = 0.008
-"""A share of the depth: what lies nearer to a plane of the background belongs to it."""
+_AROUND, _EDGE = 0.5, 8
+"""Of the sides of what is detected, and pixels: how far around it is looked, and how far outlines are off."""
+_TRIALS, _SAMPLES, _PLANES = 100, 1500, 4
+_ON_PLANE, _LEAST_ON_PLANE = 0.008, 0.0025
+"""Shares of the depth: what lies nearer to a plane of the background belongs to it, by the sensor's noise between."""
 _PLANE_SHARE = 0.15
-"""Of the ring's pixels, to be a plane of the background."""
-_NEARBY = 12
-"""Pixels in which a measured one is looked for, where a click met none."""
+"""Of the pixels around, to be a plane of the background."""
+_WHOLE, _MOSTLY = 0.9, 0.5
+"""Shares of a surface within the detection: it ends there; it belongs to what is detected."""
+_LONGER = 1.2
+"""Diameters of the thing: a surface that is longer is not its own."""
+_BEHIND = 0.2
+"""Of what is in the middle of a detection, behind a plane of its background, at most."""
 _TRIMMED = 0.01
 _LOOSE = 0.1
 """Of the box's size, on each side together: what a detector's mask cuts off, and the sensor's noise."""
@@ -127,45 +131,59 @@ class Lifted:
     points: Array
     pixels: Mask
     frame: Frame
-    notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Of an image, around a detection, (h, w) pixels. depth: 0 for none · points: (h, w, 3), camera frame · inside:
+    what is detected · seed: the pixel (row, column) that it points at · clicked: whether that one is the thing's ·
+    diameter: the thing's, m."""
+
+    depth: NDArray[np.float32]
+    points: Array
+    inside: Mask
+    seed: tuple[float, float] | None
+    clicked: bool
+    diameter: float
 
 
 def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None) -> Lifted:
     """The thing of a detection, in space. diameter: of the known object, m, where its size is known.
 
-    The depth in a mask, in a box or around a point falls into connected surfaces; without a mask, those that lie on
-    the planes around (a table, a wall) are left out. The thing is the surface that fills most of it. Its box has the
-    camera's axes; behind, it reaches as far as the thing is wide, since its back was not seen.
+    The depth in a mask, in a box or around a point falls into connected surfaces, without the planes that go on around
+    it (a table, a wall). The thing is the surface that fills most of the detection and does not go on beyond it: where
+    it ends a few pixels beyond an outline, the outline is taken to be off. Its box has the camera's axes; behind, it
+    reaches as far as the thing is wide, since its back was not seen.
     Raises InvalidDetectionError, naming the frame, for detections without depth or of another size than the image.
     """
     region, seed = _region(frame, detection)
     measured = region & (frame.depth > 0.0)
     if measured.sum() < _FEWEST:
-        share = f"{int(measured.sum())} of {int(region.sum())} pixels"
-        raise InvalidDetectionError(
-            f"frame {frame.name}: {share} of the detection have a measured depth", reason="DETECTION_WITHOUT_DEPTH"
-        )
-    if detection.point_2d is not None and seed is not None and diameter is not None:
+        raise _without_depth(frame, f"{int(measured.sum())} of {int(region.sum())} pixels of the detection")
+    clicked = detection.point_2d is not None
+    if clicked and seed is not None and diameter is not None:
         # Nothing of a thing that was clicked on is farther from the click than its diameter.
         here = _points(frame, measured)
         rows, columns = np.nonzero(measured)
-        clicked = here[np.hypot(rows - seed[0], columns - seed[1]).argmin()]
-        region = region & (frame.depth > 0.0)
-        region[rows, columns] = np.linalg.norm(here - clicked, axis=1) <= diameter
-        measured = region.copy()
-    if detection.mask is None:
-        measured = _without_background(frame, region, measured)
-    pixels = _largest(frame.depth, measured, seed, detection.point_2d is not None)
-    camera_points = _points(frame, pixels)
-    if diameter is not None and detection.mask is None:
+        middle = here[np.hypot(rows - seed[0], columns - seed[1]).argmin()]
+        region = np.zeros_like(region)
+        region[rows, columns] = np.linalg.norm(here - middle, axis=1) <= diameter
+    window = _window(region)
+    shown = np.zeros_like(region)
+    shown[window] = frame.depth[window] > 0.0
+    points = np.zeros((*region[window].shape, 3))
+    points[shown[window]] = _points(frame, shown)
+    moved = None if seed is None else (seed[0] - window[0].start, seed[1] - window[1].start)
+    pixels = np.zeros_like(region)
+    pixels[window] = _thing(_Part(frame.depth[window], points, region[window], moved, clicked, diameter or np.inf))
+    camera_points = points[pixels[window]]
+    if diameter is not None and len(camera_points):
         # Nothing of the thing is farther from its middle than its diameter.
         near = np.linalg.norm(camera_points - np.median(camera_points, axis=0), axis=1) <= diameter
+        pixels[pixels] = near
         camera_points = camera_points[near]
     if len(camera_points) < _FEWEST:
-        raise InvalidDetectionError(
-            f"frame {frame.name}: {len(camera_points)} pixels of the thing have a measured depth",
-            reason="DETECTION_WITHOUT_DEPTH",
-        )
+        raise _without_depth(frame, f"{len(camera_points)} pixels of the thing")
     low, high = (np.quantile(camera_points, share, axis=0) for share in (_TRIMMED, 1.0 - _TRIMMED))
     behind = max(float((high - low)[:2].max()), diameter or 0.0)
     high[2] = max(high[2], low[2] + behind)
@@ -174,6 +192,10 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
     center, axes = torch.from_numpy(R @ ((low + high) / 2.0) + t), torch.from_numpy(R.copy())
     box = OrientedBox(center, torch.from_numpy(size), axes, detection.label, detection.score)
     return Lifted(box, camera_points @ R.T + t, pixels, frame)
+
+
+def _without_depth(frame: Frame, said: str) -> InvalidDetectionError:
+    return InvalidDetectionError(f"frame {frame.name}: {said} have a measured depth", reason="DETECTION_WITHOUT_DEPTH")
 
 
 def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float, float] | None]:
@@ -215,38 +237,111 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
     return frame.registered(mask), seed
 
 
-def _without_background(frame: Frame, region: Mask, measured: Mask) -> Mask:
-    """Without what lies on the planes that most of the surroundings lie on."""
-    rows, columns = np.nonzero(region)
-    low, high = np.array([rows.min(), columns.min()]), np.array([rows.max(), columns.max()]) + 1
-    reach = np.ceil(_RING * (high - low)).astype(int)
-    ring = np.zeros_like(region)
-    first, last = np.maximum(low - reach, 0), high + reach
-    ring[first[0] : last[0], first[1] : last[1]] = True
-    around = ring & (frame.depth > 0.0) & (~region | region.all())
+def _window(region: Mask) -> tuple[slice, slice]:
+    """Rows and columns of the pixels of a region, and around it."""
+    spans = []
+    for axis, side in enumerate(region.shape):
+        held = np.flatnonzero(region.any(axis=1 - axis))
+        low, high = int(held[0]), int(held[-1]) + 1
+        more = max(int(_AROUND * (high - low)), 2 * _EDGE)
+        spans.append(slice(max(low - more, 0), min(high + more, side)))
+    return spans[0], spans[1]
+
+
+def _thing(part: _Part) -> Mask:
+    """(h, w): the pixels of the thing."""
+    measured = part.depth > 0.0
+    kept = measured & ~_background(part)
+    if (kept & part.inside).sum() < _FEWEST:
+        kept = measured
+    labels, count = _surfaces(part.depth, kept)
+    rows, columns = np.nonzero(kept)
+    inside = part.inside[kept]
+    weight = inside.astype(np.float64)
+    if part.seed is not None:
+        apart = np.hypot(rows - part.seed[0], columns - part.seed[1])
+        if part.clicked:
+            weight *= labels == labels[np.where(inside, apart, np.inf).argmin()]
+        else:
+            sides = np.ptp(np.nonzero(part.inside), axis=1).max()
+            weight *= np.exp(-0.5 * (apart / (0.25 * max(sides, 1))) ** 2)
+    total, held = (np.bincount(labels, each, minlength=count) for each in (None, inside))
+    share = held / np.maximum(total, 1)
+    best = int((np.bincount(labels, weight, minlength=count) * share**2).argmax())
+    # Something thin before it may part the thing: pieces at its depth belong to it.
+    depths = part.depth[kept]
+    low, high = np.quantile(depths[labels == best], [0.05, 0.95])
+    reach = max(high - low, _JUMP * high)
+    middle = np.bincount(labels, depths, minlength=count) / np.maximum(total, 1)
+    whole = _MOSTLY if part.seed is None else _WHOLE
+    belongs = (held >= _FEWEST) & (share >= whole) & (low - reach <= middle) & (middle <= high + reach)
+    if part.seed is not None:
+        near = np.zeros_like(kept)
+        near[kept] = labels == best
+        near = ndimage.binary_dilation(near, iterations=2 * _EDGE)
+        belongs &= (np.bincount(labels, near[kept], minlength=count) > 0) & (not part.clicked)
+    belongs[best] = True
+    around = ndimage.binary_dilation(part.inside, iterations=_EDGE)
+    ends = np.bincount(labels, around[kept], minlength=count) >= _WHOLE * total
+    out = np.zeros_like(kept)
+    out[kept] = belongs[labels] & (inside | (ends[labels] & around[kept]))
+    return out
+
+
+def _background(part: _Part) -> Mask:
+    """(h, w): what lies on planes that hold much of the surroundings, go on beyond the detection, and lie behind what
+    is in its middle: those of a neighbor's faces cut through it."""
+    measured = part.depth > 0.0
+    out = np.zeros_like(measured)
+    everything = bool(part.inside.all())
+    around = measured & (~part.inside | part.clicked)
     if around.sum() < 3 * _FEWEST:
-        return measured
+        return out
+    own = _middle(part, measured & part.inside)
     rng = np.random.default_rng(0)
-    inside, points = _points(frame, measured), _points(frame, around)
-    kept = np.ones(len(inside), dtype=np.bool_)
-    left = points[rng.permutation(len(points))[:5000]]
+    left = part.points[around]
+    left = left[rng.permutation(len(left))[:_SAMPLES]]
     total = len(left)
     for _ in range(_PLANES):
         plane = _plane(left, rng)
         if plane is None:
             break
         normal, offset = plane
-        on = np.abs(left @ normal - offset) <= _ON_PLANE * left[:, 2]
+        off = np.abs(left @ normal - offset) / left[:, 2]
+        on = off <= _ON_PLANE
         if on.sum() < _PLANE_SHARE * total:
             break
-        # Behind a plane, seen from the camera at the origin, is background too.
-        side = np.sign(offset) or 1.0
-        kept &= side * (offset - inside @ normal) > _ON_PLANE * inside[:, 2]
+        within = np.clip(4.5 * np.median(off[on]), _LEAST_ON_PLANE, _ON_PLANE)
+        before = (offset - part.points @ normal) * (np.sign(offset) or 1.0)  # the camera's side counts positive
+        there = measured & (np.abs(before) <= within * part.depth)
+        behind = own & (before < -within * part.depth)
+        goes_on = everything or _extent(part.points[there & part.inside]) > _LONGER * part.diameter
+        goes_on |= bool((there & part.inside).sum() < _MOSTLY * there.sum())
+        itself = (part.seed is None or everything) and (there & own).sum() > _MOSTLY * own.sum()
+        if goes_on and not itself and behind.sum() <= _BEHIND * (own & ~there).sum():
+            out |= there
         left = left[~on]
-    if kept.sum() < _FEWEST:
-        return measured
-    out = np.zeros_like(measured)
-    out[measured] = kept
+    return out
+
+
+def _extent(points: Array) -> float:
+    """The diagonal of points (P, 3), without the outermost ones; 0 for none."""
+    if not len(points):
+        return 0.0
+    return float(np.linalg.norm(np.subtract(*(np.quantile(points, share, axis=0) for share in (0.98, 0.02)))))
+
+
+def _middle(part: _Part, own: Mask) -> Mask:
+    """Of the measured pixels ``own`` of a detection, those that are surely the thing's, or nearly so."""
+    if part.seed is None:
+        core = own & (ndimage.distance_transform_edt(part.inside) > _EDGE)
+        return core if core.sum() >= _FEWEST else own
+    rows, columns = np.nonzero(own)
+    apart = np.hypot(rows - part.seed[0], columns - part.seed[1])
+    most = _FEWEST if part.clicked else max(_FEWEST, len(rows) // 4)
+    nearest = apart.argsort()[:most]
+    out = np.zeros_like(own)
+    out[rows[nearest], columns[nearest]] = True
     return out
 
 
@@ -272,39 +367,6 @@ def _points(frame: Frame, pixels: Mask) -> Array:
     """(P, 3): the measured points of pixels (H, W), camera frame."""
     middles = np.stack(np.nonzero(pixels)[::-1], axis=1).astype(np.float64) + 0.5
     return frame.camera.rays(middles) * frame.depth[pixels][:, None]
-
-
-def _largest(depth: NDArray[np.float32], measured: Mask, seed: tuple[float, float] | None, clicked: bool) -> Mask:
-    """The connected surface with most pixels; with a seed, those near it count for more, or it alone is ``clicked``."""
-    labels, count = _surfaces(depth, measured)
-    rows, columns = np.nonzero(measured)
-    if not len(rows):
-        return measured
-    weight = np.ones(len(rows))
-    if seed is not None:
-        apart = np.hypot(rows - seed[0], columns - seed[1])
-        if clicked:
-            return _of(int(labels[apart.argmin()]), labels, measured)
-        spread = 0.25 * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
-        weight = np.exp(-0.5 * (apart / spread) ** 2)
-    sizes = np.bincount(labels, weight, minlength=count)
-    best = int(sizes.argmax())
-    chosen = _of(best, labels, measured)
-    # Something thin before it may part the thing: pieces at its depth belong to it.
-    low, high = np.quantile(depth[chosen], [0.05, 0.95])
-    reach = max(high - low, _JUMP * high)
-    for other in np.flatnonzero(np.bincount(labels, minlength=count) >= _FEWEST):
-        if other != best:
-            piece = _of(int(other), labels, measured)
-            if low - reach <= np.median(depth[piece]) <= high + reach:
-                chosen |= piece
-    return chosen
-
-
-def _of(label: int, labels: NDArray[Any], measured: Mask) -> Mask:
-    out = np.zeros_like(measured)
-    out[measured] = labels == label
-    return out
 
 
 def _surfaces(depth: NDArray[np.float32], measured: Mask) -> tuple[NDArray[np.int64], int]:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from regnf_data.recordings.recording import Given
 
 _INVALID = "DATASET_METADATA_INVALID"
+_METRIC = 1e-3
+"""How far the scale of a world in meters may be from 1."""
 _INTRINSICS = "DATASET_INTRINSICS_INVALID"
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -235,7 +237,9 @@ def read_sdfstudio(folder: Path, given: Given) -> Recording:
                 color_file(resolve(folder, color, f"rgb_path of {name}")) if color else None,
             )
         )
-    return recording_of(folder.name, "sdfstudio", frames, (), T_metric_world)
+    scale = None if T_metric_world is None else np.cbrt(np.linalg.det(T_metric_world[:3, :3]))
+    is_metric = scale is not None and abs(scale - 1.0) < _METRIC
+    return recording_of(folder.name, "sdfstudio", frames, (), T_metric_world, is_metric)
 
 
 # COLMAP: cameras and images, as text or binary, and a depth image of each image's name.
@@ -270,7 +274,7 @@ def read_colmap(folder: Path, given: Given) -> Recording:
     cameras = dict(_binary_cameras(model / "cameras.bin") if binary else _text_cameras(model / "cameras.txt"))
     images = list(_binary_images(model / "images.bin") if binary else _text_images(model / "images.txt"))
     colors = _subfolder(folder, _COLOR_FOLDERS)
-    unit = given.depth_unit or 0.001
+    unit, is_dense = given.depth_unit or 0.001, False
     frames: list[StoredFrame | None] = []
     for name, number, quaternion, place in sorted(images, key=lambda each: each[0]):
         if number not in cameras:
@@ -285,11 +289,12 @@ def read_colmap(folder: Path, given: Given) -> Recording:
             frames.append(None)
             continue
         color = colors / name if colors and (colors / name).is_file() else None
+        is_dense |= depth is None
         reader = depth_file(depth, unit) if depth is not None else _dense(dense)
         frames.append(
             StoredFrame(name, given.camera or cameras[number], pose, reader, color_file(color) if color else None)
         )
-    return recording_of(folder.name, "COLMAP with depth", frames)
+    return recording_of(folder.name, "COLMAP with depth", frames, is_metric=not is_dense)
 
 
 def _dense(path: Path | None) -> Any:

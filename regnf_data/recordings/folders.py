@@ -47,6 +47,8 @@ _TUM_CAMERAS = {
 }
 """fx fy cx cy as the benchmark publishes them, by the part of the folder's name; its lists have no intrinsics."""
 _TUM_STEP_M = 1.0 / 5000.0
+_NANOSECONDS = 1e15
+"""Time stamps beyond are no seconds."""
 _MOST_APART_S = 0.05
 """Between an image and the poses on both sides of it, or the color beside it."""
 
@@ -72,10 +74,11 @@ def read_tum(folder: Path, given: Given) -> Recording:
         camera = camera_of(*published, size=(480, 640), whole_centers=True)
         notes.append("the folder has no intrinsics: those that the benchmark publishes for it are taken")
     unit = given.depth_unit or (found.depth_unit if found else None) or _TUM_STEP_M
-    stamps, poses = _tum_trajectory(_tum_poses(folder) or folder / "groundtruth.txt")
     depths, colors = _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
     color_stamps = np.array([stamp for stamp, _ in colors])
-    placed = interpolated(stamps, poses, np.array([stamp for stamp, _ in depths]))
+    wanted = np.array([stamp for stamp, _ in depths])
+    stamps, poses = _tum_trajectory(_tum_poses(folder) or folder / "groundtruth.txt", wanted)
+    placed = interpolated(stamps, poses, wanted)
     if depths and not any(pose is not None for pose in placed):
         first, last = depths[0][0], depths[-1][0]
         raise DatasetError(
@@ -108,11 +111,23 @@ def _tum_list(path: Path) -> list[tuple[float, str]]:
     return found
 
 
-def _tum_trajectory(path: Path) -> tuple[Array, Array]:
-    """Time stamps (N,), rising, and poses (N, 4, 4)."""
+def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
+    """Time stamps (N,), rising, and poses (N, 4, 4). wanted: of the depth images, for poses without stamps.
+
+    Also as EuRoC has it (ns, p, q w first, and more), and as KITTI does (12 numbers a line, in the images' order).
+    """
     rows = [[_number(word, path.name) for word in line.replace(",", " ").split()] for line in _lines(path)]
-    if not rows or any(len(row) != 8 for row in rows):
-        raise DatasetError(f"{path.name}: expected lines of t tx ty tz qx qy qz qw", reason=_INVALID)
+    lengths = {len(row) for row in rows}
+    if lengths in ({12}, {16}) and len(rows) == len(wanted):
+        found = [pose_of(row, path.name) for row in rows]
+        known = [number for number, pose in enumerate(found) if pose is not None]
+        return wanted[known], np.array([found[number] for number in known])
+    if len(lengths) == 1 and min(lengths) >= 8 and rows[0][0] > _NANOSECONDS:
+        rows = [[1e-9 * row[0], *row[1:4], *row[5:8], row[4]] for row in rows]
+        lengths = {8}
+    if lengths != {8}:
+        expected = "lines of t tx ty tz qx qy qz qw, or 12 numbers for each depth image"
+        raise DatasetError(f"{path.name}: expected {expected}", reason=_INVALID)
     values = np.array(rows)
     values = values[np.isfinite(values).all(axis=1)]
     values = values[np.argsort(values[:, 0], kind="stable")]
@@ -351,7 +366,7 @@ def _has_16_bits(path: Path) -> bool:
 
 
 def read_frame(path: Path, given: Given) -> Recording:
-    """The camera's frame is the world."""
+    """The camera's frame is the world, unless the file of intrinsics says T_world_camera."""
     files = _frame_files(path)
     if files is None:
         raise DatasetError(f"{path.name} has not one depth image", reason="DATASET_NO_FRAMES")
@@ -369,8 +384,8 @@ def read_frame(path: Path, given: Given) -> Recording:
             notes.append("no file says the depth's unit: millimeters are taken")
     # A camera file of the color image's resolution is scaled to the depth image's.
     size = checked_size(depth)
-    picture = color_file(color) if color else None
-    frame = StoredFrame(depth.stem, camera.of_size(size, depth.name), np.eye(4), depth_file(depth, unit), picture)
+    pose = np.eye(4) if found is None or found.pose is None else pose_of(found.pose, "T_world_camera")
+    frame = _frame(depth.stem, camera.of_size(size, depth.name), pose, depth, unit, color)
     return recording_of(path.name, "one frame", [frame], notes)
 
 

@@ -13,7 +13,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -128,7 +128,7 @@ def main(arguments: list[str]) -> int:
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
     from regnf_data.recordings.opening import open_recording
-    from regnf_data.recordings.stored import write_recording
+    from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
     if kind in ("zip", "tar", "gzip", "bzip2", "xz"):
@@ -136,6 +136,8 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
         unpack(upload, kind, source, limits.file_bytes // 2)
         source = inner_folder(source)
     recording = open_recording(source, given_of(request["description"] or {}))
+    if len(recording) == 1:  # somebody waits for it: it is decoded once
+        recording = replace(recording, frames=recording_of_frames([recording.frames[0].read()]).frames)
     kept, bounds = _kept(recording)
     stored = write_recording(recording, kept, folder / "field.safetensors")
     warning = _agreement(recording, kept, bounds)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import tarfile
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +22,9 @@ from regnf_data.recordings.stored import is_stored, read_stored
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MOST_LISTED = 12
+_TARS = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
+_CHECKPOINTS = (".ckpt", ".pt", ".pth", ".pkl", ".safetensors")
+_IMAGES = (".png", ".tif", ".tiff", ".npy", ".pgm", ".exr")
 _NEAR = 3
 """Folders below the one that was given in which recordings are looked for, to name them."""
 
@@ -48,12 +56,54 @@ def _bag(path: Path, given: Given) -> Recording:
     return read_bag(path, given)
 
 
+def _is_archive(path: Path) -> bool:
+    """Whether an archive holds depth images or a bag, and no checkpoint."""
+    if not path.is_file():
+        return False
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as zipped:
+                names = zipped.namelist()
+        elif path.name.lower().endswith(_TARS):
+            with tarfile.open(path) as tarred:
+                names = tarred.getnames()
+        else:
+            return False
+    except (OSError, zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error):
+        return False
+    return not any(name.endswith(_CHECKPOINTS) for name in names) and any(
+        name.endswith((".mcap", ".db3", ".bag")) or ("depth" in name.lower() and name.lower().endswith(_IMAGES))
+        for name in names
+    )
+
+
+def _archive(path: Path, given: Given) -> Recording:
+    """Imported as a service imports it; what was made of an archive is kept in the user's cache."""
+    from regnf_core.loading import default_cache_dir
+    from regnf_data.recordings.importing import import_recording
+
+    said: dict[str, Any] = {"depth_unit": given.depth_unit, "layout": given.layout, "camera_axes": given.axes}
+    if given.camera is not None:
+        K, size = given.camera.K, given.camera.size or (None, None)
+        said["intrinsics"] = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] - 0.5, "cy": K[1, 2] - 0.5}
+        said["intrinsics"] |= {} if size[0] is None else {"height": size[0], "width": size[1]}
+    description = {name: value for name, value in said.items() if value is not None}
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+    digest.update(json.dumps(description, sort_keys=True).encode())
+    kept = default_cache_dir().parent / "recordings" / digest.hexdigest()[:32]
+    if not (kept / "field.safetensors").is_file():
+        import_recording(path, kept, description)
+    return read_stored(kept / "field.safetensors", path.name)
+
+
 def _is_bag(path: Path) -> bool:
     return path.suffix in (".mcap", ".db3", ".bag") if path.is_file() else (path / "metadata.yaml").is_file()
 
 
 LAYOUTS = (
     Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
+    Layout("archive", "an archive of a recording", "*.zip, *.tar", _is_archive, _archive),
     Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop),
     Layout("sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio),
     Layout("nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio, "opengl"),

@@ -21,6 +21,7 @@ MOST_PIXELS = 1 << 25
 _FARTHEST = 1e6
 """Camera positions beyond are no meters."""
 _NOT_RIGID = 0.02
+_MILLIMETER, _EIGHT_BITS = 0.001, 255.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,12 @@ class StoredFrame:
     def read(self, color: bool = True) -> Frame:
         """Raises DatasetError (DATASET_IMAGE_INVALID, DATASET_INTRINSICS_INVALID, ...) naming the frame."""
         depth = self.depth()
-        camera = self.camera.of_size((depth.shape[0], depth.shape[1]), self.name).check(self.name)
+        size, given = (depth.shape[0], depth.shape[1]), self.camera
+        if given.size is None and self.color is not None and not given.is_central(size):
+            # Phones and ROS drivers give the color's intrinsics beside a smaller depth image.
+            height, width = self.color().shape[:2]
+            given = given.of_size((height, width), self.name) if given.is_central((height, width)) else given
+        camera = given.of_size(size, self.name).check(self.name)
         camera, depth = _without_lens(camera, depth)
         if self.along_ray:
             rows, columns = np.indices(depth.shape) + 0.5
@@ -91,7 +97,7 @@ class StoredFrame:
         if not color or self.color is None:
             return frame
         picture = self.color()
-        taken = (self.color_camera or self.camera).of_size((picture.shape[0], picture.shape[1]), self.name)
+        taken = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
         taken, picture = _without_lens(taken.check(self.name), picture)
         return replace(frame, color=picture, color_camera=taken)
 
@@ -101,7 +107,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world is in
+    meters.
     """
 
     name: str
@@ -109,6 +116,7 @@ class Recording:
     frames: tuple[StoredFrame, ...]
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
+    is_metric: bool = True
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -191,6 +199,11 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
         depth = read_depth(path, checked_size(path), unit)
         if unit is not None and path.suffix.lower() == ".npy" and _whole_numbers(path):
             depth = depth * np.float32(unit)
+        if unit is not None and unit <= _MILLIMETER and 0.0 < depth.max() <= _EIGHT_BITS * unit:
+            raise DatasetError(
+                f"{path.name}: its depths are whole numbers up to {round(depth.max() / unit)}: an image of 8 bits",
+                reason="DATASET_IMAGE_INVALID",
+            )
         return depth
 
     return read
@@ -239,8 +252,8 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
         given = np.array(matrix, np.float64)
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{name}: the pose is not numbers", reason="DATASET_POSE_NOT_RIGID") from error
-    if given.shape == (16,):
-        given = given.reshape(4, 4)
+    if given.shape in ((16,), (12,)):
+        given = given.reshape(-1, 4)
     if given.shape not in ((4, 4), (3, 4)):
         raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")
     if not np.isfinite(given).all():
@@ -278,6 +291,7 @@ def recording_of(
     frames: Sequence[StoredFrame | None],
     notes: Sequence[str] = (),
     T_metric_world: Array | None = None,
+    is_metric: bool = True,
 ) -> Recording:
     """The recording of the frames that have a pose; what was left out is noted.
 
@@ -294,4 +308,4 @@ def recording_of(
     said = (
         (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
     )
-    return Recording(name, layout, found, said, T_metric_world)
+    return Recording(name, layout, found, said, T_metric_world, is_metric)

@@ -71,6 +71,7 @@ def write_recording(recording: Recording, indices: Sequence[int], path: Path) ->
         "depth_unit": unit,
         "layout": recording.layout,
         "notes": list(recording.notes),
+        "is_metric": recording.is_metric,
         "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
     }
     arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]] = {
@@ -166,7 +167,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
                 Camera(colors[1][number].astype(np.float64), colors[0]) if colored and colors is not None else None,
             )
         )
-    return Recording(name or path.name, layout, tuple(frames), notes, metric)
+    return Recording(name or path.name, layout, tuple(frames), notes, metric, bool(said.get("is_metric", True)))
 
 
 def _depth(path: Path, number: int, unit: float) -> NDArray[np.float32]:

@@ -58,7 +58,7 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
         "depth_images": f"{width} x {height}",
         "color_images": " and ".join(f"{w} x {h}" for w, h in sorted(colors)) or None,
         "depth_step_m": _step(frames[0].depth),
-        "depth_step_from": "what was said" if said and said.depth_unit else "a guess" if guessed else "the layout",
+        "depth_step_from": "what was said" if said and said.depth_unit else "a guess" if guessed else "the recording",
         "depth_m": {
             name: _rounded(float(np.quantile(depths, share)))
             for name, share in (("nearest", 0.01), ("median", 0.5), ("farthest", 0.99))

@@ -180,7 +180,7 @@ def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
     valid = depth > 0.0
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=valid)
     x, y = rays[..., 0], rays[..., 1]
-    count, sums = _moments(x, y, inverse, valid)
+    count, sums = _moments(np.linalg.inv(camera)[:2, :2], inverse, valid)
     known = valid & (count >= _MIN_PIXELS)
     mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
     # all relative to the pixel itself, see _moments
@@ -202,21 +202,36 @@ def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
     return PixelPlanes(known, *(each.astype(np.float32) for each in (normals, cosine, deviation)))
 
 
-def _moments(x: Floats, y: Floats, inverse: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+_ROWS = 24
+"""That are done at once: what is in use stays in the processor's cache."""
+
+
+def _moments(step: Floats, inverse: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """How many pixels of each window lie on its middle's surface, (H, W), and sums over them, (9, H, W): of x, y and
-    i = 1/z less the middle's, and of their products xx, yy, xy, xi, yi, ii."""
+    i = 1/z less the middle's, and of their products xx, yy, xy, xi, yi, ii.
+
+    step: (2, 2), x and y of one pixel to the right and of one down: those of a window's pixels are the same everywhere.
+    """
     height, width = inverse.shape
-    count = np.zeros(inverse.shape)
-    sums = np.zeros((9, *inverse.shape))
-    for down, right in product(range(-_NORMAL_REACH, _NORMAL_REACH + 1), repeat=2):
-        here = slice(max(0, -down), height - max(0, down)), slice(max(0, -right), width - max(0, right))
-        there = slice(max(0, down), height - max(0, -down)), slice(max(0, right), width - max(0, -right))
-        i = inverse[there] - inverse[here]
-        same = valid[there] & (np.abs(i) < _SAME_SURFACE * inverse[here])
-        dx, dy, i = (np.where(same, each, 0.0) for each in (x[there] - x[here], y[there] - y[here], i))
-        count[(*here,)] += same
-        for k, term in enumerate((dx, dy, i, dx * dx, dy * dy, dx * dy, dx * i, dy * i, i * i)):
-            sums[(k, *here)] += term
+    reach = _NORMAL_REACH
+    padded = np.pad(np.where(valid, inverse, np.inf), reach, constant_values=np.inf)
+    offsets = list(product(range(2 * reach + 1), repeat=2))
+    x, y = step @ (np.array(offsets).T[::-1] - reach)
+    of_count, of_inverse = np.stack([np.ones_like(x), x, y, x * x, y * y, x * y]), np.stack([np.ones_like(x), x, y])
+    count, sums = np.zeros(inverse.shape), np.zeros((9, height, width))
+    for top in range(0, height, _ROWS):
+        here = inverse[top : top + _ROWS]
+        rows = len(here)
+        windows = [padded[top + down : top + down + rows, right : right + width] for down, right in offsets]
+        i = np.stack(windows) - here
+        same = np.abs(i) < _SAME_SURFACE * here
+        i[~same] = 0.0
+        flat = i.reshape(len(offsets), -1)
+        counted = (of_count @ same.reshape(len(offsets), -1).astype(np.float64)).reshape(6, rows, width)
+        part = slice(top, top + rows)
+        count[part], sums[0:2, part], sums[3:6, part] = counted[0], counted[1:3], counted[3:]
+        first, sums[6, part], sums[7, part] = (of_inverse @ flat).reshape(3, rows, width)
+        sums[2, part], sums[8, part] = first, np.einsum("kn,kn->n", flat, flat).reshape(rows, width)
     return count, sums
 
 

@@ -61,9 +61,10 @@ def recorded_scene(
     Raises DatasetError and InvalidDetectionError, naming the frame.
     """
     options = options or RegistrationOptions()
+    said: Unit = options.robust.object_unit if recording.is_metric else "free"
     if isinstance(detection, OrientedBox):
         box, own, first, extent = detection, [], [], float(detection.size.max())
-        unit = _unit(options.robust.object_unit, extent, object_bounds)
+        unit = _unit(said, extent, object_bounds)
     else:
         if not detection:
             raise InvalidDetectionError("no detection is given")
@@ -72,7 +73,7 @@ def recorded_scene(
         pairs = list(zip(own, detection, strict=True))
         first = [lift(frame, one) for frame, one in pairs]
         extent = max(float(np.ptp(each.points, axis=0).max()) for each in first)
-        unit = _unit(options.robust.object_unit, extent, object_bounds)
+        unit = _unit(said, extent, object_bounds)
         if unit in METERS and object_bounds is not None:
             diameter = METERS[unit] * float(np.linalg.norm(object_bounds[1] - object_bounds[0]))
             first = [lift(frame, one, diameter) for frame, one in pairs]
@@ -91,6 +92,8 @@ def recorded_scene(
     camera = CameraView(frame.name, Sim3.from_matrix(frame.T_world_camera.tolist()), METERS.get(unit))
     known = replace(options, robust=replace(options.robust, object_unit=unit))
     notes = recording.notes if disagreement is None else (*recording.notes, disagreement)
+    if not recording.is_metric:
+        notes += ("the recording's world is not in meters: the scale is free, and lengths are in its unit",)
     if unit in METERS and options.robust.object_unit == "auto":
         notes += (f"the object's unit is taken to be {unit}, by its size: say --object-unit, or --scale free",)
     return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), notes)

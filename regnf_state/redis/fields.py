@@ -237,11 +237,21 @@ class RedisFieldRecords(RedisRejections):
         return self._read_each(FIELD, references)
 
     def list_fields(
-        self, label: str | None, limit: int, before: Position | None, owner: str | None = None
+        self,
+        label: str | None,
+        limit: int,
+        before: Position | None,
+        owner: str | None = None,
+        recordings: bool | None = None,
     ) -> Page[FieldRecord]:
-        """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's."""
+        """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's. recordings: these
+        alone, or all but these."""
+
+        def wanted(record: FieldRecord) -> bool:
+            return label in (None, record.label) and recordings in (None, record.is_recording)
+
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
-        return self._page(index, FIELD, limit, before, lambda record: label in (None, record.label))
+        return self._page(index, FIELD, limit, before, wanted)
 
     def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
         """Compare-and-set. Raises StaleAttemptError for a field that is gone, or past ``attempt`` (None: any).

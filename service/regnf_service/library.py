@@ -19,13 +19,15 @@ def find_entry(services: Services, caller: str, name: str) -> LibraryEntry:
 
 
 def add_entry(services: Services, caller: str, sha256: str, notes: EntryNotes) -> tuple[LibraryEntry, bool]:
-    """The entry, and whether it is new. Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IN_LIBRARY,
-    NameTakenError."""
+    """The entry, and whether it is new. Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, RECORDING_UNSUITABLE,
+    FIELD_IN_LIBRARY, NameTakenError."""
     field = services.records.get_field(reference_of(caller, sha256))
     if field is None:
         raise Problem("FIELD_NOT_FOUND")
     if field.state == "rejected":
         raise Problem("FIELD_REJECTED")
+    if field.is_recording:
+        raise Problem("RECORDING_UNSUITABLE")
     held = LibraryEntry.of(field)
     if held is not None and held.notes == notes:
         return held, False

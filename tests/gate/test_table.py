@@ -18,7 +18,7 @@ from tests.gate.bad_runs import RUNS
 from tests.gate.bad_tensors import TENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
-SECTIONS = ("Transport", "Names", "Container", "Runs", "Pickle", "Tensors", "Boxes", "Requests")
+SECTIONS = ("Transport", "Names", "Container", "Runs", "Pickle", "Tensors", "Boxes", "Requests", "Recordings")
 _WORD = re.compile(r"`([^`]+)`")
 _REASON = re.compile(r"`([A-Z][A-Z0-9_]+)`")
 

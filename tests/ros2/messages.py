@@ -63,7 +63,8 @@ class Message:
         elif kind in _KINDS:
             assert type(value) is _KINDS[kind], (type(self).__name__, name, value)
         else:
-            assert isinstance(value, list if kind.endswith("[]") else TYPES[kind])
+            received = getattr(value, "__msgtype__", "").replace("/msg/", "/") == kind
+            assert received or isinstance(value, list if kind.endswith("[]") else TYPES[kind])
         object.__setattr__(self, name, value)
 
 

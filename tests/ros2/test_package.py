@@ -61,13 +61,15 @@ class Answers:
         return httpx.Response(200, json={"id": "j1", "status": "successful"})
 
 
-def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request], httpx.Response], **given: Any) -> Any:
+def make_node(monkeypatch: pytest.MonkeyPatch, answers: Any, **given: Any) -> Any:
+    """answers: a function of requests, or a transport."""
     monkeypatch.setenv("REGNF_API_TOKEN", "open-sesame")
     usual = {"server": "http://127.0.0.1:1", "scene": SCENE, "objects": f"chair={CHAIR}"}
     monkeypatch.setattr(Node, "given", usual | given)
-    service, transport = part("service").Service, httpx.MockTransport(answers)
+    service = part("service").Service
+    transport = answers if isinstance(answers, httpx.BaseTransport) else httpx.MockTransport(answers)
     monkeypatch.setattr(part("node"), "Service", lambda address, token: service(address, token, transport))
-    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self: None)
+    monkeypatch.setattr(part("node").RegisterObjects, "work", lambda self, *what: None)
     return part("node").RegisterObjects()
 
 
@@ -132,6 +134,19 @@ def test_objects_in_meters_bound_the_scale(monkeypatch: pytest.MonkeyPatch, tmp_
     bounds = pytest.approx({"min_scale": 3.88, "max_scale": 4.12})  # an object's meters for each of the field's units
     assert quarter["options"]["robust"] == bounds
     assert metric["options"]["robust"] == {"min_scale": 1.0, "max_scale": 1.0}
+    _, inches = answered(monkeypatch, scale_tolerance="0.1", object_unit="in")
+    bounds = {name: pytest.approx(share / 0.0254) for name, share in (("min_scale", 0.9), ("max_scale", 1.1))}
+    assert inches["options"]["robust"] == {"object_unit": "in", **bounds}
+    _, known = answered(monkeypatch, object_unit="mm")
+    assert known["options"]["robust"] == {"object_unit": "mm"}
+    _, scaled = answered(monkeypatch, dataparser_transforms=str(file), object_unit="mm")
+    assert {name: scaled["options"]["robust"][name] for name in ("min_scale", "max_scale")} == pytest.approx(
+        {"min_scale": 3960.0, "max_scale": 4040.0}
+    )
+    _, free = answered(monkeypatch, object_unit="free", scale_tolerance="0.1")
+    assert free["options"]["robust"] == {"object_unit": "free"}
+    with pytest.raises(ValueError, match="object_unit: 'ft' is none of auto, free, m, cm, mm, in"):
+        make_node(monkeypatch, Answers(result()), object_unit="ft")
     for wrong in ("-0.1", "1", "nan", "little"):
         with pytest.raises(ValueError, match=r"scale_tolerance|could not convert"):
             make_node(monkeypatch, Answers(result()), scale_tolerance=wrong)
@@ -358,7 +373,9 @@ def test_the_launch_file_gives_each_parameter_of_the_node() -> None:
     made = runpy.run_path(str(PACKAGE / "launch" / "regnf.launch.py"))["generate_launch_description"]()
     *declared, node = made
     names = {one.arguments[0] for one in declared}
-    assert names == set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
+    topics = {topic: name.arguments[0] for topic, name in node.named["remappings"]}
+    assert set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
+    assert names == set(part("node").PARAMETERS) | set(topics.values())
     assert (node.named["package"], node.named["executable"]) == ("regnf_ros", "register_objects")
 
 

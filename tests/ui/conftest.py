@@ -174,7 +174,8 @@ def service(running_home: str, visit: Visit) -> Iterator[str]:
     if visit.page.url.startswith(running_home):
         visit.page.evaluate("() => { sessionStorage.clear(); localStorage.clear(); }")
     visit.page.goto("about:blank")  # lets go of the connections
-    for kind, key in (("jobs", "id"), ("library", "name"), ("fields", "sha256")):
+    kinds = {"jobs": "id", "library": "name", "fields": "sha256", "recordings": "sha256"}
+    for kind, key in kinds.items():
         listed = httpx.get(f"{running_home}/{kind}", headers={"Accept": "application/json"}).json()
         for one in listed.get(kind) or listed.get("entries") or []:
             httpx.delete(f"{running_home}/{kind}/{one[key]}").raise_for_status()

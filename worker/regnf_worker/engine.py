@@ -16,7 +16,9 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.rendering.request import RenderRequest
 from regnf_core.version import ENGINE_REVISION
 from regnf_state.manifest import EDITED_FIELD
+from regnf_state.records import RECORDING
 from regnf_state.registration_request import RegistrationRequest
+from regnf_worker.recorded import place_of
 
 if TYPE_CHECKING:
     from regnf_core.rendering.job import RenderReport
@@ -93,26 +95,27 @@ class Engine:
     ) -> Made:
         """Do what a request asks for, artifacts into ``folder``. ``model`` saves making one."""
         from regnf_core.fields.build import open_field
-        from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
         from regnf_core.library import register, with_late_clouds
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         _one_thread()
         start, truth = request.initial_transform, request.ground_truth
-        fields = open_field(scene, self.device), open_field(object_, self.device)
-        box, options = OrientedBox.from_quaternion(**asdict(request.detection)), request.options
+        thing = open_field(object_, self.device)
+        place = place_of(scene, request, model or thing, self.device)
+        fields, box, options = (place.field, thing), place.box, place.options
         initial = Sim3.from_matrix(start) if start else None
         # errors against a truth are those of the clouds' points
-        result = register(*fields, box, options, request.seed, report, initial, model, bool(truth))
+        result = place.seen(register(*fields, box, options, request.seed, report, initial, model, bool(truth)))
         T_true = Sim3.from_matrix(truth) if truth else None
         said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object)}
         names = write_result(result, folder, truth=T_true, **said)
 
         def finish() -> list[str]:
-            return write_pictures(result if truth else with_late_clouds(result, *fields, box, options), folder)
+            shown = result if truth else with_late_clouds(result, *fields, box, options)
+            return [*place.draw(result, thing, folder), *write_pictures(shown, folder)]
 
-        return Made(names, PICTURES, finish) if request.pictures else Made(names)
+        return Made(names, (*place.pictures, *PICTURES), finish) if request.pictures else Made(names)
 
     def search(
         self,
@@ -126,7 +129,6 @@ class Engine:
         """The same for a request with candidates."""
         from regnf_core.document import ranking_document
         from regnf_core.fields.build import open_field
-        from regnf_core.geometry.box import OrientedBox
         from regnf_core.library import LibraryObject, search_library, with_late_clouds
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
@@ -136,20 +138,23 @@ class Engine:
             return lambda: open_field(one.open(), self.device)
 
         unusable = {one.sha256: one.fault for one in candidates if one.fault is not None}
-        place, options = open_field(scene, self.device), request.options
-        box = OrientedBox.from_quaternion(**asdict(request.detection))
+        place = place_of(scene, request, None, self.device)
+        box, options = place.box, place.options
         objects = {
             one.sha256: LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None
         }
-        found = search_library(place, box, [*objects.values()], options, request.seed, report, clouds=False)
+        found = search_library(place.field, box, [*objects.values()], options, request.seed, report, clouds=False)
+        result = place.seen(found.result)
         winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
         said: dict[str, Any] = {"object_name": winner, "candidates": ranking, "fields": _fields(notes, winner)}
-        names = write_result(found.result, folder, **said)
+        names = write_result(result, folder, **said)
 
         def finish() -> list[str]:
-            return write_pictures(with_late_clouds(found.result, place, objects[winner].field(), box, options), folder)
+            thing = objects[winner].field()
+            shown = with_late_clouds(result, place.field, thing, box, options)
+            return [*place.draw(result, thing, folder), *write_pictures(shown, folder)]
 
-        return Made(names, PICTURES, finish) if request.pictures else Made(names)
+        return Made(names, (*place.pictures, *PICTURES), finish) if request.pictures else Made(names)
 
     def render(
         self,
@@ -206,11 +211,15 @@ def _fields(notes: Notes, obj: str | None) -> dict[str, FieldNotes]:
 
 
 def core_importer(limits: ImportLimits) -> Importer:
-    """The import gate of regnf_core within ``limits``."""
+    """The import gate of regnf_core within ``limits``, and of regnf_data for recordings."""
 
     def run(
         upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None
     ) -> dict[str, Any]:
+        if description.get("as") == RECORDING:
+            from regnf_data.recordings.importing import import_recording
+
+            return import_recording(upload, folder, {"as": RECORDING}, limits)
         said = description or None
         report = import_field(upload, folder, said, limits, settings=settings, cameras=cameras, ask_by_picture=True)
         return report.to_dict()

@@ -14,9 +14,10 @@ from typing import Any
 from redis.exceptions import RedisError
 from rq.timeouts import JobTimeoutException
 
-from regnf_core.errors import Candidate, FieldFormatError, RegnfError
+from regnf_core.errors import Candidate, DatasetError, FieldFormatError, RegnfError
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.ownership import owner_of
+from regnf_state.ownership import owner_of, reference_of
+from regnf_state.pieces import view_key
 from regnf_state.records import CANDIDATES, FieldRecord, SettingsFile, StaleAttemptError
 from regnf_state.room import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_worker.engine import Importer
@@ -67,12 +68,13 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
             raise
         _refuse(context, sha256, attempt, fault(error, f"import {sha256} attempt {attempt}"))
     else:
-        until = context.originals.kept_until(None)
+        until = None if field.is_recording else context.originals.kept_until(None)
+        views: dict[str, Any] = {"views": "none"} if field.is_recording else {}
         if until is None:
             delete_upload(context.blobs, field)
         retry_until_available(
             f"the record of import {sha256}",
-            lambda: _end(context, sha256, attempt, state="ready", report=report, original_until=until),
+            lambda: _end(context, sha256, attempt, state="ready", report=report, original_until=until, **views),
         )
 
 
@@ -141,6 +143,10 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
         folder = Path(temporary)
         with _beside(context, field, field.settings) as settings, _beside(context, field, field.cameras) as cameras:
             report: dict[str, Any] = importer(upload, folder, field.said, settings, cameras)
+        if "after" in field.description:
+            report = _joined(context, field, report, folder)
+        if field.is_recording:
+            report = {**report, "field_bytes": (folder / "field.safetensors").stat().st_size}
         _require_current(context, field)
         delete_all_but_upload(context.blobs, field)  # an object's model, of what the field was before
         with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
@@ -149,6 +155,19 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
             writer.commit(f"fields/{sha256}/field.safetensors")
     context.blobs.put(_report(sha256), json.dumps({"description": description, "report": report}).encode())
     return report
+
+
+def _joined(context: Context, field: FieldRecord, report: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Put the frame behind those of the recording that it is added to; what is known of both. Raises DatasetError."""
+    from regnf_worker.recorded import joined_recordings, joined_reports
+
+    before, name = reference_of(field.owner, field.description["after"]), str(field.description["frame"])
+    known, made = context.records.get_field(before), folder / "field.safetensors"
+    if known is None or known.state != "ready":
+        raise DatasetError("the recording that the frame was added to was deleted", reason="FIELD_NOT_FOUND")
+    with context.blobs.local_copy(view_key(before, made.name)) as first:
+        joined_recordings(first, made, name, made)
+    return joined_reports(known.report, report, name)
 
 
 @contextmanager

@@ -40,8 +40,11 @@ _MODULES = (
     "regnf_core.viewing.artifacts",
     "regnf_core.fields.build",
     "regnf_core.library",
-    "regnf_core.library",
     "regnf_core.rendering.job",
+    "regnf_data.recordings.importing",
+    "regnf_data.recordings.stored",
+    "regnf_fit.images.recorded_scene",
+    "regnf_fit.images.overlay",
     "regnf_core.geometry.sim3",
     "PIL.PngImagePlugin",
 )

@@ -140,7 +140,10 @@ _PACKED = ((b"\x1f\x8b\x08", "gzip"), (b"BZh", "bzip2"), (b"\xfd7zXZ\x00", "xz")
 _TAR_MAGIC, _TAR_MAGIC_AT, _OLD_TORCH_TAR = b"ustar", 257, b"sys_info\0"
 _PICTURE = "picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"
 _PAGE = "an HTML page, not a field; the download failed, or it needs a login"
+BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n")
+"""How recordings of robots begin, beside those that are SQLite databases."""
 _OTHER_FILES = (
+    *((magic, "a recording of a robot, not a field; a service takes it at POST /recordings") for magic in BAGS),
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
     *((b"<!doctype html", _PAGE), (b"<html", _PAGE)),
     (b"<?xml", "an XML document, not a field; export a model as .glb, .ply, .obj or .stl"),

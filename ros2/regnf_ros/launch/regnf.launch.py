@@ -1,4 +1,4 @@
-"""Starts the node: ros2 launch regnf_ros regnf.launch.py scene:=SHA256 objects:='chair=SHA256'"""
+"""Starts the node: ros2 launch regnf_ros regnf.launch.py objects:='chair=SHA256' depth:=/camera/depth/image_rect ..."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -9,19 +9,32 @@ from launch_ros.parameter_descriptions import ParameterValue
 ARGUMENTS = {
     "server": ("http://127.0.0.1:8080", "Address of the regnf service."),
     "token_file": ("", "File with the service's access token. Without it that of the variable REGNF_API_TOKEN."),
-    "scene": ("", "SHA-256 of the room's field."),
+    "scene": ("", "SHA-256 of the room's field, for boxes in space. Images need none."),
     "objects": ("", 'CLASS=SHA256 of each object, with blanks between them; or JSON: {"CLASS": "SHA256"}.'),
-    "map_frame": ("map", "The fixed frame that the room's field is in."),
+    "object_unit": ("auto", "Unit of the objects' fields: m, cm, mm, in; auto: by their size; free: unknown."),
+    "map_frame": ("map", "The fixed frame of poses, which the room's field is in."),
     "dataparser_transforms": ("", "dataparser_transforms.json, if the room's field is in its trainer's frame."),
-    "scale_tolerance": ("", "The objects' fields are in meters, give or take this share: 0.03 for instance."),
+    "scale_tolerance": ("", "The objects' fields are in their unit, give or take this share: 0.03 for instance."),
     "up_axis": ("", "x, y or z: the vertical axis of room and objects, if it is known."),
+}
+TOPICS = {
+    "depth": ("depth/image", "Depth images, aligned to the images that detections are made in."),
+    "camera_info": ("depth/camera_info", "Their camera's."),
+    "color": ("color/image", "Color images, for the picture of a result."),
+    "detections_2d": ("detections_2d", "vision_msgs/Detection2DArray."),
+    "yolo": ("yolo/detections", "yolo_msgs/DetectionArray."),
+    "detections": ("detections", "Boxes in space, vision_msgs/Detection3DArray."),
 }
 
 
 def generate_launch_description():
     declared = [
-        DeclareLaunchArgument(name, default_value=value, description=told) for name, (value, told) in ARGUMENTS.items()
+        DeclareLaunchArgument(name, default_value=value, description=told)
+        for name, (value, told) in (ARGUMENTS | TOPICS).items()
     ]
     parameters = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ARGUMENTS}
-    node = Node(package="regnf_ros", executable="register_objects", name="regnf", parameters=[parameters])
+    topics = [(topic, LaunchConfiguration(name)) for name, (topic, _) in TOPICS.items()]
+    node = Node(
+        package="regnf_ros", executable="register_objects", name="regnf", parameters=[parameters], remappings=topics
+    )
     return LaunchDescription([*declared, node])

@@ -18,6 +18,10 @@ from regnf_ros.poses import Matrix, scale_of
 _AXIS = re.compile(r"\+?(?:axis[_ -]?)?([xyz])(?:[_ -]?axis)?", re.IGNORECASE)
 _ENTRY = re.compile(r"\s*(.+?)\s*=\s*([0-9a-fA-F]{64})(?:[\s,;]+|$)", re.DOTALL)
 _DIGEST = re.compile(r"[0-9a-fA-F]{64}")
+METERS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Of the units that an object may be in."""
+KNOWN = 0.01
+"""By what share the scale of a unit that is said may be off, as in the service."""
 TOKEN_VARIABLE = "REGNF_API_TOKEN"  # noqa: S105 - the variable's name
 
 
@@ -88,18 +92,26 @@ def _entries(text: str) -> list[str]:
     return [*found, text[at:]] if text[at:].strip() else found
 
 
-def options_of(up_axis: str, scale_tolerance: float | None, T_field_map: Matrix) -> dict[str, Any]:
-    """The options of every registration. scale_tolerance: by what share the objects' units may differ from meters;
-    None: they are not known.
+def unit_of(name: str, value: Any) -> str:
+    """The unit of the objects' fields: auto, free, or one of a known length. Raises ValueError."""
+    if value in ("auto", "free", *METERS):
+        return str(value)
+    raise ValueError(f"{name}: {value!r} is none of auto, free, {', '.join(METERS)}")
+
+
+def options_of(up_axis: str, scale_tolerance: float | None, object_unit: str, T_scene_map: Matrix) -> dict[str, Any]:
+    """The options of every registration. scale_tolerance: by what share the objects' units may differ from what
+    ``object_unit`` says, or from meters where it says nothing; None: as the service takes a known unit, if it is known.
     """
     options: dict[str, Any] = {"up_axis": up_axis} if up_axis else {}
-    if scale_tolerance is not None:
-        metric = 1.0 / scale_of(T_field_map)
-        options["robust"] = {
-            "min_scale": (1.0 - scale_tolerance) * metric,
-            "max_scale": (1.0 + scale_tolerance) * metric,
-        }
-    return options
+    robust: dict[str, Any] = {} if object_unit == "auto" else {"object_unit": object_unit}
+    scale = scale_of(T_scene_map)
+    if scale_tolerance is None and object_unit in METERS and abs(scale - 1.0) > KNOWN:
+        scale_tolerance = KNOWN  # of a scene that is not in meters the service cannot tell
+    if scale_tolerance is not None and object_unit != "free":
+        units = 1.0 / (scale * METERS.get(object_unit, 1.0))
+        robust |= {"min_scale": (1.0 - scale_tolerance) * units, "max_scale": (1.0 + scale_tolerance) * units}
+    return options | ({"robust": robust} if robust else {})
 
 
 def token_of(file: str, environment: Mapping[str, str] = os.environ) -> str:

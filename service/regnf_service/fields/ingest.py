@@ -12,7 +12,7 @@ from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
-from regnf_state.ownership import reference_of
+from regnf_state.ownership import reference_of, sha256_of
 from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
 from regnf_state.room import delete_upload, original_key, settings_key
 
@@ -166,6 +166,9 @@ async def store_upload(
 
 def keep_held(services: Services, known: FieldRecord, beside: Beside) -> StoredUpload:
     """A field that the caller has already. Raises Problem FIELD_DESCRIPTION_DIFFERS."""
+    if known.is_recording and beside.is_nothing:
+        hint = f"They are stored as a recording: GET /recordings/{sha256_of(known.sha256)}."
+        raise Problem("FIELD_DESCRIPTION_DIFFERS", hint=hint)
     if not beside.is_nothing and not beside.is_function_of(known):
         raise Problem("FIELD_DESCRIPTION_DIFFERS")
     if beside.label is not None and beside.label != known.label:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from regnf_core.importing.containers.sniff import HEAD_BYTES
+from regnf_core.importing.containers.sniff import BAGS, HEAD_BYTES
 from regnf_service.concurrency import Claim, in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, keep_held, store_upload
 from regnf_service.fields.uploads import Upload
@@ -34,6 +34,10 @@ class PieceUpload(Upload):
         super().__init__(services, claim, piece.length)
         self._recognized = piece.first != 0 or piece.length < HEAD_BYTES
 
+    def _recognize(self) -> None:
+        if not self._pending.startswith(BAGS):  # which become recordings
+            super()._recognize()
+
 
 def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange) -> None:
     """Refuse a piece before it comes. Blocking. Raises Problem UPLOAD_NOT_FINISHED, INVALID_HEADER, TOO_MANY_PIECES."""
@@ -48,8 +52,10 @@ def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange)
         raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.")
 
 
-async def finish_pieces(services: Services, caller: str, sha256: str, beside: Beside | None = None) -> StoredUpload:
-    """Make the field of the pieces, which then go.
+async def finish_pieces(
+    services: Services, caller: str, sha256: str, beside: Beside | None = None, kind: type[Upload] = Upload
+) -> StoredUpload:
+    """Make the field of the pieces, which then go; of another ``kind`` of upload the recording.
 
     The pieces are read only when all are here and the field has room, one upload of a caller after the other: until the
     field is recorded there are two copies of the bytes. Raises Problem UPLOAD_NOT_FINISHED, DIGEST_MISMATCH (the pieces
@@ -60,12 +66,14 @@ async def finish_pieces(services: Services, caller: str, sha256: str, beside: Be
         if known is not None:
             taken = await in_thread(keep_held, services, known, beside or Beside())
         else:
-            taken = await _assembled(services, caller, sha256, beside)
+            taken = await _assembled(services, caller, sha256, beside, kind)
     await in_thread(services.pieces.drop, caller, sha256)
     return taken
 
 
-async def _assembled(services: Services, caller: str, sha256: str, beside: Beside | None) -> StoredUpload:
+async def _assembled(
+    services: Services, caller: str, sha256: str, beside: Beside | None, kind: type[Upload]
+) -> StoredUpload:
     found = await in_thread(services.pieces.find, caller, sha256)
     if not found.total or found.offset != found.total:
         raise _not_finished(found.offset)
@@ -73,7 +81,7 @@ async def _assembled(services: Services, caller: str, sha256: str, beside: Besid
     if room is not None:
         room += found.bytes  # the field takes their place
     with services.under_way.claim(caller, room, found.total) as claim:
-        async with Upload(services, claim) as upload:
+        async with kind(services, claim) as upload:
             blocks = services.pieces.blocks(caller, sha256)
             try:
                 while (block := await in_thread(next, blocks, b"")) != b"":

@@ -32,6 +32,7 @@ Query parameters that an address of fields, registrations or jobs does not know 
 """
 _TAGS = {
     "fields": "Upload fields and see what was found in them.",
+    "recordings": "Upload frames of a depth camera, and see them.",
     "library": "Objects by name, with tags, to be found by search.",
     "registrations": "Find where an object stands in a scene.",
     "batches": "Thousands of registrations at once.",

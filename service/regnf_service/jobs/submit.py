@@ -83,6 +83,8 @@ def _count(term: Term) -> str:
 _ID_DIGITS = 32
 _WITHOUT_EFFECT = frozenset({"label", "score"})
 """Members of a detection that no result depends on."""
+_IN_IMAGE = frozenset({"mask", "box_2d", "point_2d"})
+_SHOWN_IMAGES = 8
 
 
 def digest(value: Any) -> str:
@@ -116,7 +118,8 @@ def _of_effect(value: Any) -> Any:
         return [_of_effect(one) for one in value]
     if not isinstance(value, dict):
         return value
-    without = _WITHOUT_EFFECT if "rotation_quaternion_xyzw" in value else frozenset()
+    is_detection = "rotation_quaternion_xyzw" in value or not value.keys().isdisjoint(_IN_IMAGE)
+    without = _WITHOUT_EFFECT if is_detection else frozenset()
     return {name: _of_effect(one) for name, one in value.items() if name not in without}
 
 
@@ -163,7 +166,7 @@ def check_fields(
     ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer. ``fields``:
     where these and the scene were read.
     Raises Problem OPTIONS_TOO_COSTLY, RENDER_TOO_LARGE, FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE,
-    WEBHOOK_NOT_ALLOWED.
+    RECORDING_UNSUITABLE, IMAGE_DETECTION_WITHOUT_RECORDING, WEBHOOK_NOT_ALLOWED.
     """
     check_cost(services.settings, request)
     services.webhooks.check(caller, request.webhook)
@@ -172,7 +175,9 @@ def check_fields(
         fields.read([request.scene, *named.values()])
     records = {pointer: fields.get(name) for pointer, name in named.items()}
     _require_usable(records)
-    bounds = _bounds(fields.get(request.scene))
+    scene = fields.get(request.scene)
+    _require_suited(request, scene, records)
+    bounds = _bounds(scene)
     if bounds is None:
         return
     for pointer, box in _boxes(request).items():
@@ -185,7 +190,7 @@ def check_fields(
 
 def _boxes(request: JobRequest) -> dict[str, Detection]:
     if not isinstance(request, RenderingRequest):
-        return {"/detection": request.detection}
+        return {"/detection": request.detection} if isinstance(request.detection, Detection) else {}
     named = {f"/edits/{n}/detection": getattr(one, "detection", None) for n, one in enumerate(request.rendering.edits)}
     if request.rendering.orbit is not None:
         named["/orbit/detection"] = request.rendering.orbit.detection
@@ -203,6 +208,25 @@ def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
     ]
     if rejected:
         raise Problem("FIELD_REJECTED", errors=rejected)
+
+
+def _require_suited(request: JobRequest, scene: FieldRecord | None, named: Mapping[str, FieldRecord | None]) -> None:
+    """A recording is a scene to register in, and only there are detections in images."""
+    is_scene_only = not isinstance(request, RenderingRequest)
+    used = {pointer: record for pointer, record in named.items() if pointer != "/scene"}
+    used |= {} if is_scene_only else {"/scene": scene}
+    wrong = [pointer for pointer, record in used.items() if record is not None and record.is_recording]
+    if wrong:
+        raise Problem("RECORDING_UNSUITABLE", errors=[{"pointer": one, "detail": "a recording"} for one in wrong])
+    if scene is not None and not scene.is_recording:
+        require_box(request)
+
+
+def require_box(request: JobRequest) -> None:
+    """Of a scene that is a field. Raises Problem IMAGE_DETECTION_WITHOUT_RECORDING."""
+    if not isinstance(request, RenderingRequest) and not isinstance(request.detection, Detection):
+        fault = {"pointer": "/detection", "detail": "in an image, and the scene is a field"}
+        raise Problem("IMAGE_DETECTION_WITHOUT_RECORDING", errors=[fault])
 
 
 def _bounds(found: FieldRecord | None) -> Bounds | None:
@@ -289,6 +313,13 @@ def _earlier_answer(services: Services, key: str, job_id: str, request: JobReque
     return known if request.webhook is None or request.webhook in known.webhooks else None
 
 
+def _shown(detection: Any) -> Any:
+    """A detection as the job's record shows it for as long as it is kept: without masks."""
+    if not isinstance(detection, list):
+        return detection
+    return [one | ({"mask": True} if "mask" in one else {}) for one in detection[:_SHOWN_IMAGES]]
+
+
 def _inputs(request: JobRequest) -> dict[str, Any]:
     values = request.values()
     if isinstance(request, RenderingRequest):
@@ -306,7 +337,7 @@ def _inputs(request: JobRequest) -> dict[str, Any]:
         "scene": request.scene,
         "object": request.object,
         "candidates": None if request.candidates is None else len(request.candidates),
-        "detection": values["detection"],
+        "detection": _shown(values["detection"]),
         "seed": request.seed,
         "initial_transform": request.initial_transform,
         "pictures": request.pictures,

@@ -8,6 +8,7 @@ from regnf_service.http.routes import (
     library,
     meta,
     pages,
+    recordings,
     registrations,
     renderings,
     results,
@@ -17,6 +18,7 @@ from regnf_service.http.routes import (
 ROUTERS = (
     uploads.router,
     fields.router,
+    recordings.router,
     library.router,
     registrations.router,
     renderings.router,

@@ -18,13 +18,17 @@ JSON = "application/json"
 _Endpoint = TypeVar("_Endpoint", bound=Callable[..., Any])
 
 
-def get_and_head(router: APIRouter, path: str, *, summary: str, **how: Any) -> Callable[[_Endpoint], _Endpoint]:
-    """Declare an endpoint for GET, and for HEAD, which has GET's status and headers; servers leave its content out."""
+def get_and_head(
+    router: APIRouter, path: str, *, summary: str, name: str | None = None, **how: Any
+) -> Callable[[_Endpoint], _Endpoint]:
+    """Declare an endpoint for GET, and for HEAD, which has GET's status and headers; servers leave its content out.
+    name: of the operation, where it is not the endpoint's own."""
 
     def declare(endpoint: _Endpoint) -> _Endpoint:
-        name = "head_" + endpoint.__name__.removeprefix("get_")
-        router.get(path, summary=summary, **how)(endpoint)
-        router.head(path, summary=f"{summary}: headers alone", operation_id=name, **how)(endpoint)
+        called = name or endpoint.__name__
+        router.get(path, name=called, summary=summary, **how)(endpoint)
+        alone = "head_" + called.removeprefix("get_")
+        router.head(path, name=alone, summary=f"{summary}: headers alone", operation_id=alone, **how)(endpoint)
         return endpoint
 
     return declare

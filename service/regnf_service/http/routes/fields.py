@@ -54,6 +54,11 @@ _PATCHES = (JSON, "application/merge-patch+json")
 _NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
 _PRIVATE_HOUR = "private, max-age=3600"
+FIELD_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"headers": {"ETag": header("For If-None-Match.")}},
+    304: NOT_MODIFIED,
+    **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
+}
 _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
     304: NOT_MODIFIED,
@@ -61,7 +66,8 @@ _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
 }
 
 
-def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
+def require_field(services: Services, caller: str, sha256: str) -> FieldRecord:
+    """The caller's field or recording of this name. Raises Problem FIELD_NOT_FOUND."""
     record = services.records.get_field(reference_of(caller, sha256)) if is_sha256(sha256) else None
     if record is None:
         raise Problem("FIELD_NOT_FOUND")
@@ -73,11 +79,7 @@ def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
     "/fields/{sha256}",
     summary="A field's state and what its import found",
     response_model=FieldDocument,
-    responses={
-        200: {"headers": {"ETag": header("For If-None-Match.")}},
-        304: NOT_MODIFIED,
-        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
-    },
+    responses=FIELD_ANSWERS,
 )
 async def get_field(
     sha256: str,
@@ -95,7 +97,7 @@ async def get_field(
     def is_news(found: FieldRecord) -> bool:
         return found.state != "validating" or held.differs(field_etag(found))
 
-    record = await wait_for(lambda: _require(services, caller, sha256), is_news, wait, services, caller)
+    record = await wait_for(lambda: require_field(services, caller, sha256), is_news, wait, services, caller)
     headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
     position = None
     if record.state == "validating":
@@ -119,7 +121,7 @@ async def get_field_preview(
 
     Made once the field is ready, as the mesh is.
     """
-    record = await in_thread(_require, services, caller, sha256)
+    record = await in_thread(require_field, services, caller, sha256)
     return await _view_answer(request, services, record, (PICTURE_NAME,), "image/png", held)
 
 
@@ -150,7 +152,7 @@ async def get_field_mesh(
     404 has `Retry-After`. A small surface has one mesh for both. A `.glb` of `POST /render` is made with the resolution
     that you ask for.
     """
-    record = await in_thread(_require, services, caller, sha256)
+    record = await in_thread(require_field, services, caller, sha256)
     fine, coarse = MESH_NAMES
     names = (coarse, fine) if detail == "coarse" else (fine,)
     return await _view_answer(request, services, record, names, "model/gltf-binary", held)
@@ -172,7 +174,7 @@ async def get_candidate_picture(
     held: IfNoneMatchDep,
 ) -> Response:
     """One of the `candidates` of a field's error, for as long as the upload is kept (`kept_until`)."""
-    record = await in_thread(_require, services, caller, sha256)
+    record = await in_thread(require_field, services, caller, sha256)
     if number not in _NUMBERS or not record.has_candidate_picture(int(number)):
         raise Problem("FIELD_VIEW_NOT_FOUND")
     headers = {"ETag": field_etag(record), "Cache-Control": "private, no-cache"}
@@ -222,7 +224,7 @@ def list_fields(
     """
     if wants_page(request.scope):
         return page("lists.html")
-    found = services.records.list_fields(label, limit, decode_token(page_token), caller)
+    found = services.records.list_fields(label, limit, decode_token(page_token), caller, recordings=False)
     documents = [field_document(record, prefix) for record in found.records]
     document = {"fields": documents, "next_page_token": encode_token(found.rest)}
     return JSONResponse(document, headers={"Vary": "Accept"})
@@ -239,7 +241,7 @@ def list_fields(
         **refusals(
             "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
             "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST INVALID_DESCRIPTION FIELD_NOT_FOUND FIELD_VALIDATING FIELD_IN_USE "
-            "FIELD_BYTES_GONE CONFLICT QUOTA_ACTIVE_JOBS"
+            "FIELD_BYTES_GONE RECORDING_UNSUITABLE CONFLICT QUOTA_ACTIVE_JOBS"
         ),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: _CHANGE}}},
@@ -261,11 +263,13 @@ async def patch_field(
 
 
 def _changed(services: Services, caller: str, sha256: str, change: FieldChange) -> tuple[FieldRecord, bool]:
-    known = _require(services, caller, sha256)
+    known = require_field(services, caller, sha256)
+    if known.is_recording:
+        raise Problem("RECORDING_UNSUITABLE")
     said = _described_anew(known, change.description_change(known.said))
     label = change.label if "label" in change.model_fields_set else (said.label or known.label)
     imported = redescribe(services, caller, known, said, label)
-    return _require(services, caller, sha256), imported
+    return require_field(services, caller, sha256), imported
 
 
 def _described_anew(known: FieldRecord, change: Mapping[str, Any]) -> UploadDescription:
@@ -308,7 +312,7 @@ def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Respo
         services.pieces.drop(caller, sha256)
         if services.records.get_field(reference_of(caller, sha256)) is None:
             return Response(status_code=204)
-    field = _require(services, caller, sha256)
+    field = require_field(services, caller, sha256)
     reference = field.sha256
     if field.library is not None:
         raise Problem("FIELD_IN_LIBRARY")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import re
+from collections.abc import Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -11,17 +13,19 @@ from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
+from regnf_core.detections.images import ImageDetection
 from regnf_core.field_source import Role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, room_for_bytes, store_upload
-from regnf_service.fields.uploads import SettingsUpload, Upload, settings_limit
+from regnf_service.fields.uploads import Received, SettingsUpload, Upload, settings_limit
 from regnf_service.http import body
 from regnf_service.http.batch_intake import Library, asked_by_reference, read_library
 from regnf_service.http.body import (
     CallerDep,
     PrefixDep,
     ServicesDep,
+    Sink,
     boundary_of,
     read_json,
     read_parts,
@@ -40,12 +44,14 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
+from regnf_service.http.routes.recordings import FRAME_PARTS, camera_of
 from regnf_service.http.routes.uploads import DESCRIPTION_BYTES, read_description
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.reading import reference
-from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
-from regnf_service.jobs.submit import check_fields, check_idempotency_key, future_job_id, submit
+from regnf_service.http.schemas.registrations import DryRunDocument, OneShotRequest, RegisterRequest
+from regnf_service.jobs.submit import check_fields, check_idempotency_key, future_job_id, require_box, submit
 from regnf_service.problem import Problem
+from regnf_service.recordings.uploads import CAMERA_BYTES, AsRecording, FrameUpload
 from regnf_service.services import Services
 from regnf_state.records import ACTIVE, FINISHED
 from regnf_state.registration_request import JobRequest, RegistrationRequest
@@ -122,16 +128,19 @@ async def answer(services: Services, caller: str, prefix: str, asked: JobRequest
 
 
 router = APIRouter(tags=["registrations"])
+_PNG = b"\x89PNG"
 _ROLES: tuple[Role, Role] = ("scene", "object")
 _ONE_SHOT = {
     "schema": {
         "type": "object",
-        "required": ["scene", "object", "request"],
+        "required": ["request"],
         "additionalProperties": False,
         "properties": {
             "scene": FILE,
             "object": FILE,
-            "request": reference(RegistrationSpec),
+            **FRAME_PARTS,
+            "mask": FILE | {"description": "The detection in the frame: a PNG of its size."},
+            "request": reference(OneShotRequest),
             **{f"{role}_description": reference(UploadDescription) for role in ("scene", "object")},
             **{f"{role}_settings": FILE for role in ("scene", "object")},
         },
@@ -152,7 +161,8 @@ _ONE_SHOT = {
             JOB_REFUSALS,
             "MALFORMED_JSON FIELD_NOT_FOUND INVALID_REQUEST INVALID_DETECTION INVALID_OPTIONS OPTIONS_TOO_COSTLY "
             "INVALID_TRANSFORM PRESET_UNSUITABLE LIBRARY_ENTRY_NOT_FOUND LIBRARY_EMPTY LIBRARY_TOO_LARGE "
-            "FIELD_REJECTED FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION DETECTION_OUTSIDE_SCENE",
+            "FIELD_REJECTED FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION DETECTION_OUTSIDE_SCENE "
+            "RECORDING_NOT_RECOGNIZED RECORDING_UNSUITABLE IMAGE_DETECTION_WITHOUT_RECORDING",
         ),
     },
     openapi_extra={
@@ -203,10 +213,13 @@ async def _by_reference(request: Request, services: Services, caller: str) -> Re
 
 
 async def _one_shot(request: Request, services: Services, caller: str, keep: bool) -> RegistrationRequest:
-    """Both files and the request in one body. Nothing is kept before all of it has arrived and been checked."""
+    """All in one body: the scene's file or a frame, the object's file unless the request names one that is held.
+
+    Nothing is kept before all of it has arrived and been checked.
+    """
     body.refuse_encoding(request)
     settings = services.settings
-    besides = 2 * settings.max_request_bytes + 4 * DESCRIPTION_BYTES
+    besides = 3 * settings.max_request_bytes + 4 * DESCRIPTION_BYTES + CAMERA_BYTES
     limit = 2 * (settings.max_upload_bytes + settings_limit(services)) + besides
     declared = body.declared_length(request, besides)
     async with AsyncExitStack() as stack:
@@ -215,20 +228,58 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
         files = {name: await stack.enter_async_context(Upload(services, claim)) for name in _ROLES}
         configs = {name: await stack.enter_async_context(SettingsUpload(services, claim)) for name in _ROLES}
-        sinks = files | {f"{name}_settings": config for name, config in configs.items()}
-        texts = {"request": settings.max_request_bytes} | {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
-        data = body.chunks(request, limit)
-        parts = await read_parts(data, boundary_of(request), sinks, texts)
-        missing = [name for name in ("scene", "object", "request") if name not in parts]
-        if missing:
-            raise Problem("MALFORMED_MULTIPART", f"The part `{missing[0]}` is missing.")
-        spec = await read_text(RegistrationSpec, parts["request"], what="The part `request`")
-        said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
-        received = {name: await upload.finish() for name, upload in files.items()}
-        beside = {name: Beside(said[name], await configs[name].received(), role=name) for name in _ROLES}
-        asked = spec.to_request(received["scene"].sha256, received["object"].sha256)
-        await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
-        if keep:
-            for name, upload in files.items():
-                await store_upload(services, caller, upload, received[name], beside[name])
+        frame = await stack.enter_async_context(FrameUpload(services, claim))
+        sinks: dict[str, Sink] = {**frame.images}
+        for name in _ROLES:
+            sinks |= {name: files[name], f"{name}_settings": configs[name]}
+        texts = {"request": settings.max_request_bytes, "camera": CAMERA_BYTES, "mask": settings.max_request_bytes}
+        texts |= {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
+        parts = await read_parts(body.chunks(request, limit), boundary_of(request), sinks, texts)
+        _check_parts(parts)
+        spec = await read_text(OneShotRequest, parts["request"], what="The part `request`")
+        uploads: dict[str, tuple[Upload, Received, Beside]] = {}
+        for name in (name for name in _ROLES if name in parts):
+            said = read_description(parts.get(f"{name}_description"))
+            beside = Beside(said, await configs[name].received(), role=name)
+            uploads[name] = (files[name], await files[name].finish(), beside)
+        if "depth" in parts:
+            received = await frame.finish_frame({"camera.json": camera_of(parts)})
+            uploads["scene"] = (frame, received, AsRecording())
+        asked, named = await _asked(
+            services, caller, spec, {name: one[1].sha256 for name, one in uploads.items()}, parts
+        )
+        if "scene" in parts:
+            require_box(asked)
+        await in_thread(check_fields, services, caller, asked, named)  # what comes along need not be held
+        for upload, received, beside in uploads.values() if keep else ():
+            await store_upload(services, caller, upload, received, beside)
     return asked
+
+
+def _check_parts(parts: Mapping[str, bytes]) -> None:
+    """Raises Problem MALFORMED_MULTIPART."""
+    if "request" not in parts:
+        raise Problem("MALFORMED_MULTIPART", "The part `request` is missing.")
+    if ("scene" in parts) == ("depth" in parts):
+        raise Problem("MALFORMED_MULTIPART", "Send the part `scene`, or `depth` and `camera` of a frame.")
+    needed = {"camera": "depth", "depth": "camera", "color": "depth", "mask": "depth"}
+    needed |= {f"{name}_{what}": name for name in _ROLES for what in ("settings", "description")}
+    for part, other in needed.items():
+        if part in parts and other not in parts:
+            raise Problem("MALFORMED_MULTIPART", f"The part `{part}` goes with `{other}`, which is missing.")
+
+
+async def _asked(
+    services: Services, caller: str, spec: OneShotRequest, came: Mapping[str, str], parts: Mapping[str, bytes]
+) -> tuple[RegistrationRequest, dict[str, str]]:
+    """The job's request and the fields that must be held, as ``asked_by_reference``. came: the SHA-256s of files."""
+    if ("object" in came) == (spec.object is not None or spec.candidates is not None):
+        raise Problem("MALFORMED_MULTIPART", "Send the part `object`, or name `object` or `candidates` in the request.")
+    if ("mask" in parts) == (spec.detection is not None) or not parts.get("mask", _PNG).startswith(_PNG):
+        raise Problem("INVALID_DETECTION", "Give `detection` in the request, or a PNG as the part `mask` of a frame.")
+    mask = (ImageDetection(mask=base64.b64encode(parts["mask"]).decode()),) if "mask" in parts else spec.detection
+    whole = spec.model_copy(update={**came, "detection": mask})
+    library = Library(services, caller)
+    await read_library(library, [whole])
+    asked, named = await in_thread(asked_by_reference, library, whole)
+    return asked, {pointer: name for pointer, name in named.items() if pointer.strip("/") not in came}

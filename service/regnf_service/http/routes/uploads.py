@@ -45,11 +45,11 @@ from regnf_state.records import FieldRecord
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
 _BESIDE = ("settings", "cameras")
-_UPLOAD_BYTES = 4 * (64 + 4)
+UPLOAD_BYTES = 4 * (64 + 4)
 """A digest in any encoding, with a mark and the end of its line."""
 _HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
 _DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
-_ANSWERS: dict[int | str, dict[str, Any]] = {
+ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "The bytes were held already.",
         "model": FieldDocument,
@@ -58,13 +58,14 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
     },
     201: {"description": "Stored; the import is queued.", "headers": _HEADERS, "links": FIELD_LINKS},
 }
+UPLOAD_PART = {"type": "string", "pattern": "^[0-9a-f]{64}$", "description": "In place of the file: its pieces."}
 _MULTIPART = {
     "schema": {
         "type": "object",
         "additionalProperties": False,
         "properties": {
             "file": FILE,
-            "upload": {"type": "string", "pattern": "^[0-9a-f]{64}$", "description": "In place of `file`: its pieces."},
+            "upload": UPLOAD_PART,
             "description": reference(UploadDescription),
             "settings": FILE,
             "cameras": FILE,
@@ -79,7 +80,7 @@ _MULTIPART = {
     response_model=FieldDocument,
     status_code=201,
     responses={
-        **_ANSWERS,
+        **ANSWERS,
         202: {
             "description": "The piece is kept; the rest is awaited.",
             "model": UploadProgress,
@@ -124,20 +125,20 @@ async def put_field(
         if span is not None:
             held = await _receive_piece(request, services, caller, sha256, span, digest)
             if held is not None:
-                return _answer(StoredUpload(held, created=False), prefix)
+                return upload_answer(StoredUpload(held, created=False), prefix)
             offset = (await in_thread(services.pieces.find, caller, sha256)).offset
             if upload_complete == "?0" or offset != span.total:
                 document = UploadProgress(sha256=sha256, offset=offset, bytes=span.total).model_dump()
                 return JSONResponse(document, status_code=202, headers={"Upload-Offset": str(offset)})
-            return _answer(await finish_pieces(services, caller, sha256), prefix)
+            return upload_answer(await finish_pieces(services, caller, sha256), prefix)
         room = await in_thread(check_room, services, caller, sha256)
         with services.under_way.claim(caller, room, declared) as claim:
             async with Upload(services, claim) as upload:
-                received = await _receive_raw(request, services, upload)
-                if received.sha256 != sha256 or digest not in (None, received.sha256):
+                received = await receive_raw(request, services, upload, digest)
+                if received.sha256 != sha256:
                     raise Problem("DIGEST_MISMATCH")
                 taken = await store_upload(services, caller, upload, received)
-    return _answer(taken, prefix)
+    return upload_answer(taken, prefix)
 
 
 @router.post(
@@ -146,7 +147,7 @@ async def put_field(
     response_model=FieldDocument,
     status_code=201,
     responses={
-        **_ANSWERS,
+        **ANSWERS,
         **refusals(
             UPLOAD_REFUSALS,
             MULTIPART_REFUSALS,
@@ -190,13 +191,11 @@ async def post_field(
             files = {part: await stack.enter_async_context(SettingsUpload(services, claim)) for part in _BESIDE}
             received, beside = await _receive_parts(request, services, upload, files, digest)
             if isinstance(received, str):
-                return _answer(await finish_pieces(services, caller, received, beside), prefix)
+                return upload_answer(await finish_pieces(services, caller, received, beside), prefix)
         else:
-            received, beside = await _receive_raw(request, services, upload), Beside()
-            if digest not in (None, received.sha256):
-                raise Problem("DIGEST_MISMATCH")
+            received, beside = await receive_raw(request, services, upload, digest), Beside()
         taken = await store_upload(services, caller, upload, received, beside)
-    return _answer(taken, prefix)
+    return upload_answer(taken, prefix)
 
 
 async def _receive_piece(
@@ -231,11 +230,15 @@ async def _receive_piece(
     return known
 
 
-async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
+async def receive_raw(request: Request, services: Services, upload: Upload, digest: str | None) -> Received:
+    """A body that is one file, whole. Raises Problem, DIGEST_MISMATCH where it is not of the announced digest."""
     body.refuse_encoding(request)
     async for data in body.chunks(request, services.settings.max_upload_bytes):
         await upload.feed(data)
-    return await upload.finish()
+    received = await upload.finish()
+    if digest not in (None, received.sha256):
+        raise Problem("DIGEST_MISMATCH")
+    return received
 
 
 async def _receive_parts(
@@ -250,8 +253,8 @@ async def _receive_parts(
     limit = services.settings.max_upload_bytes + len(beside) * settings_limit(services) + 2 * DESCRIPTION_BYTES
     data = body.chunks(request, limit)
     if digest is not None:
-        data = _compared(data, digest)
-    texts = {"description": DESCRIPTION_BYTES, "upload": _UPLOAD_BYTES}
+        data = compared(data, digest)
+    texts = {"description": DESCRIPTION_BYTES, "upload": UPLOAD_BYTES}
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts)
     if ("file" in parts) == ("upload" in parts):
@@ -260,13 +263,18 @@ async def _receive_parts(
     settings, cameras = [await beside[part].received() for part in _BESIDE]
     if "file" in parts:
         return await upload.finish(), Beside(description, settings, cameras)
+    return named_upload(parts["upload"]), Beside(description, settings, cameras)
+
+
+def named_upload(text: bytes) -> str:
+    """The SHA-256 that the part `upload` names. Raises Problem INVALID_DIGEST."""
     try:
-        named = decode_text(parts["upload"]).strip()
+        named = decode_text(text).strip()
     except TextError as error:
         raise Problem("INVALID_DIGEST", f"The part upload is {error}.") from error
     if not is_sha256(named):
         raise Problem("INVALID_DIGEST")
-    return named, Beside(description, settings, cameras)
+    return named
 
 
 def read_description(text: bytes | None) -> UploadDescription | None:
@@ -278,7 +286,7 @@ def read_description(text: bytes | None) -> UploadDescription | None:
     )
 
 
-async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
+async def compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
     """The body as it comes. Raises Problem DIGEST_MISMATCH at its end: the digest is of the parts and all between."""
     found = hashlib.sha256()
     async for piece in data:
@@ -288,7 +296,8 @@ async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[by
         raise Problem("DIGEST_MISMATCH")
 
 
-def _answer(taken: StoredUpload, prefix: str) -> JSONResponse:
+def upload_answer(taken: StoredUpload, prefix: str) -> JSONResponse:
+    """The document of what was taken in."""
     document = field_document(taken.record, prefix)
     headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
     return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)

@@ -10,8 +10,11 @@ from pydantic_core import PydanticCustomError
 
 from regnf_core.detections import Detection as ParsedDetection
 from regnf_core.detections import parse_detection
+from regnf_core.detections.images import AnyDetection as BoxOrImages
+from regnf_core.detections.images import ImageDetection, is_image_detection, read_image_detections
 from regnf_core.errors import InvalidDetectionError
 from regnf_service.http.schemas.results import Coordinate, Incoming, Label
+from regnf_state.registration_request import values_of
 
 DETECTION_FAULT = "invalid_detection"
 """The type of a fault whose context says the place within the detection, the message and the hint."""
@@ -115,12 +118,67 @@ _Corners = Annotated[
 ]
 
 
+_Pixels = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class InImage(_Labeled):
+    """A thing in one image of a recording, in pixels of its color image, or of its depth image where it has none."""
+
+    model_config = _one_of_each(("mask", "box_2d", "point_2d"))
+
+    frame: str | int = Field(0, description="The name of the frame, or its number.")
+    mask: str | dict[str, Any] | list[list[_Pixels]] | _Nothing = Field(
+        None,
+        description="A PNG of the image's size as base64, not 0 on the thing; or COCO's run lengths, `size` (height, "
+        "width) and `counts`, or its polygons.",
+    )
+    box_2d: Annotated[list[_Pixels], Field(min_length=4, max_length=4, description="Left, top, right, bottom.")] | (
+        _Nothing
+    ) = None
+    point_2d: Annotated[list[_Pixels], Field(min_length=2, max_length=2, description="Column, row.")] | _Nothing = None
+
+
+MOST_IMAGES = 32
+"""Detections of one thing, each in an image of its own."""
+_MOST_NAME = 200
+_PNG = "iVBORw0KGgo"
+"""How one begins as base64."""
+
+
+def read_images(value: Any) -> tuple[ImageDetection, ...]:
+    """A thing in images, as requests have it. Raises InvalidDetectionError."""
+    if isinstance(value, list) and len(value) > MOST_IMAGES:
+        hint = "Give the images that show most of it."
+        raise InvalidDetectionError(f"has {len(value)} entries, expected {MOST_IMAGES} at most", hint=hint)
+    found = read_image_detections(value)
+    for one in found:
+        if max(len(str(one.frame)), len(one.label or "")) > _MOST_NAME:
+            raise InvalidDetectionError(f"the frame's name and the label have at most {_MOST_NAME} characters")
+        if isinstance(one.mask, str) and not (one.mask.partition("base64,")[2] or one.mask).startswith(_PNG):
+            hint = "Write the bytes of a PNG of the image's size as base64, or COCO's run lengths."
+            raise InvalidDetectionError("the mask is no PNG as base64", hint=hint, place=("mask",))
+    return found
+
+
+def _read_any(value: Any) -> BoxOrImages:
+    if not is_image_detection(value):
+        return _read(value)
+    try:
+        return read_images(value)
+    except InvalidDetectionError as error:
+        raise _fault(error) from error
+
+
+def _fault(error: InvalidDetectionError) -> PydanticCustomError:
+    context = {"message": str(error), "hint": error.hint, "place": list(error.place)}
+    return PydanticCustomError(DETECTION_FAULT, "{message}", context)
+
+
 def _read(value: Any) -> ParsedDetection:
     try:
         return parse_detection(value).normal()
     except InvalidDetectionError as error:
-        context = {"message": str(error), "hint": error.hint, "place": list(error.place)}
-        raise PydanticCustomError(DETECTION_FAULT, "{message}", context) from error
+        raise _fault(error) from error
 
 
 Detection = Annotated[
@@ -128,3 +186,16 @@ Detection = Annotated[
     PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | _Corners),
     PlainSerializer(ParsedDetection.values, return_type=dict[str, Any]),
 ]
+AnyDetection = Annotated[
+    BoxOrImages,
+    PlainValidator(
+        _read_any,
+        json_schema_input_type=CornerBox
+        | CenteredBox
+        | _Corners
+        | InImage
+        | Annotated[list[InImage], Field(min_length=1, max_length=MOST_IMAGES)],
+    ),
+    PlainSerializer(values_of, return_type=Any),
+]
+"""The same of a scene that may be a recording: a box, or the thing in its images."""

@@ -33,7 +33,7 @@ class EntryNamed(Outgoing):
 
 
 class FieldDocument(Outgoing):
-    """One field. `validating` until its import has ended; only a `ready` field can be registered."""
+    """One field, or one recording. `validating` until its import has ended; only what is `ready` can be registered."""
 
     sha256: Sha256
     state: Literal["validating", "ready", "rejected"]
@@ -43,7 +43,9 @@ class FieldDocument(Outgoing):
     settings: SettingsDocument | None = Field(None, description="The file of settings that came with the upload.")
     cameras: SettingsDocument | None = Field(None, description="The file that says where its cameras stood.")
     report: dict[str, Any] = Field(
-        {}, description="What the import found: family, bounds, those of the surface, parameters, plausibility."
+        {},
+        description="What the import found: family, bounds, those of the surface, parameters, plausibility; of a "
+        "recording, with the `kind` `recording`, its layout, frames, sizes, bounds and notes.",
     )
     symmetry: SymmetryDocument | None = Field(
         None, description="The object's own, found by the first job that registers the field as an object."
@@ -106,9 +108,16 @@ class FieldPage(Outgoing):
     next_page_token: str | None = Field(None, description=NEXT_PAGE)
 
 
+class RecordingPage(Outgoing):
+    """Recordings, newest first."""
+
+    recordings: list[FieldDocument]
+    next_page_token: str | None = Field(None, description=NEXT_PAGE)
+
+
 def field_document(record: FieldRecord, prefix: str, queue_position: int | None = None) -> dict[str, Any]:
     """The field as it travels; ``prefix`` is what the API's paths begin with."""
-    address = f"{prefix}/fields/{sha256_of(record.sha256)}"
+    address = f"{prefix}/{'recordings' if record.is_recording else 'fields'}/{sha256_of(record.sha256)}"
     return {
         **{name: getattr(record, name) for name in ("state", "bytes", "label", "symmetry", "views")},
         "sha256": sha256_of(record.sha256),
@@ -141,4 +150,6 @@ def _error(record: FieldRecord, address: str) -> dict[str, Any]:
 
 def _links(record: FieldRecord, address: str) -> Links:
     shown = {"preview": f"{address}/preview.png", "mesh": f"{address}/mesh.glb"}
+    if record.is_recording:
+        shown = {"picture": f"{address}/frames/0/color.png"}
     return {"self": address} | (shown if record.state == "ready" else {})

@@ -115,8 +115,15 @@ def request_document(request: dict[str, Any]) -> dict[str, Any]:
         asked["object"] = sha256_of(asked["object"])
     else:
         asked["candidates"] = [sha256_of(one) for one in asked["candidates"]]
-    asked["detection"] = {name: value for name, value in asked["detection"].items() if value is not None}
+    asked["detection"] = _as_asked(asked["detection"])
     return asked
+
+
+def _as_asked(detection: Any) -> Any:
+    """Of a box its members that were given; of things in images each one's."""
+    if isinstance(detection, list | tuple):
+        return [_as_asked(one) for one in detection]
+    return {name: value for name, value in detection.items() if value is not None}
 
 
 def _webhook(url: str, delivery: Delivery | None) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError
 from regnf_core.document import Outgoing, Sha256
 from regnf_core.options import RegistrationOptions
 from regnf_core.rotations import Rows, inverse_rows, normal_quaternion, rotation_columns, similarity_fault
-from regnf_service.http.schemas.detections import Detection
+from regnf_service.http.schemas.detections import AnyDetection
 from regnf_service.http.schemas.library import (
     BY_DIGEST,
     MAX_SELECTED,
@@ -202,7 +202,9 @@ class Webhook(Incoming):
 class RegistrationSpec(Incoming):
     """What a registration asks for, apart from the fields: the part `request` of a one-shot upload."""
 
-    detection: Detection = Field(description="Where in the scene the object is.")
+    detection: AnyDetection = Field(
+        description="Where in the scene the object is: a box; of a recording also the thing in its images."
+    )
     options: RegistrationOptions = Field(default_factory=RegistrationOptions)
     seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="The same seed gives the same result.")] = 0
     initial_transform: Start | None = Field(
@@ -258,6 +260,12 @@ def _one_of_both(schema: dict[str, Any]) -> None:
         schema["properties"][name].pop("default")  # null is what leaving it out means, nothing to send
 
 
+def _nothing_needed(schema: dict[str, Any]) -> None:
+    for name in ("object", "candidates"):
+        schema["properties"][name].pop("default")
+    del schema["properties"]["scene"]
+
+
 class RegisterRequest(RegistrationSpec):
     """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among."""
 
@@ -293,6 +301,23 @@ class RegisterRequest(RegistrationSpec):
     def _asks_for_one_or_several(self) -> RegisterRequest:
         if (self.object is None) == (self.candidates is None):
             raise ValueError("exactly one of `object` and `candidates` must be given")
+        return self
+
+
+class OneShotRequest(RegisterRequest):
+    """The part `request` of a registration whose scene, and perhaps whose object, is in the same body."""
+
+    model_config = ConfigDict(json_schema_extra=_nothing_needed)
+
+    scene: None = None  # type: ignore[assignment]
+    detection: AnyDetection | None = Field(  # type: ignore[assignment]
+        None, description="Where in the scene the object is; of a frame in place of the part `mask`."
+    )
+
+    @model_validator(mode="after")
+    def _asks_for_one_or_several(self) -> OneShotRequest:
+        if self.object is not None and self.candidates is not None:
+            raise ValueError("at most one of `object` and `candidates` is given")
         return self
 
 

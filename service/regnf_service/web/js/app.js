@@ -9,6 +9,7 @@ import { askFirst, deletionOf } from './confirm.js';
 import { announce, byId, copyText, keepPrefix, show } from './dom.js';
 import { followJob } from './events.js';
 import { showFields } from './fields.js';
+import { showInImage } from './in-image.js';
 import { offerInScene, showStrip } from './in-scene.js';
 import { Turns } from './latest.js';
 import { showAgreement } from './metric-list.js';
@@ -16,7 +17,7 @@ import { prefersStillness } from './motion.js';
 import { Names } from './names.js';
 import { showOptions } from './options.js';
 import {
-  checkPose, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
+  checkPose, offerCamera, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
 } from './panel.js';
 import { Playback } from './playback.js';
 import { DistancePlot } from './plot.js';
@@ -85,10 +86,12 @@ async function showResult(job, result) {
   showBadge(result.verdict ?? job.status, job.id);
   if (result.verdict) showVerdict(job, result);
   offerInScene(api, job, result);
+  showInImage(api, result, names);
   if (job.kind === 'render') await showStrip(api, names);
   showRanking(fieldNames, result.candidates);
   showCertainty(result);
   showOptions(result.options);
+  offerCamera(result.camera);
   if (frames.length) showTransform(frames.at(-1).pose);
   await showAgreement(result.metrics);
   showTimes(job, result.metrics);

@@ -10,8 +10,7 @@ const ONE_MORE = 'Click the thing again for a larger or smaller box. A click els
 export class BoxList {
   /** workspace() is where they are drawn; onChange() hears that there are others. */
   constructor(workspace, onChange) {
-    Object.assign(this, { workspace, onChange, boxes: [], edits: null, adding: false, made: 0 });
-    byId('add-box').addEventListener('click', () => this.add());
+    Object.assign(this, { workspace, onChange, boxes: [], edits: null, adding: false, made: 0, title: 'Boxes', one: 'Add a box', wanted: 'a box: click a thing in the scene' });
     this.inputs = this.makeInputs();
   }
 
@@ -87,6 +86,15 @@ export class BoxList {
     byId('boxes-note').textContent = this.boxes.length ? ONE_MORE : FIRST;
     show(byId('numbers'), Boolean(this.current()));
     this.fill();
+  }
+
+  nameOf({ id }) {
+    return `Box ${id}`;
+  }
+
+  /** The entry as a request says it. */
+  detectionOf({ box }) {
+    return this.workspace().detectionOf(box);
   }
 
   makeInputs() {

@@ -45,10 +45,15 @@ export function detectionOf(job, result) {
   return { center: box.center, size: box.size, quaternion: isVector(turn, 4) ? turn : [0, 0, 0, 1] };
 }
 
-/** The axis of the scene that points up, as far as the options say. */
-export function upAxisOf(options) {
+/** The axis of the scene that points up: as the options say, else the one that the camera of a recording has above it. */
+export function upAxisOf({ options, camera }) {
   const said = options?.up_axis;
-  return ['x', 'y', 'z'].includes(said) ? said : 'z';
+  if (['x', 'y', 'z'].includes(said)) return said;
+  const seen = readSim3(camera?.T_scene_camera);
+  if (!seen) return 'z';
+  const up = seen.elements.slice(4, 7).map((part) => -part); // the camera's y points down
+  const axis = up.reduce((best, part, i) => (Math.abs(part) > Math.abs(up[best]) ? i : best), 0);
+  return `${up[axis] < 0 ? '-' : ''}${'xyz'[axis]}`;
 }
 
 /** The artifacts as [{ name, bytes }], whether they are listed as names, as objects or as a mapping. */

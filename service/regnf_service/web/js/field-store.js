@@ -1,11 +1,12 @@
-// The fields of the service as this page knows them: one list, which every part of the page draws from.
+// The fields and recordings of the service as this page knows them: lists that every part of the page draws from.
 
 import { Turns } from './latest.js';
+import { isRecording } from './recordings.js';
 import { roleOf } from './roles.js';
 
 export class FieldStore {
   constructor(service) {
-    Object.assign(this, { service, fields: [], jobs: [], hearers: [], turns: new Turns(), news: new Map() });
+    Object.assign(this, { service, fields: [], recordings: [], jobs: [], hearers: [], turns: new Turns(), news: new Map() });
   }
 
   /** hear() is called after every change, however it came about. */
@@ -13,26 +14,29 @@ export class FieldStore {
     this.hearers.push(hear);
   }
 
-  /** Reads the list anew. What was put in while the answer was on its way is newer than the answer. */
+  /** Reads the lists anew. What was put in while the answer was on its way is newer than the answer. */
   async load() {
     const isLatest = this.turns.next();
     this.news = new Map();
-    const [fields, jobs] = await Promise.all([this.service.all('fields'), this.service.all('jobs')]);
+    const lists = ['fields', 'recordings', 'jobs'].map((name) => this.service.all(name));
+    const [fields, recordings, jobs] = await Promise.all(lists);
     if (!isLatest()) return;
-    const known = new Map(fields.map((field) => [field.sha256, field]));
-    for (const [sha256, field] of this.news) known.set(sha256, field);
-    const put = [...this.news.keys()].filter((sha256) => !fields.some((field) => field.sha256 === sha256));
-    const order = [...put, ...fields.map(({ sha256 }) => sha256)];
-    Object.assign(this, { fields: order.map((sha256) => known.get(sha256)), jobs });
+    Object.assign(this, { fields, recordings, jobs });
+    for (const document of this.news.values()) this.take(document);
     this.tell();
   }
 
-  /** A field's document that has just come: of an upload, or of a change. */
-  put(field) {
-    this.news.set(field.sha256, field);
-    const at = this.fields.findIndex(({ sha256 }) => sha256 === field.sha256);
-    this.fields = at < 0 ? [field, ...this.fields] : this.fields.with(at, field);
+  /** A document that has just come, of a field or a recording: of an upload, or of a change. */
+  put(document) {
+    this.news.set(document.sha256, document);
+    this.take(document);
     this.tell();
+  }
+
+  take(document) {
+    const name = isRecording(document) ? 'recordings' : 'fields';
+    const at = this[name].findIndex(({ sha256 }) => sha256 === document.sha256);
+    this[name] = at < 0 ? [document, ...this[name]] : this[name].with(at, document);
   }
 
   /** Those that can be registered, the library's first. */

@@ -1,11 +1,15 @@
-// The home page: a scene, objects, boxes around things, and what the service makes of them.
+// The home page: a scene, objects, boxes around things or marks in pictures, and what the service makes of them.
 
 import { told } from './api.js';
 import { BoxList } from './box-list.js';
 import { byId, keepPrefix, show } from './dom.js';
 import { FieldStore } from './field-store.js';
+import { MarkList } from './mark-list.js';
+import { maskShape } from './mask.js';
 import { ObjectList } from './object-list.js';
 import { OptionsForm } from './options-form.js';
+import { PictureView } from './picture-view.js';
+import { isRecording } from './recordings.js';
 import { nameOf } from './uploads.js';
 import { Runs } from './runs.js';
 import { SceneChoice } from './scene-choice.js';
@@ -22,26 +26,46 @@ let starting = false;
 const objects = new ObjectList(service, store, update);
 const scene = new SceneChoice(service, store, showScene, objects);
 const boxes = new BoxList(() => workspace, update);
-const runs = new Runs(service, () => workspace, options);
+const pictures = new PictureView((shape, mark) => marks.take(shape, mark));
+const marks = new MarkList(() => pictures, update);
+let list = boxes; // what is marked in the scene that is shown
+const runs = new Runs(service, () => (list === marks ? pictures : workspace), options);
 
-/** Shows a ready field as the scene; isLatest(): whether no other one was chosen since. */
-async function showScene(field, up, isLatest) {
+/** Shows a ready field or recording as the scene; isLatest(): whether no other one was chosen since. mask: a file. */
+async function showScene(field, up, isLatest, mask) {
+  const recorded = isRecording(field);
+  if (workspace) boxes.clear();
+  marks.clear();
+  list = recorded ? marks : boxes;
+  runs.clear();
+  delete document.documentElement.dataset.scene;
+  objects.leaveOut(field.sha256);
   show(byId('welcome'), false);
-  show(byId('canvas'));
-  show(byId('gizmo'));
+  for (const id of ['canvas', 'gizmo', 'handles']) show(byId(id), !recorded);
+  for (const id of ['pictures', 'unit-row']) show(byId(id), recorded);
+  byId('stage').classList.toggle('of-pictures', recorded);
+  byId('boxes-title').textContent = list.title;
+  byId('add-box').textContent = list.one;
+  list.draw();
+  update();
+  await (recorded ? showRecording(field, isLatest, mask) : showField(field, up, isLatest));
+  if (isLatest()) document.documentElement.dataset.scene = field.sha256;
+}
+
+async function showField(field, up, isLatest) {
   workspace ??= new Workspace(byId('canvas'), byId('gizmo'), byId('handles'), {
     onClick: (point) => boxes.click(point),
     onBox: (box) => boxes.edited(box),
   });
-  boxes.clear();
-  runs.clear();
-  delete document.documentElement.dataset.scene;
-  objects.leaveOut(field.sha256);
   tell(`${nameOf(field)}: its surface is being drawn.`);
   await workspace.showScene(service, field.sha256, up);
-  if (!isLatest()) return;
-  tell(`${nameOf(field)}: click the thing to look for.`);
-  document.documentElement.dataset.scene = field.sha256;
+  if (isLatest()) tell(`${nameOf(field)}: click the thing to look for.`);
+}
+
+async function showRecording(recording, isLatest, mask) {
+  tell(`${nameOf(recording)}: click the thing to look for, or draw a box round it.`);
+  await pictures.open(service, recording);
+  if (mask && isLatest()) marks.take(await maskShape(pictures.frame, mask));
 }
 
 function tell(text) {
@@ -52,25 +76,26 @@ function tell(text) {
 /** What is missing before anything can be registered. */
 function update() {
   const missing = [
-    [!scene.field, 'a scene'], [!objects.chosen().length, 'an object'], [!boxes.boxes.length, 'a box: click a thing in the scene'],
+    [!scene.field, 'a scene'], [!objects.chosen().length, 'an object'], [!list.boxes.length, list.wanted],
   ].filter(([is]) => is).map(([, words]) => words);
   byId('register').disabled = starting || missing.length > 0;
   byId('add-box').disabled = !scene.field;
   byId('missing').textContent = missing.length ? `Missing: ${missing.join('; ')}.` : '';
-  if (boxes.boxes.length) tell(objects.chosen().length ? '' : 'Now add the object that this may be.');
+  if (list.boxes.length) tell(objects.chosen().length ? '' : 'Now add the object that this may be.');
 }
 
 byId('register').addEventListener('click', async () => {
   starting = true;
   update();
   try {
-    boxes.rest();
-    await runs.start(scene.field, objects.chosen(), boxes.boxes);
+    list.rest();
+    await runs.start(scene.field, objects.chosen(), list, list === marks ? byId('object-unit').value : 'auto');
   } finally {
     starting = false;
     update();
   }
 });
+byId('add-box').addEventListener('click', () => list.add());
 byId('scene-up').addEventListener('change', () => {
   boxes.clear();
   workspace?.setUp(byId('scene-up').value);

@@ -10,14 +10,14 @@ const STRIP = 'before-after.png';
 const SIZE = [480, 360];
 const TINT = [0.9, 0.55, 0.2]; // tells the object from the scene
 
-/** Offers the rendering where the pose may be used; a rejected one is put into a scene only by whoever insists. */
+/** Offers the rendering where the pose may be used, in a field; a rejected one is put into a scene only by whoever insists. */
 export function offerInScene(api, job, result) {
-  if (job.kind !== 'registration' || !['registered', 'ambiguous'].includes(result.verdict)) return;
+  if (job.kind !== 'registration' || result.camera || !['registered', 'ambiguous'].includes(result.verdict)) return;
   const button = byId('render-in-scene');
   button.onclick = async () => {
     button.disabled = true;
     try {
-      await renderInScene(api, requestFor(job, upAxisOf(result.options)));
+      await renderInScene(api, requestFor(job, upAxisOf(result)));
       show(button, false);
     } catch (error) {
       note(error instanceof ApiProblem ? told(error) : 'The picture could not be made. Try again.');

@@ -6,7 +6,8 @@ import { askFirst, deletionOf } from './confirm.js';
 import { byId, el } from './dom.js';
 import { isActive, queueWords } from './documents.js';
 import { moment, seconds, words } from './format.js';
-import { boxOfJob, shortOf, titleOfJob } from './names.js';
+import { boxOfJob, isInImage, shortOf, titleOfJob } from './names.js';
+import { overlayButton } from './overlay.js';
 import { canvasOf } from './pictures.js';
 import { canRunAgain, runAgain } from './run-again.js';
 import { nameOf } from './uploads.js';
@@ -31,7 +32,7 @@ export class JobTiles {
 
   /** The chair in the room. */
   nameOf(job) {
-    const { fields } = this.store;
+    const fields = [...this.store.fields, ...this.store.recordings];
     return titleOfJob(job, (sha256) => {
       const field = fields.find((one) => one.sha256 === sha256);
       return field ? nameOf(field) : shortOf(sha256);
@@ -94,6 +95,7 @@ export class JobTiles {
 
   async picture(job, node) {
     try {
+      if (isInImage(job)) return node.prepend(await overlayButton(this.service.job(job.id)));
       const response = await this.service.request(`/jobs/${job.id}/artifacts/preview.png`, { cache: 'default' });
       const canvas = await canvasOf(await response.blob(), `${this.nameOf(job)}: before and after`, [0, 1]);
       node.prepend(el('figure', {}, canvas, el('figcaption', { className: 'note' }, el('span', {}, 'before'), el('span', {}, 'after'))));

@@ -12,11 +12,22 @@ export function titleOfJob(job, of, found = job.object_found) {
   return `${found ? of(found) : `One of ${candidates ?? 'several'} objects`} in ${of(scene)}`;
 }
 
-/** The box that a job looked in, in the scene's units; several in one scene are told apart by it. */
+/** The box that a job looked in, in the scene's units, or the image; several in one scene are told apart by it. */
 export function boxOfJob(job) {
-  const { center, size } = job.inputs?.detection ?? {};
+  const [seen] = [job.inputs?.detection ?? {}].flat();
+  if (isInImage(job)) return `${imageWords(seen)} in image ${seen.frame ?? 0}`;
+  const { center, size } = seen;
   if (!center || !size) return '';
   return `box ${size.map((edge) => number(edge, 3)).join(' × ')} at ${center.map((part) => number(part, 3)).join(', ')}`;
+}
+
+/** Whether a job looked for a thing in images of a recording. */
+export const isInImage = ({ inputs }) => [inputs?.detection ?? {}].flat().some(({ mask, box_2d: box, point_2d: point }) => mask || box || point);
+
+function imageWords({ box_2d: box, point_2d: point }) {
+  const list = (values) => values.map((part) => number(part, 4)).join(', ');
+  if (point) return `pixel ${list(point)}`;
+  return box ? `box ${list(box)}` : 'mask';
 }
 
 export class Names {

@@ -54,11 +54,15 @@ export class OptionsForm {
     return row(this.host, FIRST[name] ?? words(name), field.node);
   }
 
-  /** What a request takes: { options, seed }. What is left at its default is left out. up: the scene's up axis. */
-  values(up) {
+  /**
+   * What a request takes: { options, seed }. What is left at its default is left out. up: the scene's up axis, null where
+   * it is not known. unit: of the objects' files, where it is asked for beside the form.
+   */
+  values(up, unit = 'auto') {
     const robust = Object.fromEntries(this.fields.map(({ name, read }) => [name, read()]).filter(([, value]) => value !== undefined));
     const options = { preset: this.preset.value };
-    if (this.upright.value === UPRIGHT) options.up_axis = up.replace('-', '');
+    if (unit !== 'auto') robust.object_unit = unit;
+    if (up && this.upright.value === UPRIGHT) options.up_axis = up.replace('-', '');
     if (options.preset === 'robust' && Object.keys(robust).length) options.robust = robust;
     return { options, seed: this.seed.valueAsNumber || 0 };
   }

@@ -7,9 +7,11 @@ import { Turns } from './latest.js';
 import { inverse, partsOf, readSim3, rowsOf } from './sim3.js';
 
 const turns = new Turns();
+let toCamera = null; // T_camera_scene, of a scene that is a recording
 const DIRECTIONS = {
   T_scene_object: 'T_scene_object, the object’s pose in the scene: carries object coordinates to scene coordinates',
   T_object_scene: 'T_object_scene: carries scene coordinates to object coordinates',
+  T_camera_object: 'T_camera_object, the object’s pose in the camera’s frame: carries object coordinates to meters, x right, y down, z ahead',
 };
 
 export function showVerdict(job, result) {
@@ -47,11 +49,19 @@ function showWarnings(fields) {
   show(byId('warnings'), lines.length > 0);
 }
 
+/** Has the transform shown in the frame of the camera too, if there is one. */
+export function offerCamera(camera) {
+  const seen = readSim3(camera?.T_scene_camera);
+  toCamera = seen && inverse(seen);
+  show(byId('camera-direction'), Boolean(toCamera));
+}
+
 /** The matrix in both directions, as text to read and to copy; note says whose it is when it is not the result's. */
 export function showTransform(matrix, note = '') {
   byId('transform-note').textContent = note;
   show(byId('transform-note'), note !== '');
   const shown = { T_object_scene: matrix, T_scene_object: inverse(matrix) };
+  if (toCamera) shown.T_camera_object = toCamera.clone().multiply(shown.T_scene_object);
   const direction = () => document.querySelector('input[name="direction"]:checked').value;
   const draw = () => {
     const current = shown[direction()];

@@ -1,16 +1,25 @@
-// Which scene: a file that is chosen or dropped, a field of the service, or the demo. The latest choice counts.
+// Which scene: a file that is chosen or dropped, a frame or a recording, one of the service, or the demo. The latest choice
+// counts.
 
 import { told } from './api.js';
 import { byId, el, show } from './dom.js';
+import { filesOf } from './dropped.js';
+import { sorted } from './frame-files.js';
+import { FrameForm } from './frame-form.js';
 import { Turns } from './latest.js';
 import { progressLine } from './progress.js';
+import { isRecording, recordingOfFile, recordingOfFrame } from './recordings.js';
 import { sayRole } from './roles.js';
 import { fieldOf, nameOf } from './uploads.js';
 
 export class SceneChoice {
-  /** Draws from store; onScene(field, up, isLatest) shows a scene; objects takes the files that are dropped beside one. */
+  /**
+   * Draws from store; onScene(field, up, isLatest, mask) shows a scene, a field or a recording; mask: the file that says
+   * where the thing is in a frame. objects takes the files that are dropped beside one.
+   */
   constructor(service, store, onScene, objects) {
     Object.assign(this, { service, store, onScene, objects, field: null, turns: new Turns() });
+    this.frame = new FrameForm((parts) => this.takeFrame(parts));
     byId('scene-file').addEventListener('change', (event) => {
       this.takeFiles([...event.target.files]);
       event.target.value = ''; // the same file may be chosen again
@@ -40,7 +49,9 @@ export class SceneChoice {
       const options = ready.filter((field) => this.store.role(field) === role).map(optionOf);
       return options.length ? [el('optgroup', { label }, ...options)] : [];
     };
-    byId('scene-known').replaceChildren(el('option', { value: '' }, 'none'), ...group('Scenes', 'scene'), ...group('Objects', 'object'));
+    const recordings = this.store.recordings.filter(({ state }) => state === 'ready').map(optionOf);
+    const recorded = recordings.length ? [el('optgroup', { label: 'Recordings' }, ...recordings)] : [];
+    byId('scene-known').replaceChildren(el('option', { value: '' }, 'none'), ...recorded, ...group('Scenes', 'scene'), ...group('Objects', 'object'));
     byId('scene-known').value = this.field?.sha256 ?? '';
   }
 
@@ -51,33 +62,58 @@ export class SceneChoice {
         stage.classList.toggle('over', kind === 'dragover');
         if (kind !== 'drop') return;
         const onObjects = event.target.closest?.('[aria-labelledby="objects-title"]');
-        const files = [...event.dataTransfer.files];
-        if (onObjects) this.objects.take(files);
-        else this.takeFiles(files);
+        const files = filesOf(event.dataTransfer);
+        if (onObjects) files.then((found) => this.objects.take(found));
+        else files.then((found) => this.takeFiles(found));
       });
     }
   }
 
-  /** Without a scene the largest file becomes it, the others are objects; with one, several are objects all. */
+  /**
+   * A recording or the parts of a frame are the scene, and the rest are objects. Else, without a scene the largest file
+   * becomes it, the others are objects; with one, several are objects all.
+   */
   async takeFiles(files) {
     if (!files.length) return;
-    const [largest, ...rest] = [...files].sort((a, b) => b.size - a.size);
+    const isLatest = this.turns.next();
+    const found = await sorted(files);
+    if (found.recording || FrameForm.isPart(found)) {
+      this.objects.take(found.rest);
+      if (found.recording && isLatest()) await this.take(found.recording.name, (onStep) => recordingOfFile(this.service, found.recording, onStep), isLatest);
+      else if (isLatest()) await this.frame.take(found);
+      return;
+    }
+    const [largest, ...rest] = [...found.rest].sort((a, b) => b.size - a.size);
     this.objects.take(rest);
-    await this.take(largest, this.turns.next());
+    if (largest && isLatest()) await this.takeField(largest, isLatest);
+    if (!largest) this.fail(new Error(`${files[0].name} is neither a scene nor a part of a frame.`));
   }
 
-  async take(file, isLatest) {
+  takeField(file, isLatest) {
+    return this.take(file.name, async (onStep) => {
+      const field = await fieldOf(this.service, file, 'scene', onStep);
+      sayRole(field.sha256, 'scene');
+      return field;
+    }, isLatest);
+  }
+
+  async takeFrame(parts) {
+    const isLatest = this.turns.next();
+    await this.take(parts.depth.name, (onStep) => recordingOfFrame(this.service, parts, onStep), isLatest, parts.mask);
+  }
+
+  /** find(onStep): the document of what is called `name`, as soon as it is ready. */
+  async take(name, find, isLatest, mask = null) {
     const lines = [byId('scene-state'), byId('welcome-state')].map((host) => {
-      const line = progressLine(file.name);
+      const line = progressLine(name);
       host.replaceChildren(line.node);
       return line;
     });
     byId('welcome').classList.add('busy');
     try {
-      const field = await fieldOf(this.service, file, 'scene', (...news) => lines.forEach((line) => line.step(...news)));
-      sayRole(field.sha256, 'scene');
+      const field = await find((...news) => lines.forEach((line) => line.step(...news)));
       this.store.put(field);
-      if (isLatest()) await this.use(field, isLatest);
+      if (isLatest()) await this.use(field, isLatest, mask);
     } catch (error) {
       if (isLatest()) lines.forEach((line) => line.fail(error));
     }
@@ -103,7 +139,7 @@ export class SceneChoice {
       const { scene, object } = this.demo;
       const [room, chair] = await Promise.all([scene, object].map((file) => this.fetched(file)));
       this.objects.take([chair]);
-      if (isLatest()) await this.take(room, isLatest);
+      if (isLatest()) await this.takeField(room, isLatest);
     } catch (error) {
       this.fail(error);
     }
@@ -115,14 +151,18 @@ export class SceneChoice {
     return new File([await response.blob()], name);
   }
 
-  async use(field, isLatest) {
+  async use(field, isLatest, mask = null) {
     this.field = field;
+    this.frame.done();
+    for (const id of ['scene-up', 'scene-up-label']) show(byId(id), !isRecording(field));
     const up = field.description?.up_axis ?? 'z';
     byId('scene-up').value = up;
-    byId('scene-state').replaceChildren(el('strong', {}, nameOf(field)));
+    const { notes = [], warnings = [] } = isRecording(field) ? field.report : {};
+    byId('scene-state').replaceChildren(el('strong', {}, nameOf(field)),
+      ...warnings.map((text) => el('p', { className: 'warn' }, text)), ...notes.map((text) => el('p', { className: 'note' }, text)));
     this.draw();
     try {
-      await this.onScene(field, up, isLatest);
+      await this.onScene(field, up, isLatest, mask);
     } catch (error) {
       if (isLatest()) this.fail(error);
     }

@@ -69,7 +69,7 @@ export class Service {
     return this.json(`/fields/${sha256}`, options);
   }
 
-  /** All of a list, at most `most`: name is fields, jobs or library. */
+  /** All of a list, at most `most`: name is fields, recordings, jobs or library. */
   async all(name, most = 400) {
     const found = [];
     let page = '';
@@ -95,9 +95,15 @@ export class Service {
     const form = new FormData();
     form.append('description', JSON.stringify(description));
     form.append('file', file, file.name);
+    return this.send('/fields', form, {}, onProgress);
+  }
+
+  /** The answer to a POST whose body may be large. */
+  send(path, body, headers, onProgress) {
     return new Promise((resolve, reject) => {
       const request = new XMLHttpRequest(); // fetch tells nothing of what it has sent
-      request.open('POST', `${this.root}/fields`);
+      request.open('POST', this.root + path);
+      for (const [name, value] of Object.entries(headers)) request.setRequestHeader(name, value);
       if (this.token) request.setRequestHeader('Authorization', `Bearer ${this.token}`);
       request.responseType = 'json';
       request.upload.onprogress = ({ loaded, total }) => onProgress(loaded / total, `${bytes(loaded)} of ${bytes(total)}`);
@@ -106,7 +112,7 @@ export class Service {
         else reject(new ApiProblem(request.status, request.response ?? {}));
       };
       request.onerror = () => reject(new ApiProblem(0, { detail: 'The connection broke. Send the file again.' }));
-      request.send(form);
+      request.send(body);
     });
   }
 }

@@ -33,7 +33,7 @@ export class Stage {
     this.plain.after = new Cloud(geometryFromPly(object), { nearer: 0.6 });
     show(byId('canvas'));
     this.viewer = new Viewer(byId('canvas'), byId('gizmo'));
-    byId('up').value = upAxisOf(result.options);
+    byId('up').value = upAxisOf(result);
     this.viewer.setUp(byId('up').value);
     show(byId('gizmo'));
     this.poses = frames.map((frame) => inverse(frame.pose));

@@ -22,7 +22,7 @@ export function fieldOf(service, file, role, onStep) {
     }
     if (field.state === 'validating') field = await service.imported(sha256, (news) => onStep(importWords(news), null));
     if (!field || field.state === 'rejected') throw new ApiProblem(422, field?.error ?? { detail: 'The field was deleted.' });
-    return named(service, field, labelOf(file));
+    return named(service, field, labelOf(file.name));
   });
 }
 
@@ -42,7 +42,7 @@ export async function untilDone(work) {
 
 const warn = (event) => event.preventDefault();
 
-const importWords = (field) => (field.queue_position ? queueWords(field) : 'Reading the file');
+export const importWords = (field) => (field.queue_position ? queueWords(field) : 'Reading the file');
 
 /** A field that the service had under another name is called what it is called now. */
 async function named(service, field, label) {
@@ -50,15 +50,16 @@ async function named(service, field, label) {
   return service.label(field.sha256, label).catch(() => field); // the name is a courtesy
 }
 
-const labelOf = (file) => file.name.replace(/[^\p{L}\p{N}\p{P}\p{S} ]/gu, '').slice(0, 200);
+/** What the service calls a file of this name. */
+export const labelOf = (name) => name.replace(/[^\p{L}\p{N}\p{P}\p{S} ]/gu, '').slice(0, 200);
 
 function describe(file, role) {
-  const label = labelOf(file);
+  const label = labelOf(file.name);
   return { ...(label && { label }), ...(OF_NO_SIDE.test(file.name) && { as: role }) };
 }
 
 /** What people call a field: by the library's name, else by its label, else by the one that its file carries. */
-export const nameOf = (field) => field.library?.name || field.label || field.report?.label || `${field.report?.family ?? 'field'} ${field.sha256.slice(0, 8)}`;
+export const nameOf = (field) => field.library?.name || field.label || field.report?.label || `${field.report?.family ?? field.report?.layout ?? 'field'} ${field.sha256.slice(0, 8)}`;
 
 /** Its size as "1.7 × 1.5 × 2.8": of the surface, where the import has measured it. */
 export function sizeOf(bounds) {

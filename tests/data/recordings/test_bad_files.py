@@ -1,0 +1,179 @@
+"""Recordings as apps, trainers and disks leave them: read, or refused with the file's name and a stable reason."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from regnf_core.errors import RegnfError
+from regnf_data.recordings.choosing import choose_frames
+from regnf_data.recordings.opening import open_recording
+from tests.data.recordings import writers
+from tests.data.recordings.truth import HEIGHT, WIDTH, K, walk
+
+TRUTH = walk(3)
+Change = Callable[[Path], Any]
+
+
+def put(path: Path, image: Any) -> None:
+    Image.fromarray(image).save(path)
+
+
+def all_of(pattern: str, change: Change) -> Change:
+    return lambda folder: [change(path) for path in sorted(folder.rglob(pattern))]
+
+
+def first_of(pattern: str, change: Change) -> Change:
+    return lambda folder: change(sorted(folder.rglob(pattern))[0])
+
+
+def pose(change: Callable[[Any], Any]) -> Change:
+    return all_of("*.pose.txt", lambda path: np.savetxt(path, change(np.loadtxt(path))))
+
+
+def intrinsics(matrix: Any) -> Change:
+    return first_of("*ntrinsic*", lambda path: np.savetxt(path, matrix))
+
+
+def document(change: Callable[[Any], Any]) -> Change:
+    def write(path: Path) -> None:
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return all_of("*.json", write)
+
+
+def trajectory(lines: Callable[[], list[str]]) -> Change:
+    def write(folder: Path) -> None:
+        (folder / "groundtruth.txt").unlink()
+        (folder / "poses.txt").write_text("\n".join(lines()))
+
+    return write
+
+
+def lines_of_kitti() -> list[str]:
+    return [" ".join(map(str, one[:3].ravel())) for one in TRUTH.poses]
+
+
+def lines_of_euroc(epoch: float = 1.4e9) -> list[str]:
+    turns = Rotation.from_matrix(TRUTH.poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    rows = zip(TRUTH.stamps, TRUTH.poses[:, :3, 3], turns, strict=True)
+    return ["#timestamp, p_RS_R_x [m], ..."] + [
+        ",".join(map(str, (int(1e9 * (epoch + stamp)), *place, *turn, 0.0, 0.0))) for stamp, place, turn in rows
+    ]
+
+
+def later(folder: Path) -> None:
+    """TUM's lists with stamps of an epoch."""
+    for name in ("depth.txt", "rgb.txt"):
+        rows = [row.split() for row in (folder / name).read_text().splitlines() if not row.startswith("#")]
+        (folder / name).write_text("\n".join(f"{1.4e9 + float(row[0]):.6f} {row[1]}" for row in rows))
+
+
+DEPTHS, SCENES = "*.depth.png", "seven_scenes"
+REFUSED: dict[str, tuple[str, Change, str, str]] = {
+    "zeros": (SCENES, all_of(DEPTHS, lambda p: put(p, np.zeros((HEIGHT, WIDTH), np.uint16))), "DEPTH_MISSING", "depth"),
+    "65535": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((9, 9), 65535, np.uint16))), "INTRINSICS_INVALID", "-0"),
+    "8 bits": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((HEIGHT, WIDTH), 9, np.uint8))), "IMAGE_INVALID",
+               "8 bit"),
+    "8 of 16": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((HEIGHT, WIDTH), 200, np.uint16))), "IMAGE_INVALID",
+                "up to 200"),
+    "colors": (SCENES, all_of(DEPTHS, lambda p: put(p, np.ones((HEIGHT, WIDTH, 3), np.uint8))), "IMAGE_INVALID",
+               "frame-000000.depth.png has more than one channel"),
+    "empty": (SCENES, first_of(DEPTHS, lambda p: p.write_bytes(b"")), "IMAGE_INVALID", "frame-000000.depth.png"),
+    "cut": (SCENES, first_of(DEPTHS, lambda p: p.write_bytes(p.read_bytes()[:200])), "IMAGE_INVALID", "truncated"),
+    "bomb": (SCENES, first_of(DEPTHS, lambda p: Image.new("L", (20000, 20000)).save(p)), "IMAGE_INVALID", "400000000"),
+    "scaled": (SCENES, pose(lambda T: np.diag([1.3, 1.3, 1.3, 1.0]) @ T), "POSE_NOT_RIGID", "the length 1.3"),
+    "mirrored": (SCENES, pose(lambda T: T @ np.diag([1.0, 1.0, -1.0, 1.0])), "POSE_NOT_RIGID", "mirrors"),
+    "transposed pose": (SCENES, pose(np.transpose), "POSE_NOT_RIGID", "frame-000000: the pose is transposed"),
+    "lost": (SCENES, pose(lambda T: np.full_like(T, -np.inf)), "NO_FRAMES", "no frame has depth and a pose"),
+    "words": (SCENES, first_of("*.pose.txt", lambda p: p.write_text("a b c d")), "METADATA_INVALID", "is no number"),
+    "transposed K": (SCENES, intrinsics(K.T), "INTRINSICS_INVALID", "transposed"),
+    "K of NaN": (SCENES, intrinsics(K * np.nan), "INTRINSICS_INVALID", "not finite"),
+    "K of larger images": (SCENES, intrinsics(np.diag([3.0, 3.0, 1.0]) @ K), "INTRINSICS_INVALID",
+                           "another resolution"),
+    "other stamps": ("tum", later, "NO_FRAMES", "none belong together"),
+    "fewer poses": ("replica", first_of("traj.txt", lambda p: p.write_text(p.read_text().splitlines()[0])),
+                    "SIZES_DIFFER", "1 poses, results 3 depth images"),
+    "no JSON": ("nerfstudio", first_of("transforms.json", lambda p: p.write_text("{")), "METADATA_INVALID", "JSON"),
+    "a list": ("bop", first_of("scene_camera.json", lambda p: p.write_text("[]")), "METADATA_INVALID", "no JSON"),
+    "no depth": ("nerfstudio", document(lambda d: [one.pop("depth_file_path") for one in d["frames"]]),
+                 "DEPTH_MISSING", "names no depth images"),
+    "a lens that folds": ("nerfstudio", document(lambda d: d.update(k1=-3.5)), "CAMERA_UNSUPPORTED", "lens"),
+    "a path outside": ("nerfstudio", document(lambda d: d["frames"][0].update(depth_file_path="../../x.png")),
+                       "PATH_OUTSIDE", "leaves the dataset's folder"),
+    "a bag cut short": ("bag", first_of("*.mcap", lambda p: p.write_bytes(p.read_bytes()[:1500])), "BAG_INVALID", ""),
+    "an empty bag": ("bag", first_of("*.mcap", lambda p: p.write_bytes(b"")), "BAG_INVALID", "empty"),
+    "noise": ("bag", first_of("*.mcap", lambda p: p.write_bytes(os.urandom(500))), "BAG_INVALID", "magic"),
+}  # fmt: skip
+
+
+def read_all(folder: Path) -> None:
+    recording = open_recording(folder)
+    recording.posed_images(range(len(recording)), np.zeros((2, 3)))
+    choose_frames(recording)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_used_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    layout, change, reason, said = REFUSED[name]
+    folder = tmp_path / "recording"
+    getattr(writers, layout)(folder, TRUTH)
+    change(folder)
+    with pytest.raises(RegnfError) as refused:
+        read_all(folder)
+    assert refused.value.reason == f"DATASET_{reason}"
+    assert said in str(refused.value)
+
+
+READ: dict[str, tuple[str, Change, int]] = {
+    "a lost pose": (SCENES, first_of("*.pose.txt", lambda p: np.savetxt(p, np.full((4, 4), np.nan))), 2),
+    "a lost image": (SCENES, first_of(DEPTHS, lambda p: p.unlink()), 2),
+    "no colors": (SCENES, all_of("*.color.*", lambda p: p.unlink()), 3),
+    "larger colors": (SCENES, all_of("*.color.*", lambda p: put(p, np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8))), 3),
+    "comments": ("tum", all_of("*.txt", lambda p: p.write_text("# a\n\n" + p.read_text())), 3),
+    "KITTI's poses": ("tum", trajectory(lines_of_kitti), 3),
+    "12 numbers": ("replica", first_of("traj.txt", lambda p: np.savetxt(p, np.loadtxt(p)[:, :12])), 3),
+    "a fisheye": ("nerfstudio", document(lambda d: d.update(camera_model="OPENCV_FISHEYE", k1=0.01)), 3),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_what_apps_leave_is_read(name: str, tmp_path: Path) -> None:
+    layout, change, count = READ[name]
+    folder = tmp_path / "ein Ordner é"
+    getattr(writers, layout)(folder, TRUTH)
+    change(folder)
+    recording = open_recording(folder)
+    assert len(recording) == count
+    places = np.stack([frame.T_world_camera for frame in recording.frames])
+    np.testing.assert_allclose(places, TRUTH.poses[-count:], atol=1e-4)
+    assert all((frame.read().depth > 0.0).any() for frame in recording.frames)
+
+
+def test_poses_of_euroc_are_read(tmp_path: Path) -> None:
+    writers.tum(tmp_path, TRUTH)
+    later(tmp_path)
+    trajectory(lines_of_euroc)(tmp_path)
+    recording = open_recording(tmp_path)
+    np.testing.assert_allclose(recording.frames[1].T_world_camera, TRUTH.poses[1], atol=1e-4)
+
+
+def test_intrinsics_of_a_larger_color_image_are_those_of_its_depth_image_too(tmp_path: Path) -> None:
+    """As phones give them: the depth image is smaller, and one matrix is written, the color's."""
+    writers.seven_scenes(tmp_path, TRUTH)
+    all_of("*.color.*", lambda p: put(p, np.zeros((4 * HEIGHT, 4 * WIDTH, 3), np.uint8)))(tmp_path)
+    intrinsics(np.diag([4.0, 4.0, 1.0]) @ (K + 0.0))(tmp_path)
+    read = open_recording(tmp_path).frames[0].read()
+    assert read.camera.K[0, 0] == pytest.approx(K[0, 0])
+    assert read.color_camera is not None
+    assert read.color_camera.K[0, 0] == pytest.approx(4.0 * K[0, 0])
