@@ -36,6 +36,9 @@ _BEHIND = 8.0
 """Voxels behind a surface that count as matter; what lies farther behind it was not seen."""
 _AROUND = 8
 """Pixels around the region's picture, for the planes at its edge."""
+_FEW, _TRIED, _PLANES, _PLANE_SHARE, _ALONG = 3000, 100, 3, 0.15, 0.8
+"""Points beside the thing that planes are looked for in, those that one is tried through, planes at most, the share of
+the points on one, and the cosine between its normal and theirs."""
 _MARGIN = 1.5
 """Voxels before a surface that are not called free yet, and as many standard deviations of the depth."""
 
@@ -89,6 +92,7 @@ def focused_field(
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     free, behind = _carved(nodes, views, edge)
     values = _distances(nodes, points, normals, behind, low, edge, shape)
+    told = np.where((told == 0) & _on_planes(points, normals, told, 2.0 * edge), np.int8(-1), told)
     observation = _observation(points, told, free.reshape(shape), low, edge, shape)
     high = low + edge * (np.array(shape) - 1)
     origin, top, step = (torch.from_numpy(v.astype(np.float32)) for v in (low, high, np.full(3, edge)))
@@ -196,6 +200,32 @@ def _distances(
     return np.where(apart <= _PLANAR * edge, across, far).reshape(shape).astype(np.float32)
 
 
+def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:
+    """(P,): on a plane that holds much of what lies beside the thing, as a table, and little of the thing: what such a
+    plane shows to other images, where the thing hid it, is not the thing's either."""
+    out = np.zeros(len(points), np.bool_)
+    beside, thing = np.flatnonzero(told < 0), told > 0
+    if not len(beside) or not (told == 0).any():
+        return out
+    rng = np.random.default_rng(0)
+    left = rng.permutation(beside)[:_FEW]
+    total = len(left)
+    for _ in range(_PLANES):
+        tried = normals[left[:_TRIED]]
+        offsets = np.einsum("tc,tc->t", tried, points[left[:_TRIED]])
+        on = (np.abs(points[left] @ tried.T - offsets) <= within) & (normals[left] @ tried.T >= _ALONG)
+        best = int(on.sum(axis=0).argmax())
+        if on[:, best].sum() < _PLANE_SHARE * total:
+            break
+        there = (np.abs(points @ tried[best] - offsets[best]) <= within) & (normals @ tried[best] >= _ALONG)
+        if there[thing].mean() < _PLANE_SHARE:
+            out |= there
+        left = left[~on[:, best]]
+        if not len(left):
+            break
+    return out
+
+
 def _observation(
     points: Floats,
     told: NDArray[np.int8],
@@ -216,14 +246,15 @@ def _observation(
     states[blocks.all(axis=(1, 3, 5))] = FREE
     cells = np.floor((points - low) / (2.0 * edge)).astype(np.int64)
     within = ((cells >= 0) & (cells < np.array(counts))).all(axis=1)
-    surfaces = []
-    for which in (0, -1, 1):
-        surfaces.append(np.zeros(counts, np.bool_))
-        surfaces[-1][tuple(cells[within & (told == which)].T)] = True
-    somebody, beside, thing = surfaces
-    states[somebody] = SURFACE
-    if beside.any():
-        states[beside | (somebody & ndimage.binary_dilation(beside, iterations=2))] = UNSEEN
-    states[thing] = SURFACE
-    of_thing = bool((told != 0).any())
-    return Observation(torch.from_numpy(states), torch.from_numpy(low.copy()), 2.0 * edge, of_thing=of_thing)
+    surfaces = np.zeros((3, *counts), np.bool_)
+    for layer, which in enumerate((0, -1, 1)):
+        surfaces[layer][tuple(cells[within & (told == which)].T)] = True
+    shown, beside, thing = surfaces
+    somebody = shown
+    if thing.any():  # what other images show may be the thing's where it goes on from what the detection shows
+        somebody = shown & ~ndimage.binary_dilation(beside, iterations=2)
+        pieces, _ = ndimage.label(somebody | thing, np.ones((3, 3, 3)))
+        somebody &= np.isin(pieces, np.unique(pieces[thing]))
+        states[beside | shown] = UNSEEN
+    states[somebody | thing] = SURFACE
+    return Observation(torch.from_numpy(states), torch.from_numpy(low.copy()), 2.0 * edge, of_thing=bool(thing.any()))
