@@ -164,7 +164,8 @@ class RobustOptions:
     max_occluded_share: _Ratio = 0.85
     """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
     Increase it for objects that were observed from one side only. Whatever it says, no pose is accepted at which more
-    than 0.95 is hidden: of such poses the probability knows nothing."""
+    than 0.95 is hidden: of such poses the probability knows nothing. For detections in images the probability knows of
+    hidden objects: the limit is 0.98 of the surface there, and this option says nothing."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score, and they are at most 20 times less likely. Increase it to list less exact symmetry equivalents
