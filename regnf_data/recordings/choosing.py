@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 _LOOKED_AT = 240
 """Frames whose depths are looked at, evenly spread over the recording."""
+_LOOKED_AT_EACH = 4
+"""Frames whose depths are looked at for each that is wanted, of those whose cameras look at the box."""
+_FAR = 3.0
+"""Times as far from the box as the nearer cameras: farther frames show little of it."""
 _POINTS = 4_000
 """Of each such frame."""
 _CELLS_ACROSS = 64
@@ -46,19 +50,21 @@ def choose_frames(
     box: OrientedBox | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Chosen:
-    """At most ``most`` frames, by what they add. box: what lies outside does not count, the nearer frame sees more.
+    """At most ``most`` frames, by what they add. box: what lies outside does not count, the nearer frame sees more, and
+    only frames whose cameras look at it are read.
 
     Frames that cannot be read are an error. Raises DatasetError: DATASET_DEPTH_MISSING where no frame has a depth,
     DATASET_NOTHING_IN_BOUNDS where none shows a surface in the box.
     """
-    count = min(len(recording), _LOOKED_AT)
-    looked_at = [(index * len(recording)) // count for index in range(count)]
+    places = list(range(len(recording))) if box is None else _looking_at(recording, box)
+    count = min(len(places), _LOOKED_AT if box is None else _LOOKED_AT_EACH * most)
+    looked_at = [places[(index * len(places)) // count] for index in range(count)]
     seen: list[tuple[Array, float]] = []
     for number, index in enumerate(looked_at):
         if progress is not None:
             progress(number, count)
         frame = recording.frames[index].read(color=False)
-        seen.append((_some_points(frame), _sharpness(frame)))
+        seen.append((_some_points(frame), _sharpness(frame, box)))
     points = [each for each, _ in seen]
     if not sum(map(len, points)):
         raise DatasetError(f"{recording.name}: no frame has a measured depth", reason="DATASET_DEPTH_MISSING")
@@ -86,8 +92,27 @@ def _some_points(frame: Frame) -> Array:
     return local @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
 
 
-def _sharpness(frame: Frame) -> float:
-    """Pixels a meter, at the nearer part of what the frame shows."""
+def _looking_at(recording: Recording, box: OrientedBox) -> list[int]:
+    """Frames whose cameras have a part of the box before them, by their poses alone; all of them where none has."""
+    poses = np.stack([frame.T_world_camera for frame in recording.frames])
+    K = np.stack([frame.camera.K for frame in recording.frames])
+    sides = np.array([(frame.camera.size or 2.0 * frame.camera.K[[1, 0], 2])[::-1] for frame in recording.frames])
+    local = np.einsum("nji,nj->ni", poses[:, :3, :3], box.center.numpy() - poses[:, :3, 3])
+    depth = np.maximum(local[:, 2], 1e-9)
+    pixels = local[:, :2] / depth[:, None] * K[:, [0, 1], [0, 1]] + K[:, :2, 2]
+    around = (box.diagonal / 2.0 * K[:, 0, 0] / depth)[:, None]
+    looking = (local[:, 2] > 0.0) & ((pixels > -around) & (pixels < sides + around)).all(axis=1)
+    if not looking.any():
+        return list(range(len(recording)))
+    near = np.linalg.norm(local, axis=1)
+    return [int(index) for index in np.flatnonzero(looking & (near <= _FAR * np.quantile(near[looking], 0.1)))]
+
+
+def _sharpness(frame: Frame, box: OrientedBox | None) -> float:
+    """Pixels a meter, at the box or at the nearer part of what the frame shows."""
+    if box is not None:
+        apart = float(np.linalg.norm(box.center.numpy() - frame.T_world_camera[:3, 3]))
+        return float(frame.camera.K[0, 0]) / max(apart, 1e-9)
     measured = frame.depth[frame.depth > 0.0]
     return float(frame.camera.K[0, 0] / np.quantile(measured, 0.25)) if len(measured) else 0.0
 

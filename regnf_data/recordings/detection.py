@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
+from scipy import ndimage
 
 from regnf_core.detections.images import HINT, ImageDetection
 from regnf_core.errors import InvalidDetectionError
@@ -371,22 +370,14 @@ def _points(frame: Frame, pixels: Mask) -> Array:
 
 def _surfaces(depth: NDArray[np.float32], measured: Mask) -> tuple[NDArray[np.int64], int]:
     """The number of the connected surface of each measured pixel, row by row, and how many there are."""
-    number = np.full(measured.shape, -1)
-    number[measured] = np.arange(int(measured.sum()))
-    first, second = (np.concatenate(parts) for parts in zip(*_links(depth, number), strict=True))
-    total = int(measured.sum())
-    graph = sparse.coo_array((np.ones(len(first), np.bool_), (first, second)), shape=(total, total))
-    count, labels = csgraph.connected_components(graph, directed=False)
-    return labels.astype(np.int64), int(count)
-
-
-def _links(
-    depth: NDArray[np.float32], number: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    for here, there in (
-        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
-        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+    height, width = measured.shape
+    linked = np.zeros((2 * height - 1, 2 * width - 1), np.bool_)  # pixels, and between them whether they are linked
+    linked[::2, ::2] = measured
+    for between, here, there in (
+        (linked[1::2, ::2], np.s_[:-1], np.s_[1:]),
+        (linked[::2, 1::2], np.s_[:, :-1], np.s_[:, 1:]),
     ):
         near = np.abs(depth[here] - depth[there]) <= _JUMP * np.minimum(depth[here], depth[there])
-        both = (number[here] >= 0) & (number[there] >= 0) & near
-        yield number[here][both], number[there][both]
+        between[:] = measured[here] & measured[there] & near
+    labels, count = ndimage.label(linked)
+    return labels[::2, ::2][measured].astype(np.int64) - 1, int(count)

@@ -63,6 +63,7 @@ def focused_field(
     frames: Sequence[Frame],
     region: OrientedBox,
     voxel: float | None = None,
+    spread: float = 0.0,
     things: Sequence[NDArray[np.bool_]] = (),
 ) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
@@ -71,12 +72,10 @@ def focused_field(
     and is in the way, but nobody saw the thing there: its surface counts as unobserved.
     voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
     nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
+    spread: a standard deviation of depths from frame to frame, beside the noise of each.
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image measured a surface in the region.
     """
-    half = region.size.numpy() / 2.0
-    T_region_world = np.eye(4)
-    T_region_world[:3, :3] = region.rotation.numpy().T
-    T_region_world[:3, 3] = -T_region_world[:3, :3] @ region.center.numpy()
+    T_region_world, half = region_frame(region)
     shown = [*things, *(None for _ in frames[len(things) :])]
     pairs = zip(frames, shown, strict=True)
     views = [view for frame, thing in pairs if (view := _view(frame, T_region_world, half, thing)) is not None]
@@ -90,7 +89,7 @@ def focused_field(
     low = -half
     axes = (low[k] + edge * np.arange(shape[k]) for k in range(3))
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    free, behind = _carved(nodes, views, edge)
+    free, behind = _carved(nodes, views, edge, spread)
     values = _distances(nodes, points, normals, behind, low, edge, shape)
     told = np.where((told == 0) & _on_planes(points, normals, told, 2.0 * edge), np.int8(-1), told)
     observation = _observation(points, told, free.reshape(shape), low, edge, shape)
@@ -101,11 +100,25 @@ def focused_field(
     return TransformedField(field, Sim3.from_matrix(T_region_world.tolist()))
 
 
-def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.bool_] | None) -> _View | None:
+def region_frame(region: OrientedBox) -> tuple[Floats, Floats]:
+    """T_region_world (4, 4), whose axes are the region's and whose origin is its middle, and half of its size (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = region.rotation.numpy().T
+    T[:3, 3] = -T[:3, :3] @ region.center.numpy()
+    return T, region.size.numpy() / 2.0
+
+
+def surface_in(frame: Frame, T_region_world: Floats, half: Floats, around: float = 0.0) -> tuple[Floats, Floats]:
+    """Points and normals (P, 3) that a frame measured in a region and ``around`` it, in the region's frame."""
+    view = _view(frame, T_region_world, half + around)
+    return (np.zeros((0, 3)), np.zeros((0, 3))) if view is None else (view.points, view.normals)
+
+
+def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.bool_] | None = None) -> _View | None:
     """The pixels whose surface lies in the region; those that share a plane with too few others are left out: at edges
     sensors mix two depths."""
     T_region_camera = T_region_world @ frame.T_world_camera
-    T_camera_region = np.linalg.inv(T_region_camera)
+    T_camera_region = np.asarray(np.linalg.inv(T_region_camera), np.float64)
     rows, columns = _part(frame, T_camera_region, half)
     depth, K = frame.depth[rows, columns], frame.camera.K.copy()
     K[:2, 2] -= columns.start, rows.start
@@ -121,7 +134,7 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.
     inside = (np.abs(points) <= half).all(axis=1)
     if not inside.any():
         return None
-    normals = planes.normals[row[inside], column[inside]] @ T_region_camera[:3, :3].T
+    normals = planes.normals[row[inside], column[inside]].astype(np.float64) @ T_region_camera[:3, :3].T
     told = np.zeros(len(points), np.int8) if thing is None else np.where(thing[rows, columns][row, column], 1, -1)
     return _View(points[inside], normals, told[inside], T_camera_region, K, kept, planes.deviations)
 
@@ -145,7 +158,7 @@ def _pixel_width(views: Sequence[_View]) -> float:
 
 
 def _carved(
-    nodes: NDArray[np.float32], views: Sequence[_View], edge: float
+    nodes: NDArray[np.float32], views: Sequence[_View], edge: float, spread: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which nodes (N, 3) an image looked through, and which lie behind what one measured, in no image before it."""
     free, behind = np.zeros(len(nodes), np.bool_), np.zeros(len(nodes), np.bool_)
@@ -161,7 +174,7 @@ def _carved(
         measured = one.depth.ravel()[pixel]
         shown &= measured > 0.0
         gap = measured - local[:, 2]
-        free |= shown & (gap > _MARGIN * (edge + one.margin.ravel()[pixel]))
+        free |= shown & (gap > _MARGIN * (edge + spread + one.margin.ravel()[pixel]))
         behind |= shown & (gap < 0.0)
     return free, behind & ~free
 
@@ -197,7 +210,7 @@ def _distances(
     # Straight above a pixel's patch its plane tells the distance; beside the patch the point does.
     straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
     far = sign * np.where(straight, np.abs(across), apart)
-    return np.where(apart <= _PLANAR * edge, across, far).reshape(shape).astype(np.float32)
+    return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32).reshape(shape)
 
 
 def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:

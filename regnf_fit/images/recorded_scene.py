@@ -19,14 +19,15 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import METERS, RegistrationOptions, Unit
 from regnf_data.agreement import check_agreement
 from regnf_data.recordings.choosing import choose_frames
-from regnf_data.recordings.detection import lift
+from regnf_data.recordings.detection import Lifted, lift
 from regnf_data.recordings.recording import Frame, Recording, as_posed_images
+from regnf_fit.images.aligning import align_frames
 from regnf_fit.images.focus import focused_field
 
 Floats = NDArray[np.float64]
 
 _MOST_FRAMES = 8
-"""That are read for one region, beside those of the detections."""
+"""That are used for one region, with those of the detections."""
 _AROUND = 0.35
 """Of the box's longest side, on each side of it: the region that is seen."""
 _FITS, _APART = 0.85, 0.85
@@ -62,36 +63,36 @@ def recorded_scene(
     """
     options = options or RegistrationOptions()
     said: Unit = options.robust.object_unit if recording.is_metric else "free"
+    first: list[Lifted] = []
+    own: list[Frame] = []
+    told: tuple[str, ...] = ()
     if isinstance(detection, OrientedBox):
-        box, own, first, extent = detection, [], [], float(detection.size.max())
-        unit = _unit(said, extent, object_bounds)
+        box = detection
+        unit = _unit(said, float(detection.size.max()), object_bounds)
     else:
         if not detection:
             raise InvalidDetectionError("no detection is given")
-        indices = [recording.index(one.frame) for one in detection]
-        own = [recording.frames[index].read() for index in indices]
-        pairs = list(zip(own, detection, strict=True))
-        first = [lift(frame, one) for frame, one in pairs]
-        extent = max(float(np.ptp(each.points, axis=0).max()) for each in first)
-        unit = _unit(said, extent, object_bounds)
-        if unit in METERS and object_bounds is not None:
-            diameter = METERS[unit] * float(np.linalg.norm(object_bounds[1] - object_bounds[0]))
-            first = [lift(frame, one, diameter) for frame, one in pairs]
-        box = first[0].box if len(first) == 1 else _common(first[0].box, np.concatenate([one.points for one in first]))
+        shown, unit, diameter = _lifted(recording, detection[:_MOST_FRAMES], said, object_bounds)
+        first = _meeting(shown, diameter)
+        box = first[0].box if len(first) == 1 else _common(first, diameter)
+        own = [one.frame for one in first]
+        left = ", ".join(one.frame.name for one in shown if one not in first)
+        told = (f"the detections of other frames show another thing than {left}: left out",) if left else ()
     region = OrientedBox(box.center, box.size + 2.0 * _AROUND * box.size.max(), box.rotation)
     names = [frame.name for frame in own]
     others: list[Frame] = []
-    if len(recording) > len(own):
-        chosen = choose_frames(recording, _MOST_FRAMES, region)
-        others = [recording.frames[index].read() for index in chosen.indices]
-        others = [frame for frame in others if frame.name not in names]
-    frames = [*own, *others]
+    if len(recording) > len(own) and len(own) < _MOST_FRAMES:
+        chosen = [recording.frames[index] for index in choose_frames(recording, _MOST_FRAMES, region).indices]
+        others = [frame.read(color=not own) for frame in chosen if frame.name not in names]
+    frames = [*own, *others][:_MOST_FRAMES]
     disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)))) if len(frames) > 1 else None
-    field = focused_field(frames, region, things=[one.pixels for one in first])
-    frame = own[0] if own else max(frames, key=lambda one: _shown(one, box))
+    aligned = align_frames(frames, region)
+    frames = list(aligned.frames)
+    field = focused_field(frames, region, spread=aligned.spread, things=[one.pixels for one in first])
+    frame = frames[0] if own else max(frames, key=lambda one: _shown(one, box))
     camera = CameraView(frame.name, Sim3.from_matrix(frame.T_world_camera.tolist()), METERS.get(unit))
     known = replace(options, robust=replace(options.robust, object_unit=unit))
-    notes = recording.notes if disagreement is None else (*recording.notes, disagreement)
+    notes = (*recording.notes, *told, *([disagreement] if disagreement else ()), *aligned.notes)
     if not recording.is_metric:
         notes += ("the recording's world is not in meters: the scale is free, and lengths are in its unit",)
     if unit in METERS and options.robust.object_unit == "auto":
@@ -111,10 +112,50 @@ def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:
     return min(fitting, key=lambda name: apart[name], default="free")
 
 
-def _common(box: OrientedBox, points: Floats) -> OrientedBox:
-    """The box of the axes of ``box`` round points (P, 3) that several frames show, and round ``box``'s own middle."""
+def _lifted(
+    recording: Recording, detections: Sequence[ImageDetection], said: Unit, object_bounds: Floats | None
+) -> tuple[list[Lifted], Unit, float | None]:
+    """The things of the detections, the object's unit, and its diameter in the world where that is known."""
+    frames = [recording.frames[recording.index(one.frame)].read() for one in detections]
+    pairs = list(zip(frames, detections, strict=True))
+    shown: list[Lifted] = []
+    unit = said
+    if said == "auto" or object_bounds is None:
+        shown = [lift(frame, one) for frame, one in pairs]
+        unit = _unit(said, max(float(np.ptp(each.points, axis=0).max()) for each in shown), object_bounds)
+    if unit not in METERS or object_bounds is None:
+        return shown or [lift(frame, one) for frame, one in pairs], unit, None
+    diameter = METERS[unit] * float(np.linalg.norm(object_bounds[1] - object_bounds[0]))
+    return [lift(frame, one, diameter) for frame, one in pairs], unit, diameter
+
+
+def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
+    """Of the things that detections of frames show, those that meet most others in space: they are one.
+
+    Raises InvalidDetectionError, naming the frames, where none of several meets another.
+    """
+    middles = np.stack([one.box.center.numpy() for one in shown])
+    reach = diameter or max(float(one.box.size.max()) for one in shown)
+    apart = np.linalg.norm(middles[:, None] - middles[None], axis=-1)
+    meets = apart <= reach
+    best = max(range(len(shown)), key=lambda one: (int(meets[one].sum()), -float(apart[one][meets[one]].sum())))
+    if len(shown) > 1 and meets[best].sum() == 1:
+        names = ", ".join(one.frame.name for one in shown)
+        nearest = float(apart[apart > 0.0].min(initial=np.inf))
+        raise InvalidDetectionError(
+            f"the detections of the frames {names} show no common thing: they lie {nearest:.2g} apart or more in space,"
+            f" and it is {reach:.2g} long. Check the frames' poses, or give the detections of one frame"
+        )
+    return [one for one, found in zip(shown, meets[best], strict=True) if found]
+
+
+def _common(shown: Sequence[Lifted], diameter: float | None) -> OrientedBox:
+    """The box of the axes of the first one round what several frames show of one thing."""
+    box = shown[0].box
     axes = box.rotation.numpy()
-    local = points @ axes
+    local = np.concatenate([one.points for one in shown]) @ axes
+    if diameter is not None:
+        local = local[np.linalg.norm(local - np.median(local, axis=0), axis=1) <= diameter]
     low, high = (np.quantile(local, share, axis=0) for share in (0.01, 0.99))
     center, size = axes @ ((low + high) / 2.0), (high - low) * 1.1
     return replace(box, center=torch.from_numpy(center), size=torch.from_numpy(np.maximum(size, 1e-3)))
