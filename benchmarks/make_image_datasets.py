@@ -21,9 +21,9 @@ from typing import Any
 
 from benchmarks.make_fields import UNITS_PER_METER
 from benchmarks.worlds.composing import RenderOptions, render_object, render_room
+from benchmarks.worlds.dataset_writer import write_dataset
 from benchmarks.worlds.layouts import Layout, read_layout
 from regnf_data.posed_images import PosedImages
-from regnf_data.sdfstudio import write_dataset
 
 ROOMS = ("ac-room", "atbl-room", "mix-room")
 SINGLE_VIEW_ROOM = "ac-room"

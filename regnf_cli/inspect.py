@@ -114,7 +114,7 @@ def _inspect_recording(path: Path, said: Given, picture: Path | None, as_json: b
     _show({"name": recording.name, **found.report})
     out.print("next:")
     say(f"  regnf register {named} object.stl --detection detection.json --output out/")
-    if len(recording) > 1:
+    if len(recording) > 1 and "DISAGREE" not in found.report["agreement"]:
         say(f"  regnf fuse {named} map.safetensors")
 
 

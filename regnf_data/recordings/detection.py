@@ -210,7 +210,7 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
             )
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the mask is empty")
-        return (mask if mask.shape == frame.depth.shape else frame.registered(mask)), None
+        return frame.registered(mask), None
     mask = np.zeros(given, dtype=np.bool_)
     if detection.box_2d is not None:
         left, top, right, bottom = detection.box_2d

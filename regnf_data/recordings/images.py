@@ -17,8 +17,8 @@ from regnf_data.recordings.recording import Given
 from regnf_data.sdfstudio import load_dataset, read_metadata
 
 MOST_FRAMES = 80
-_MOST_PIXELS = 1 << 25
-"""Of all frames that are held at once: some 50 bytes each."""
+_MOST_PIXELS = 1 << 24
+"""Of all frames that are held at once: a fusion takes some 130 bytes for each."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> int:
     from regnf_core.importing.gate.sandbox import confine
     from regnf_core.importing.run import tar_run  # noqa: F401
     from regnf_data import agreement  # noqa: F401
-    from regnf_data.recordings import bags, choosing, opening, stored  # noqa: F401
+    from regnf_data.recordings import bags, choosing, layouts, stored  # noqa: F401
 
     request = json.load(sys.stdin)
     limits, folder = ImportLimits(**request["limits"]), Path(arguments[0])
@@ -127,7 +127,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
-    from regnf_data.recordings.opening import open_recording
+    from regnf_data.recordings.layouts import read_layout
     from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
@@ -135,7 +135,7 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
         source = folder / "unpacked"
         unpack(upload, kind, source, limits.file_bytes // 2)
         source = inner_folder(source)
-    recording = open_recording(source, given_of(request["description"] or {}))
+    recording = read_layout(source, given_of(request["description"] or {}))
     if len(recording) == 1:  # somebody waits for it: it is decoded once
         recording = replace(recording, frames=recording_of_frames([recording.frames[0].read()]).frames)
     kept, bounds = _kept(recording)

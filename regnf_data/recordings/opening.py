@@ -1,4 +1,4 @@
-"""Which layout a folder or file is, and its recording."""
+"""The recording at a path: a folder or file of some layout, or an archive of one."""
 
 from __future__ import annotations
 
@@ -8,52 +8,30 @@ import os
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-
-from regnf_core.errors import DatasetError
-from regnf_data.recordings import documents, folders
+from regnf_data.recordings.layouts import has_layout, read_layout
 from regnf_data.recordings.recording import Given, Recording
-from regnf_data.recordings.stored import is_stored, read_stored
+from regnf_data.recordings.stored import read_stored
 
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_MOST_LISTED = 12
 _TARS = (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz")
 _CHECKPOINTS = (".ckpt", ".pt", ".pth", ".pkl", ".safetensors")
 _IMAGES = (".png", ".tif", ".tiff", ".npy", ".pgm", ".exr")
-_NEAR = 3
-"""Folders below the one that was given in which recordings are looked for, to name them."""
 
 
-@dataclass(frozen=True)
-class Layout:
-    """name: for `--layout` · words: for people · fits: whether a folder or file has it · read: its recording ·
-    looks_for: the files that tell it · axes: of its cameras."""
+def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> Recording:
+    """The recording in a folder, a file or an archive. No image of a folder is decoded yet.
 
-    name: str
-    words: str
-    looks_for: str
-    fits: Callable[[Path], bool]
-    read: Callable[[Path, Given], Recording]
-    axes: Literal["opencv", "opengl"] = "opencv"
-
-    def recording(self, path: Path, given: Given) -> Recording:
-        """That at ``path``, with cameras whose axes are those that were given."""
-        found = self.read(path, given)
-        if given.axes in (None, self.axes):
-            return found
-        turned = (replace(one, T_world_camera=one.T_world_camera @ _OPENGL) for one in found.frames)
-        return replace(found, frames=tuple(turned))
+    Raises DatasetError: DATASET_NOT_RECOGNIZED with what was looked for, and those of the layout's reader; of an
+    archive FieldFormatError too.
+    """
+    return _archive(Path(path), given or Given()) if _is_archive(Path(path)) else read_layout(path, given)
 
 
-def _bag(path: Path, given: Given) -> Recording:
-    from regnf_data.recordings.bags import read_bag
-
-    return read_bag(path, given)
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether a folder or file has the layout of a recording."""
+    return has_layout(path) or _is_archive(Path(path))
 
 
 def _is_archive(path: Path) -> bool:
@@ -95,82 +73,3 @@ def _archive(path: Path, given: Given) -> Recording:
     if not (kept / "field.safetensors").is_file():
         import_recording(path, kept, description)
     return read_stored(kept / "field.safetensors", path.name)
-
-
-def _is_bag(path: Path) -> bool:
-    return path.suffix in (".mcap", ".db3", ".bag") if path.is_file() else (path / "metadata.yaml").is_file()
-
-
-LAYOUTS = (
-    Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
-    Layout("archive", "an archive of a recording", "*.zip, *.tar", _is_archive, _archive),
-    Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop),
-    Layout("sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio),
-    Layout("nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio, "opengl"),
-    Layout("rosbag2", "a ROS bag", "metadata.yaml, *.mcap, *.db3", _is_bag, _bag),
-    Layout("tum", "TUM RGB-D", "depth.txt, groundtruth.txt", folders.is_tum, folders.read_tum),
-    Layout("scannet", "ScanNet, extracted", "pose/, depth/", folders.is_scannet, folders.read_scannet),
-    Layout("replica", "Replica (NICE-SLAM)", "traj.txt, results/", folders.is_replica, folders.read_replica),
-    Layout("redwood", "Redwood, Open3D", "depth/, *.log or pose_graph.json", folders.is_redwood, folders.read_redwood),
-    Layout("colmap", "COLMAP with depth", "cameras.txt or .bin, depth/", documents.is_colmap, documents.read_colmap),
-    Layout(
-        "7scenes", "7-Scenes, 3DMatch", "*.pose.txt, *.depth.png", folders.is_seven_scenes, folders.read_seven_scenes
-    ),
-    Layout("frame", "one frame", "one depth image, intrinsics", folders.is_frame, folders.read_frame),
-)
-
-
-def open_recording(path: str | os.PathLike[str], given: Given | None = None) -> Recording:
-    """The recording in a folder or file. No image is decoded yet.
-
-    Raises DatasetError: DATASET_NOT_RECOGNIZED with what was looked for, and those of the layout's reader.
-    """
-    source, given = Path(path), given or Given()
-    if not source.exists():
-        raise DatasetError(f"there is no {source}", reason="DATASET_NOT_RECOGNIZED")
-    if given.layout is not None:
-        named = {layout.name: layout for layout in LAYOUTS}
-        if given.layout not in named:
-            raise DatasetError(
-                f"no layout is called {given.layout[:40]!r}: {', '.join(named)}", reason="DATASET_NOT_RECOGNIZED"
-            )
-        return named[given.layout].recording(source, given)
-    for layout in LAYOUTS:
-        if layout.fits(source):
-            return layout.recording(source, given)
-    below = _recordings_below(source) if source.is_dir() else []
-    if below:
-        names = ", ".join(str(each.relative_to(source)) for each in below[:_MOST_LISTED])
-        more = f" and {len(below) - _MOST_LISTED} more" if len(below) > _MOST_LISTED else ""
-        raise DatasetError(
-            f"{source.name} is no recording, but holds {len(below)}: give one of {names}{more}",
-            reason="DATASET_NOT_RECOGNIZED",
-        )
-    known = "; ".join(f"{layout.words}: {layout.looks_for}" for layout in LAYOUTS)
-    raise DatasetError(
-        f"{source.name} is no recording that is known. Looked for {known}", reason="DATASET_NOT_RECOGNIZED"
-    )
-
-
-def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether there is a folder or file, and it has the layout of a recording."""
-    return Path(path).exists() and any(layout.fits(Path(path)) for layout in LAYOUTS)
-
-
-def _recordings_below(folder: Path) -> list[Path]:
-    found: list[Path] = []
-    level = [folder]
-    for _ in range(_NEAR):
-        level = sorted(child for parent in level for child in _folders(parent))[:1000]
-        for child in level:
-            if any(layout.fits(child) for layout in LAYOUTS[:-1]):
-                found.append(child)
-        level = [child for child in level if child not in found]
-    return found
-
-
-def _folders(folder: Path) -> list[Path]:
-    try:
-        return [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
-    except OSError:
-        return []

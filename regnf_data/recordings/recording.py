@@ -26,7 +26,7 @@ _MILLIMETER, _EIGHT_BITS = 0.001, 255.5
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One depth image and its camera, without a lens.
+    """One depth image and its camera, without a lens; and the color image as it was taken.
 
     depth: (H, W) float32, meters along the camera's axis, 0 where nothing was measured · camera: of the depth image ·
     T_world_camera: (4, 4), OpenCV's axes · color: (H', W', 3) uint8 as it was taken, by ``color_camera`` from the same
@@ -39,13 +39,17 @@ class Frame:
     T_world_camera: Array
     color: NDArray[np.uint8] | None = None
     color_camera: Camera | None = None
+    taken: Camera | None = None
+    """The depth image's camera with its lens, where that was undone."""
 
     def registered(self, image: NDArray[Any]) -> NDArray[Any]:
-        """An image (H', W', ...) by the color's camera as the depth's camera would have taken it: (H, W, ...).
+        """An image (H', W', ...) in the pixels of the color image, or of the depth image as it was taken, in those of
+        the depth image: (H, W, ...).
 
-        Both look from the same place; pixels that the color's camera did not see are 0.
+        Both cameras look from the same place; pixels that the color's camera did not see are 0.
         """
-        source = self.color_camera or self.camera
+        of_color = self.color is not None and image.shape[:2] == self.color.shape[:2]
+        source = (self.color_camera if of_color else self.taken) or self.camera
         if image.shape[:2] == self.depth.shape and source is self.camera:
             return image
         height, width = self.depth.shape
@@ -56,6 +60,13 @@ class Frame:
         out = np.zeros((height * width, *image.shape[2:]), image.dtype)
         out[inside] = image[row[inside], column[inside]]
         return out.reshape(height, width, *image.shape[2:])
+
+    def without_lens(self) -> Frame:
+        """With the color image as a camera without a lens would have taken it."""
+        if self.color is None or self.color_camera is None:
+            return self
+        camera, color = _without_lens(self.color_camera, self.color)
+        return replace(self, color=color, color_camera=camera)
 
     def points(self) -> tuple[Array, NDArray[np.bool_]]:
         """World points (P, 3) of the measured pixels, and which those are: (H, W)."""
@@ -78,6 +89,8 @@ class StoredFrame:
     color: Callable[[], NDArray[np.uint8]] | None = None
     color_camera: Camera | None = None
     along_ray: bool = False
+    taken: Camera | None = None
+    """As of :class:`Frame`, where the lens was undone before."""
 
     def read(self, color: bool = True) -> Frame:
         """Raises DatasetError (DATASET_IMAGE_INVALID, DATASET_INTRINSICS_INVALID, ...) naming the frame."""
@@ -87,19 +100,19 @@ class StoredFrame:
             # Phones and ROS drivers give the color's intrinsics beside a smaller depth image.
             height, width = self.color().shape[:2]
             given = given.of_size((height, width), self.name) if given.is_central((height, width)) else given
-        camera = given.of_size(size, self.name).check(self.name)
-        camera, depth = _without_lens(camera, depth)
+        with_lens = given.of_size(size, self.name).check(self.name)
+        camera, depth = _without_lens(with_lens, depth)
         if self.along_ray:
             rows, columns = np.indices(depth.shape) + 0.5
             rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))
             depth = (depth / np.linalg.norm(rays, axis=1).reshape(depth.shape)).astype(np.float32)
-        frame = Frame(self.name, depth, camera, self.T_world_camera)
+        taken = self.taken if with_lens.lens == "none" else with_lens
+        frame = Frame(self.name, depth, camera, self.T_world_camera, taken=taken)
         if not color or self.color is None:
             return frame
         picture = self.color()
-        taken = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
-        taken, picture = _without_lens(taken.check(self.name), picture)
-        return replace(frame, color=picture, color_camera=taken)
+        colored = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
+        return replace(frame, color=picture, color_camera=colored.check(self.name))
 
 
 @dataclass(frozen=True, eq=False)

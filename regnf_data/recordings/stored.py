@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import DatasetError, atomic_path
-from regnf_data.recordings.camera import Array, Camera
+from regnf_data.recordings.camera import Array, Camera, Lens, lens_of
 from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
 
 _KEY = "recording"
@@ -65,13 +65,16 @@ def write_recording(recording: Recording, indices: Sequence[int], path: Path) ->
             taken.append(None if frame is None else frame.color_camera)
             yield np.zeros((*color, 3), np.uint8) if frame is None or frame.color is None else frame.color
 
-    count = len(kept)
+    count, first = len(kept), kept[0]
+    seen, bent = first.color_camera or first.camera, first.taken or first.camera
     said = {
         "names": names,
         "depth_unit": unit,
         "layout": recording.layout,
         "notes": list(recording.notes),
         "is_metric": recording.is_metric,
+        "lens": [bent.lens, list(bent.distortion)],
+        "color_lens": [seen.lens, list(seen.distortion)],
         "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
     }
     arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]] = {
@@ -147,6 +150,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
             raise ValueError("its arrays do not fit together")
         colors = None if color is None or color_K is None else ((color[1], color[2]), color_K)
         metric = None if said.get("T_metric_world") is None else np.array(said["T_metric_world"], np.float64)
+        lens, color_lens = (_lens_of(said.get(one, ["none", []]), path.name) for one in ("lens", "color_lens"))
         layout, notes = str(said["layout"])[:100], tuple(str(one)[:500] for one in said["notes"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         message = f"{path.name} is no recording of regnf: {error}"
@@ -164,10 +168,18 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
                 pose,
                 partial(_depth, path, number, unit),
                 partial(_color, path, number) if colored else None,
-                Camera(colors[1][number].astype(np.float64), colors[0]) if colored and colors is not None else None,
+                Camera(colors[1][number].astype(np.float64), colors[0], *color_lens) if colored and colors else None,
+                taken=None if lens[0] == "none" else Camera(K[number].astype(np.float64), (height, width), *lens),
             )
         )
     return Recording(name or path.name, layout, tuple(frames), notes, metric, bool(said.get("is_metric", True)))
+
+
+def _lens_of(said: Any, name: str) -> tuple[Lens, tuple[float, ...]]:
+    kind, coefficients = said
+    if kind not in ("none", "brown", "fisheye"):
+        raise ValueError(f"a lens {str(kind)[:20]!r}")
+    return ("none", ()) if kind == "none" else lens_of(coefficients, kind == "fisheye", name)
 
 
 def _depth(path: Path, number: int, unit: float) -> NDArray[np.float32]:
@@ -186,7 +198,13 @@ def recording_of_frames(frames: Sequence[Frame], name: str = "frames", layout: s
     def held(frame: Frame) -> StoredFrame:
         color: Callable[[], NDArray[np.uint8]] | None = None if frame.color is None else partial(_same, frame.color)
         return StoredFrame(
-            frame.name, frame.camera, frame.T_world_camera, partial(_same, frame.depth), color, frame.color_camera
+            frame.name,
+            frame.camera,
+            frame.T_world_camera,
+            partial(_same, frame.depth),
+            color,
+            frame.color_camera,
+            taken=frame.taken,
         )
 
     return Recording(name, layout, tuple(held(frame) for frame in frames))

@@ -52,6 +52,8 @@ def align_frames(frames: Sequence[Frame], region: OrientedBox) -> Aligned:
     A frame stays where its surfaces in the region do not tell how to move it (along a plane, about a ball's middle),
     where too few of them are seen by others, and where the others would not agree better with it.
     """
+    if len(frames) == 1:
+        return Aligned(tuple(frames), 0.0)
     T_region_world, half = region_frame(region)
     reach = _REACH * 2.0 * float(half.max())
     rng = np.random.default_rng(0)

@@ -31,8 +31,8 @@ _BACKGROUND = (249, 249, 247)
 
 @dataclass(frozen=True, eq=False)
 class InspectedRecording:
-    """report: plain values, meters and pixels · picture: some images, and the points from above with the cameras'
-    path."""
+    """report: plain values, the recording's unit and pixels · picture: some images, and the points from above with the
+    cameras' path."""
 
     report: dict[str, Any]
     picture: Image.Image
@@ -50,16 +50,18 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
     depths = np.concatenate([one.depth[one.depth > 0.0] for one in frames])
     height, width = frames[0].depth.shape
     colors = {one.color.shape[1::-1] for one in frames if one.color is not None}
-    guessed = any("unit" in note for note in recording.notes)
+    step, guessed = _step(frames[0].depth), any("unit" in note for note in recording.notes)
+    known = "what was said" if said and said.depth_unit else "a guess" if guessed else "the recording"
     report = {
         "kind": "recording",
         "layout": recording.layout,
         "frames": len(recording),
+        "unit": "meters" if recording.is_metric else "the recording's own",
         "depth_images": f"{width} x {height}",
         "color_images": " and ".join(f"{w} x {h}" for w, h in sorted(colors)) or None,
-        "depth_step_m": _step(frames[0].depth),
-        "depth_step_from": "what was said" if said and said.depth_unit else "a guess" if guessed else "the recording",
-        "depth_m": {
+        "depth_step": step,
+        "depth_step_from": None if step is None else known,
+        "depth": {
             name: _rounded(float(np.quantile(depths, share)))
             for name, share in (("nearest", 0.01), ("median", 0.5), ("farthest", 0.99))
         },
@@ -74,7 +76,7 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
             "lens": "none" if stored.camera.lens == "none" else f"{stored.camera.lens}, taken out of the images",
         },
         "bounds": [[_rounded(value) for value in row] for row in chosen.bounds.tolist()],
-        "path_m": _rounded(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())),
+        "path": _rounded(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())),
         "agreement": _agreement(recording, chosen.indices, chosen.bounds),
         "notes": list(recording.notes),
     }
@@ -82,7 +84,7 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
 
 
 def _step(depth: NDArray[np.float32]) -> float | None:
-    """What depths are whole multiples of, m, as the unit of images of whole numbers; None for numbers with a point."""
+    """What depths are whole multiples of, as the unit of images of whole numbers; None for numbers with a point."""
     steps = np.diff(np.unique(depth[depth > 0.0].astype(np.float64)))
     if not len(steps):
         return None

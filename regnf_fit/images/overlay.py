@@ -69,6 +69,7 @@ def overlay_picture(result: RegistrationResult, frame: Frame, vertices: Floats, 
     faces (F, 3): the object's own frame and unit. The picture is at most 1,560 pixels wide, and 592 high.
     """
     assert result.camera is not None
+    frame = frame.without_lens()
     to_camera = result.camera.T_world_camera.inverse()
     poses = [to_camera @ one.T_scene_object for one in (result, *result.alternatives[:_MOST_ALTERNATIVES])]
     used = vertices[np.unique(faces)]

@@ -150,13 +150,15 @@ def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
 
 
 def _common(shown: Sequence[Lifted], diameter: float | None) -> OrientedBox:
-    """The box of the axes of the first one round what several frames show of one thing."""
+    """The box of the axes of the first one round what several frames show of one thing; behind, seen from the first,
+    it reaches as far as the thing is wide."""
     box = shown[0].box
     axes = box.rotation.numpy()
     local = np.concatenate([one.points for one in shown]) @ axes
     if diameter is not None:
         local = local[np.linalg.norm(local - np.median(local, axis=0), axis=1) <= diameter]
     low, high = (np.quantile(local, share, axis=0) for share in (0.01, 0.99))
+    high[2] = max(high[2], low[2] + (high - low)[:2].max())
     center, size = axes @ ((low + high) / 2.0), (high - low) * 1.1
     return replace(box, center=torch.from_numpy(center), size=torch.from_numpy(np.maximum(size, 1e-3)))
 

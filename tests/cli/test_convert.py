@@ -9,10 +9,10 @@ import pytest
 import torch
 import trimesh
 
+from benchmarks.worlds.dataset_writer import write_dataset
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
 from regnf_core.schema.safe_format import read_description
-from regnf_data.sdfstudio import write_dataset
 from regnf_fit.images.observing import observe
 from tests.cli.conftest import DATA, Run
 from tests.fit.images.scenes import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, images

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.worlds.dataset_writer import write_dataset
 from regnf_core.schema.safe_format import read_description
-from regnf_data.sdfstudio import write_dataset
 from tests.cli.conftest import Run
 from tests.fit.images import scenes
 from tests.fit.images.test_agreement import OPENGL, recording

@@ -73,10 +73,11 @@ def test_inspect_says_what_a_recording_is(name: str, run: Run, tmp_path: Path) -
     found = report(run, folder, "--picture", tmp_path / "it.png")
     assert (found["kind"], found["frames"], found["depth_images"]) == ("recording", 6, "80 x 60")
     assert found["color_images"] == ("160 x 120" if name == "scannet" else "80 x 60")
-    assert found["depth_step_m"] == pytest.approx(1 / 6553.5 if name == "replica" else step, rel=0.01)
+    assert found["depth_step"] == pytest.approx(1 / 6553.5 if name == "replica" else step, rel=0.01)
     assert found["camera"]["focal_px"] == [70.0, 72.0]
     assert np.allclose(np.array(found["bounds"])[:, 2], (-0.2, 1.95), atol=0.1)
     assert "agree" in found["agreement"]
+    assert found["unit"] == "meters"
     assert len(found["notes"]) == (name == "scannet")
     with Image.open(tmp_path / "it.png") as picture:
         assert picture.size == (1320, 360)

@@ -285,3 +285,30 @@ def test_a_rendering_that_is_cancelled_leaves_nothing(
     assert live_client.post(f"{address}/cancel").status_code == 202
     assert finished(live_client, address.rpartition("/")[2])["status"] == "dismissed"
     assert not [name for name in live_stack.files() if name.startswith(f"{address[1:]}/")]
+
+
+@pytest.mark.long
+def test_one_frame_in_one_call_ends_in_a_pose_and_its_picture(live_client: httpx.Client) -> None:
+    """The example's frame, mask and model."""
+    files = DATA / "frame"
+    parts = {name: (name, (files / f"{name}.png").read_bytes()) for name in ("depth", "color", "mask")}
+    parts |= {"object": ("cat.stl", (files / "cat.stl").read_bytes())}
+    texts = {"camera": (None, (files / "camera.json").read_bytes()), "request": (None, b"{}")}
+    answer = live_client.post("/register", files={**parts, **texts})
+    assert answer.status_code == 202, answer.text
+    job = finished(live_client, answer.json()["id"])
+    result = live_client.get(job["links"]["result"]).json()
+    validator("ResultDocument").validate(result)
+    truth = np.array(json.loads((files / "truth.json").read_text())["T_camera_object"])
+    assert np.abs(np.array(result["camera"]["T_camera_object"]["matrix"]) - truth)[:3, 3].max() < 0.005
+    assert result["verdict"] == "registered"
+    (overlay,) = [one for one in result["artifacts"] if one["name"] == "overlay.png"]
+    shown = arrived(live_client, overlay["url"])
+    assert shown.status_code == 200, shown.text
+    with Image.open(BytesIO(shown.content)) as image:
+        assert image.format == "PNG"
+    recording = live_client.get(f"/recordings/{job['inputs']['scene']}").json()
+    assert recording["report"]["kind"] == "recording"
+    assert live_client.get(recording["links"]["picture"]).headers["content-type"] == "image/png"
+    assert live_client.delete(recording["links"]["self"]).status_code == 204
+    assert_refused(live_client.get(recording["links"]["picture"]), 404, "FIELD_NOT_FOUND")

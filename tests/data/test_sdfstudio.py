@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.worlds.dataset_writer import write_dataset
 from regnf_core.errors import DatasetError
 from regnf_core.geometry.box import OrientedBox
 from regnf_data.posed_images import PosedImages
-from regnf_data.sdfstudio import METADATA, load_dataset, write_dataset
+from regnf_data.sdfstudio import METADATA, load_dataset
 from tests.data.small import two_images
 
 Change = Callable[[dict[str, Any]], object]

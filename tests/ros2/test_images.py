@@ -21,7 +21,7 @@ from regnf_data.recordings.detection import mask_of
 from tests.ros2.conftest import Buffer, Node
 from tests.ros2.definitions import boxes, camera_info, header, image, masks, received
 from tests.ros2.messages import TYPES
-from tests.ros2.test_package import CHAIR, make_node, matrix, part
+from tests.ros2.test_package import CHAIR, contract_takes, make_node, matrix, part
 
 CUP, FRAME = "ee" * 32, "fa" * 32
 H, W = 12, 16
@@ -286,6 +286,13 @@ def test_cameras_are_of_the_image_that_came(said: dict[str, Any], rectified: boo
 def test_a_rectified_image_is_known_by_its_topic(monkeypatch: pytest.MonkeyPatch, topic: str) -> None:
     monkeypatch.setattr(Node, "remapped", {"depth/image": topic})
     assert Robot(monkeypatch, Answers()).node.rectified == topic.endswith("rect")
+
+
+def test_the_requests_are_ones_that_the_contract_takes(robot: Robot) -> None:
+    robot.see(boxes(12.5, BOX))
+    robot.see(masks(12.5, (H, W), ("chair", OUTLINE)))
+    for number in (0, 1):
+        contract_takes("OneShotRequest", robot.answers.json("request", number))
 
 
 # What is published.

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,16 @@ def answered(monkeypatch: pytest.MonkeyPatch, document: Any = None, **given: Any
     return node, answers.requests[0]
 
 
+@cache
+def contract() -> Any:
+    return yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))["components"]
+
+
+def contract_takes(schema: str, request: dict[str, Any]) -> None:
+    reference = {"$ref": f"#/components/schemas/{schema}", "components": contract()}
+    Draft202012Validator(reference).validate(request)
+
+
 def detections(class_id: str = "chair", frame: str = "map") -> Any:
     array, one = TYPES["vision_msgs/Detection3DArray"](), TYPES["vision_msgs/Detection3D"]()
     array.header.frame_id, array.header.stamp.sec = frame, 12
@@ -119,9 +130,7 @@ def test_a_pose_is_published_in_the_map_with_its_frame(monkeypatch: pytest.Monke
 
 def test_the_request_is_one_that_the_contract_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     _, request = answered(monkeypatch, up_axis="z")
-    contract = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
-    schema = {"$ref": "#/components/schemas/RegisterRequest", "components": contract["components"]}
-    Draft202012Validator(schema).validate(request)
+    contract_takes("RegisterRequest", request)
     assert (request["scene"], request["object"], request["options"]) == (SCENE, CHAIR, {"up_axis": "z"})
     assert (request["detection"]["center"], request["detection"]["size"]) == ([1.0, 0.0, 0.0], [0.5, 0.6, 0.7])
 

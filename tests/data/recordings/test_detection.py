@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from regnf_core.detections.images import ImageDetection, is_image_detection, rea
 from regnf_core.errors import InvalidDetectionError
 from regnf_data.recordings.camera import Camera
 from regnf_data.recordings.detection import lift, mask_of
-from regnf_data.recordings.recording import Frame
+from regnf_data.recordings.recording import Frame, Recording, StoredFrame
+from regnf_data.recordings.stored import read_stored, write_recording
 
 H, W = 120, 160
 CAMERA = Camera(np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]]), (H, W))
@@ -171,3 +173,40 @@ def test_a_detection_without_depth_is_refused() -> None:
     with pytest.raises(InvalidDetectionError, match=r"frame 0: 0 of \d+ pixels of the detection") as found:
         lift(holes, ImageDetection(mask=shown))
     assert found.value.reason == "DETECTION_WITHOUT_DEPTH"
+
+
+@pytest.mark.parametrize("kind", ["mask grown", "mask shrunk", "mask shifted", "box loose", "point"])
+def test_the_box_does_not_depend_on_how_the_thing_was_detected(kind: str) -> None:
+    frame, shown = ball_image()
+    rng = np.random.default_rng(1)
+    frame = Frame("0", (frame.depth * (1 + 0.001 * rng.normal(size=(H, W)))).astype(np.float32), CAMERA, np.eye(4))
+    rows, columns = np.nonzero(shown)
+    left, top, right, bottom = columns.min() - 6.0, rows.min() - 6.0, columns.max() + 7.0, rows.max() + 7.0
+    detection = {
+        "mask grown": ImageDetection(mask=grown(shown, 6)),
+        "mask shrunk": ImageDetection(mask=grown(shown, -5)),
+        "mask shifted": ImageDetection(mask=np.roll(shown, (3, -4), axis=(0, 1))),
+        "box loose": ImageDetection(box_2d=(left, top, right, bottom)),
+        "point": ImageDetection(point_2d=(float(columns.mean()), float(rows.mean()))),
+    }[kind]
+    exact, found = (lift(frame, one, diameter=3.5 * RADIUS) for one in (ImageDetection(mask=shown), detection))
+    assert np.abs((found.box.center - exact.box.center).numpy()).max() < 0.05 * RADIUS
+    np.testing.assert_allclose(found.box.size.numpy(), exact.box.size.numpy(), rtol=0.05)
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_a_mask_is_in_pixels_of_the_image_with_its_lens(colored: bool, tmp_path: Path) -> None:
+    """A lens that bends the image's corner by several pixels; the mask is drawn on the bent image."""
+    bent = replace(CAMERA, lens="brown", distortion=(-0.25, 0.05, 0.0, 0.0))
+    depth, color = np.ones((H, W), np.float32), np.zeros((H, W, 3), np.uint8)
+    stored = StoredFrame("0", bent, np.eye(4), lambda: depth, (lambda: color) if colored else None)
+    write_recording(Recording("r", "frames", (stored,)), [0], tmp_path / "r.safetensors")
+    rows, columns = np.indices((H, W))
+    corner = (rows > 88) & (rows < 104) & (columns > 128) & (columns < 144)
+    seen = bent.project(CAMERA.rays(np.stack(np.nonzero(corner)[::-1], axis=1) + 0.5))
+    assert np.abs(seen - (np.stack(np.nonzero(corner)[::-1], axis=1) + 0.5)).max() > 3.0
+    mask = np.zeros((H, W), np.bool_)
+    mask[np.floor(seen[:, 1]).astype(int), np.floor(seen[:, 0]).astype(int)] = True
+    for frame in (stored.read(), read_stored(tmp_path / "r.safetensors").frames[0].read()):
+        np.testing.assert_array_equal(frame.registered(mask)[corner], True)
+        assert frame.registered(mask).sum() < 1.2 * corner.sum()

@@ -13,11 +13,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.worlds.dataset_writer import write_dataset
 from benchmarks.worlds.trajectories import look_at
 from regnf_core.errors import DatasetError
 from regnf_data.agreement import check_agreement
 from regnf_data.posed_images import PosedImages
-from regnf_data.sdfstudio import load_dataset, write_dataset
+from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.fusion import fuse_images
 from tests.fit.images import scenes

@@ -152,9 +152,12 @@ async def _taken(
             received = await receive_raw(request, services, upload, digest)
             return await store_upload(services, caller, upload, received, as_)
         frame = await stack.enter_async_context(FrameUpload(services, claim))
-        parts = await _receive_parts(request, frame, digest, ("camera", "name") if as_.said else ("camera", "upload"))
-        if "upload" in parts:
+        parts = await _receive_parts(request, frame, digest)
+        if parts.keys() == {"upload"} and not as_.said:
             return await finish_pieces(services, caller, named_upload(parts["upload"]), as_, RecordingUpload)
+        wanted = ["camera", "depth"] + (["name"] if as_.said else [])
+        if sorted(parts.keys() - {"color"}) != wanted:
+            raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and color if there is one.")
         texts = {"camera.json": camera_of(parts)}
         if as_.said:
             name = parts["name"].decode("utf-8", "replace")
@@ -165,20 +168,13 @@ async def _taken(
         return await store_upload(services, caller, frame, await frame.finish_frame(texts), as_)
 
 
-async def _receive_parts(
-    request: Request, frame: FrameUpload, digest: str | None, texts: tuple[str, str]
-) -> dict[str, bytes]:
-    """The parts of a frame, or `upload` alone. Raises Problem."""
+async def _receive_parts(request: Request, frame: FrameUpload, digest: str | None) -> dict[str, bytes]:
     body.refuse_encoding(request)
     data = body.chunks(request, FRAME_BYTES + 2 * CAMERA_BYTES)
-    most = dict(zip(texts, (CAMERA_BYTES, UPLOAD_BYTES), strict=True))
-    sent = data if digest is None else compared(data, digest)
-    parts = await read_parts(sent, boundary_of(request), frame.images, most)
-    missing = {"depth", *texts} - parts.keys() - {"upload"}
-    if missing if "upload" not in parts else len(parts) > 1:
-        told = "`upload` comes alone." if "upload" in parts else f"The part `{min(missing)}` is missing."
-        raise Problem("MALFORMED_MULTIPART", told)
-    return parts
+    texts = {"camera": CAMERA_BYTES, "name": UPLOAD_BYTES, "upload": UPLOAD_BYTES}
+    return await read_parts(
+        data if digest is None else compared(data, digest), boundary_of(request), frame.images, texts
+    )
 
 
 def camera_of(parts: Mapping[str, bytes]) -> bytes:

@@ -6,12 +6,14 @@ const BAGS = ['\x89MCAP0', '#ROSBAG', 'SQLite'];
 const IMAGE = /\.(png|jpe?g|bmp|webp|tiff?|exr|npy)$/i;
 export const DEPTH = /depth.*\.(png|tiff?|exr|npy)$/i;
 const OF_A_FIELD = /\.(ckpt|pth?|safetensors|msgpack|ingp|glb|gltf|obj|stl)$/i;
+const CAMERA_TEXT = /(intrinsic|camera|cam_params|calib|cam_k|^k).*\.txt$/i;
 const CAMERA_BYTES = 65_536;
 const CAMERA_WORDS = /"(fx|fl_x|K|k|cam_K|intrinsics?|intrinsic_matrix|camera_matrix|focal_length|ppx)"/;
 
 /**
- * { recording, depth, color, mask, camera, rest }: a file each where there is one; rest: those that are no part of a
- * recording, without texts that are nothing to the page. A mask is a picture that is called one. Several depth images are a recording, with all that came with them.
+ * { recording, depth, color, mask, camera, settings, rest }: a file each where there is one. camera: intrinsics as JSON;
+ * settings: a text that may hold them; rest: those that are no part of a recording, without JSON that is nothing to the
+ * page. A mask is a picture that is called one. Several depth images are a recording, with all that came with them.
  */
 export async function sorted(files) {
   const found = { rest: [] };
@@ -39,7 +41,7 @@ async function kindOf(file) {
     const words = file.size <= CAMERA_BYTES ? await file.text() : '';
     return CAMERA_WORDS.test(words) ? 'camera' : 'nothing';
   }
-  if (/\.(ya?ml)$/i.test(file.name)) return 'nothing';
+  if (/\.ya?ml$/i.test(file.name) || CAMERA_TEXT.test(file.name)) return 'settings';
   if (/\.npz$/i.test(file.name)) return 'rest';
   return isOfRecording(await namesIn(file)) ? 'recording' : 'rest';
 }

@@ -3,11 +3,14 @@
 import { byId, show } from './dom.js';
 import { sizeOf } from './frame-files.js';
 
-const PARTS = ['depth', 'color', 'camera', 'mask'];
+const PARTS = ['depth', 'color', 'camera', 'mask', 'settings'];
 const FOCAL = 0.95; // of the width: about what depth cameras have, shown as an example only
 
 export class FrameForm {
-  /** onFrame(parts) hears of a frame that is complete: depth, camera and, where they are given, color and mask. */
+  /**
+   * onFrame(parts) hears of a frame that is complete: depth, camera or settings and, where
+   * they are given, color and mask.
+   */
   constructor(onFrame) {
     Object.assign(this, { onFrame, parts: {}, size: null });
     byId('camera-form').addEventListener('submit', (event) => {
@@ -17,17 +20,19 @@ export class FrameForm {
     });
   }
 
-  /** Whether files hold a part of a frame. */
-  static isPart = (found) => PARTS.some((name) => found[name]);
+  /** Whether files hold a part of a frame; a text alone is one only of a frame that has begun. */
+  isPart(found) {
+    return PARTS.some((name) => found[name] && (name !== 'settings' || found.depth || this.parts.depth));
+  }
 
   /** Takes what was chosen or dropped, beside what came before; a depth image begins another frame. */
   async take(found) {
     const given = Object.fromEntries(PARTS.filter((name) => found[name]).map((name) => [name, found[name]]));
     this.parts = given.depth ? given : { ...this.parts, ...given };
-    const { depth, camera } = this.parts;
+    const { depth, camera, settings } = this.parts;
     if (!depth) {
       this.say('The depth image of the frame is missing: a PNG of 16 bits, a TIFF or a .npy file. Add it.');
-    } else if (camera) {
+    } else if (camera || settings) {
       this.onFrame(this.parts);
     } else {
       await this.ask();

@@ -24,15 +24,15 @@ let workspace = null;
 let starting = false;
 
 const objects = new ObjectList(service, store, update);
-const scene = new SceneChoice(service, store, showScene, objects);
+const scene = new SceneChoice(service, store, { onScene: showScene, onMask: takeMask }, objects);
 const boxes = new BoxList(() => workspace, update);
 const pictures = new PictureView((shape, mark) => marks.take(shape, mark));
 const marks = new MarkList(() => pictures, update);
 let list = boxes; // what is marked in the scene that is shown
 const runs = new Runs(service, () => (list === marks ? pictures : workspace), options);
 
-/** Shows a ready field or recording as the scene; isLatest(): whether no other one was chosen since. mask: a file. */
-async function showScene(field, up, isLatest, mask) {
+/** Shows a ready field or recording as the scene; isLatest(): whether no other one was chosen since. */
+async function showScene(field, up, isLatest) {
   const recorded = isRecording(field);
   if (workspace) boxes.clear();
   marks.clear();
@@ -48,7 +48,7 @@ async function showScene(field, up, isLatest, mask) {
   byId('add-box').textContent = list.one;
   list.draw();
   update();
-  await (recorded ? showRecording(field, isLatest, mask) : showField(field, up, isLatest));
+  await (recorded ? showRecording(field) : showField(field, up, isLatest));
   if (isLatest()) document.documentElement.dataset.scene = field.sha256;
 }
 
@@ -62,10 +62,15 @@ async function showField(field, up, isLatest) {
   if (isLatest()) tell(`${nameOf(field)}: click the thing to look for.`);
 }
 
-async function showRecording(recording, isLatest, mask) {
+async function showRecording(recording) {
   tell(`${nameOf(recording)}: click the thing to look for, or draw a box round it.`);
   await pictures.open(service, recording);
-  if (mask && isLatest()) marks.take(await maskShape(pictures.frame, mask));
+}
+
+/** Marks what a mask, a PNG, shows in the picture. */
+async function takeMask(file) {
+  const { frame } = pictures;
+  marks.take(await maskShape(frame, file));
 }
 
 function tell(text) {

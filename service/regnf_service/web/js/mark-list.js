@@ -70,10 +70,14 @@ export class MarkList {
   draw() {
     for (const entry of this.boxes) this.view().showMark(entry, entry.id === this.edits);
     byId('boxes').replaceChildren(...this.boxes.map((entry) => el('li', {},
-      el('button', { type: 'button', 'aria-pressed': String(entry.id === this.edits), onclick: () => this.choose(entry) }, wordsOf(entry)),
+      el('button', { type: 'button', 'aria-pressed': String(entry.id === this.edits), onclick: () => this.choose(entry) }, this.rowWords(entry)),
       el('button', { type: 'button', className: 'quiet', 'aria-label': `Remove mark ${entry.id}`, onclick: () => this.remove(entry.id) }, 'Remove'))));
     byId('boxes-note').textContent = this.boxes.length ? ONE_MORE : FIRST;
     show(byId('numbers'), false);
+  }
+
+  rowWords(entry) {
+    return wordsOf(entry) + (this.view().hasSeveral ? ` in ${entry.shape.frame}` : '');
   }
 
   nameOf({ id }) {
@@ -88,8 +92,9 @@ export class MarkList {
   }
 }
 
-function wordsOf({ id, shape: { point, box } }) {
-  if (point) return `Mark ${id}: pixel ${point.map(Math.round).join(', ')}`;
-  if (!box) return `Mark ${id}: a mask`;
-  return `Mark ${id}: box of ${Math.round(box[2] - box[0])} × ${Math.round(box[3] - box[1])} pixels`;
+const wordsOf = ({ id, shape }) => `Mark ${id}: ${shapeWords(shape)}`;
+
+function shapeWords({ point, box }) {
+  if (point) return `pixel ${point.map(Math.round).join(', ')}`;
+  return box ? `box of ${Math.round(box[2] - box[0])} × ${Math.round(box[3] - box[1])} pixels` : 'a mask';
 }

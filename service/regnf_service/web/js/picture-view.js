@@ -28,12 +28,12 @@ export class PictureView {
 
   /** Shows the recording's first frame, and the strip where there are several. */
   async open(service, recording) {
-    Object.assign(this, { service, recording });
+    Object.assign(this, { service, recording, hasSeveral: framesOf(recording).length > 1 });
     this.clear();
     this.nearby.disconnect();
     const names = framesOf(recording);
     byId('strip').replaceChildren(...names.map((name) => this.thumb(name)));
-    show(byId('strip'), names.length > 1);
+    show(byId('strip'), this.hasSeveral);
     await this.choose(names[0]);
   }
 

@@ -1,6 +1,7 @@
 // Recordings on the service: how they are sent, what their documents say, the pictures of their frames.
 
 import { ApiProblem } from './api.js';
+import { archiveOf } from './archive.js';
 import { sha256Of } from './sha256.js';
 import { importWords, labelOf, untilDone } from './uploads.js';
 
@@ -22,13 +23,21 @@ export function recordingOfFile(service, file, onStep) {
   });
 }
 
-/** The same of one frame. parts: its depth, color and camera, as files or as text. */
+/** The same of one frame. parts: its depth, color and camera, as files; settings in place of a camera that is no JSON. */
 export function recordingOfFrame(service, parts, onStep) {
+  if (!parts.camera) return recordingOfFile(service, archiveOf(parts.depth.name, filesOf(parts)), onStep);
   return untilDone(async () => {
     const form = new FormData();
     for (const name of ['depth', 'color', 'camera']) if (parts[name]) form.append(name, parts[name]);
     return imported(service, await sent(service, parts.depth.name, form, {}, onStep), onStep);
   });
+}
+
+/** A frame's files as a folder has them. */
+function filesOf({ depth, color, settings }) {
+  const ending = settings.name.split('.').pop();
+  return [[depth.name, depth], [color?.name, color], [`camera.${ending}`, settings]]
+    .filter(([, file]) => file).map(([path, file]) => ({ path, file }));
 }
 
 /** The picture of a frame, a PNG of the image that detections are made in. */

@@ -14,11 +14,11 @@ import { fieldOf, nameOf } from './uploads.js';
 
 export class SceneChoice {
   /**
-   * Draws from store; onScene(field, up, isLatest, mask) shows a scene, a field or a recording; mask: the file that says
-   * where the thing is in a frame. objects takes the files that are dropped beside one.
+   * Draws from store; onScene(field, up, isLatest) shows a scene, a field or a recording; onMask(file) marks a thing in
+   * the picture that is shown. objects takes the files that are dropped beside a scene.
    */
-  constructor(service, store, onScene, objects) {
-    Object.assign(this, { service, store, onScene, objects, field: null, turns: new Turns() });
+  constructor(service, store, { onScene, onMask }, objects) {
+    Object.assign(this, { service, store, onScene, onMask, objects, field: null, turns: new Turns() });
     this.frame = new FrameForm((parts) => this.takeFrame(parts));
     byId('scene-file').addEventListener('change', (event) => {
       this.takeFiles([...event.target.files]);
@@ -77,16 +77,26 @@ export class SceneChoice {
     if (!files.length) return;
     const isLatest = this.turns.next();
     const found = await sorted(files);
-    if (found.recording || FrameForm.isPart(found)) {
+    if (found.recording || this.frame.isPart(found)) {
       this.objects.take(found.rest);
-      if (found.recording && isLatest()) await this.take(found.recording.name, (onStep) => recordingOfFile(this.service, found.recording, onStep), isLatest);
-      else if (isLatest()) await this.frame.take(found);
+      if (isLatest()) await this.takePictures(found, isLatest);
       return;
     }
-    const [largest, ...rest] = [...found.rest].sort((a, b) => b.size - a.size);
+    const [largest, ...rest] = [...found.rest, ...(found.settings ? [found.settings] : [])].sort((a, b) => b.size - a.size);
     this.objects.take(rest);
     if (largest && isLatest()) await this.takeField(largest, isLatest);
     if (!largest) this.fail(new Error(`${files[0].name} is neither a scene nor a part of a frame.`));
+  }
+
+  async takePictures(found, isLatest) {
+    const { recording, mask, depth, color, camera } = found;
+    if (recording) {
+      await this.take(recording.name, (onStep) => recordingOfFile(this.service, recording, onStep), isLatest);
+    } else if (mask && !depth && !color && !camera && this.field && isRecording(this.field)) {
+      await this.onMask(mask).catch((error) => this.fail(error)); // of the picture that is shown
+    } else {
+      await this.frame.take(found);
+    }
   }
 
   takeField(file, isLatest) {
@@ -162,7 +172,8 @@ export class SceneChoice {
       ...warnings.map((text) => el('p', { className: 'warn' }, text)), ...notes.map((text) => el('p', { className: 'note' }, text)));
     this.draw();
     try {
-      await this.onScene(field, up, isLatest, mask);
+      await this.onScene(field, up, isLatest);
+      if (mask && isLatest()) await this.onMask(mask);
     } catch (error) {
       if (isLatest()) this.fail(error);
     }
