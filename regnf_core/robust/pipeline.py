@@ -125,8 +125,7 @@ def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scal
     scene, obj = view.foreground.on_surface(), model.samples.on_surface()
     if view.of_thing and scale.log_width < math.inf:
         middle = math.sqrt(scale.low * scale.high)
-        axes, turns = box.rotation.to(device), rotations.to(device)
-        return seen_seeds(scene, obj, model.samples.normals, axes, turns, middle)
+        return seen_seeds(scene, obj, model.samples.normals, box.rotation.to(device), rotations.to(device), middle)
     return seed_poses(
         scene,
         obj,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import product, zip_longest
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from regnf_data.recordings.recording import Frame
 from regnf_fit.images.observing import pixel_planes
 
 Floats = NDArray[np.float64]
+Masks = Sequence[NDArray[np.bool_]]
 
 _MOST_NODES = 1_000_000
 _SHARP = 0.25
@@ -60,11 +61,7 @@ class _View:
 
 
 def focused_field(
-    frames: Sequence[Frame],
-    region: OrientedBox,
-    voxel: float | None = None,
-    spread: float = 0.0,
-    things: Sequence[NDArray[np.bool_]] = (),
+    frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None, spread: float = 0.0, things: Masks = ()
 ) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
@@ -76,14 +73,12 @@ def focused_field(
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image measured a surface in the region.
     """
     T_region_world, half = region_frame(region)
-    shown = [*things, *(None for _ in frames[len(things) :])]
-    pairs = zip(frames, shown, strict=True)
+    pairs = zip_longest(frames, things)
     views = [view for frame, thing in pairs if (view := _view(frame, T_region_world, half, thing)) is not None]
     if not views:
         raise DatasetError("no depth image shows a surface in the region", reason="DATASET_NOTHING_IN_BOUNDS")
-    points, normals, told = (
-        np.concatenate([getattr(one, name) for one in views]) for name in ("points", "normals", "told")
-    )
+    measured = ((one.points, one.normals, one.told) for one in views)
+    points, normals, told = (np.concatenate(part) for part in zip(*measured, strict=True))
     edge = max(voxel or _pixel_width(views), float(np.prod(2.0 * half) / _MOST_NODES) ** (1.0 / 3.0))
     shape = tuple(int(n) for n in np.ceil(2.0 * half / edge) + 1)
     low = -half
@@ -220,10 +215,11 @@ def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: 
     beside, thing = np.flatnonzero(told < 0), told > 0
     if not len(beside) or not (told == 0).any():
         return out
-    rng = np.random.default_rng(0)
-    left = rng.permutation(beside)[:_FEW]
+    left = np.random.default_rng(0).permutation(beside)[:_FEW]
     total = len(left)
     for _ in range(_PLANES):
+        if len(left) < _PLANE_SHARE * total:
+            break
         tried = normals[left[:_TRIED]]
         offsets = np.einsum("tc,tc->t", tried, points[left[:_TRIED]])
         on = (np.abs(points[left] @ tried.T - offsets) <= within) & (normals[left] @ tried.T >= _ALONG)
@@ -234,18 +230,11 @@ def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: 
         if there[thing].mean() < _PLANE_SHARE:
             out |= there
         left = left[~on[:, best]]
-        if not len(left):
-            break
     return out
 
 
 def _observation(
-    points: Floats,
-    told: NDArray[np.int8],
-    free: NDArray[np.bool_],
-    low: Floats,
-    edge: float,
-    shape: tuple[int, ...],
+    points: Floats, told: NDArray[np.int8], free: NDArray[np.bool_], low: Floats, edge: float, shape: tuple[int, ...]
 ) -> Observation:
     """Voxels of two nodes' edge: free where all their nodes are, a surface where a point lies, but for those where
     points beside the thing lie and none of it."""

@@ -83,17 +83,12 @@ class PoseBound(Bundle):
 
     @classmethod
     def of(
-        cls,
-        detection: OrientedBox,
-        extremal_points: Tensor,
-        tolerance: float,
-        scale: ScaleBound = ANY_SCALE,
-        seen: bool = False,
+        cls, detection: OrientedBox, extremal_points: Tensor, tolerance: float, scale: ScaleBound = ANY_SCALE
     ) -> PoseBound:
         """The bound for an object with these ``extremal_points`` (E, 3), on their device."""
         axes, edges = detection.rotation.double(), (detection.size / detection.diagonal).double()
         device = extremal_points.device
-        return cls(extremal_points.double(), axes.to(device), edges.to(device), tolerance, scale, seen)
+        return cls(extremal_points.double(), axes.to(device), edges.to(device), tolerance, scale)
 
     def admits(self, T: Sim3) -> Tensor:
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""
@@ -158,22 +153,16 @@ def seed_poses(
     return Sim3.cat([by_moments, bound.limited_poses(by_points), bound.limited_poses(by_box)])
 
 
-def seen_seeds(
-    scene_points: Tensor,
-    object_points: Tensor,
-    object_normals: Tensor,
-    camera_axes: Tensor,
-    rotations: Tensor,
-    scale: float,
-) -> Sim3:
+def seen_seeds(scene: Tensor, points: Tensor, normals: Tensor, axes: Tensor, rotations: Tensor, scale: float) -> Sim3:
     """Poses T_object_scene (2K,), as those of ``seed_poses``, of an object of known scale that one image shows.
 
     Its side that faces the camera is laid on what was seen: for every rotation by the middle of that side, and by its
-    nearest point and the middles across. camera_axes: (3, 3), columns, the last one away from the camera.
+    nearest point and the middles across. scene: (N, 3) · points, normals: (M, 3) of the object · axes: (3, 3), columns,
+    the camera's, the last one away from it.
     """
-    scene, points, axes = scene_points.double(), object_points.double(), camera_axes.double()
+    scene, points, axes = scene.double(), points.double(), axes.double()
     turned = rotations @ axes  # (K, 3, 3): the camera's axes in the object's frame
-    facing = (object_normals.double() @ turned[:, :, 2].mT < SEARCH.facing_cosine).double()  # (M, K)
+    facing = (normals.double() @ turned[:, :, 2].mT < SEARCH.facing_cosine).double()  # (M, K)
     of_side = facing.mT @ points / facing.sum(0).clamp_min(1.0)[:, None]
     by_side = of_side - scale * (rotations @ scene.mean(0))
     low, high = _object_extents(points, rotations, axes)
