@@ -148,7 +148,7 @@ class RobustOptions:
     """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
     min_probability: _Share = 0.7
     """Minimum ``probability`` (0..1) of an answer; below it: LOW_PROBABILITY. Increase it for fewer wrong poses; an
-    answer below it is never accepted."""
+    answer below it is never accepted. For detections in images it is 0.9 at least."""
     share_limits_below: _Share = 0.9
     """Below this probability (0..1) the three limits that follow, of shares, must be kept too. 1: always, 0: never."""
     min_inlier_share: _Ratio = 0.6

@@ -103,7 +103,8 @@ def evaluate_pose(
             _Limit("LOW_OVERLAP", "scene inliers", told["inlier_share_scene"], enough),
             _Limit("SCENE_UNEXPLAINED", "explained share", explained, options.min_explained_share),
         ]
-    limits.append(_Limit("LOW_PROBABILITY", "probability", probability, options.min_probability))
+    least = max(options.min_probability, VERDICT.min_probability_of_thing) if of_thing else options.min_probability
+    limits.append(_Limit("LOW_PROBABILITY", "probability", probability, least))
     margin = min(one.slack for one in limits)
     if not bool(held_out.admitted[index]):
         return PoseVerdict("rejected", "OUTSIDE_DETECTION", -1.0)
