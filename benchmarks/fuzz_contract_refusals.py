@@ -25,7 +25,7 @@ OF_STATE = frozenset(
 )
 """Reasons that depend on what the service holds, and on its settings: allowed wherever the contract documents them."""
 
-_LISTS = ("jobs", "fields", "batches", "library")
+_LISTS = ("jobs", "fields", "recordings", "batches", "library")
 OF_MEMBERS: Mapping[str, frozenset[str]] = {
     **{f"GET /{name}": frozenset({"INVALID_QUERY"}) for name in _LISTS},  # a page token that no page has given
     "POST /register": frozenset(

@@ -19,7 +19,13 @@ from numpy.typing import ArrayLike
 import regnf_core.api as core
 from regnf_core.api import FieldLike, Objects, Registered, Search
 from regnf_core.batch import BatchOutcome, ModeledObject
-from regnf_core.detections.images import AnyDetection, ImageDetection, is_image_detection, read_detection
+from regnf_core.detections.images import (
+    AnyDetection,
+    ImageDetection,
+    image_detection_in_field,
+    is_image_detection,
+    read_detection,
+)
 from regnf_core.detections.parsing import BoxLike
 from regnf_core.document import ProgressCallback
 from regnf_core.errors import InvalidDetectionError, RegnfError
@@ -204,12 +210,8 @@ def _detection(scene: Any, given: Any) -> OrientedBox | Sequence[ImageDetection]
 
 def _box(given: DetectionLike) -> BoxLike:
     """The detection in a field: a box. Raises InvalidDetectionError."""
-    if given is None:
-        raise InvalidDetectionError("no detection is given", hint="Give the box in the scene's frame.")
     if is_image_detection(given):
-        raise InvalidDetectionError(
-            "the detection is about an image, and the scene is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
-        )
+        raise image_detection_in_field()
     return given  # type: ignore[return-value]
 
 

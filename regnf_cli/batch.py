@@ -137,8 +137,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
         place = where()
         found = search_library(place.field, place.box, library, place.options, request["seed"], clouds=False)
         ranking = ranking_document(found.ranking, {})
-        result = replace(found.result, camera=place.camera)
-        return dict(result_document(result, object_name=found.ranking[0].name, candidates=ranking))
+        return dict(result_document(place.seen(found.result), object_name=found.ranking[0].name, candidates=ranking))
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
     initial = None if start is None else Sim3.from_matrix(start)
@@ -147,9 +146,7 @@ def _document(pair: FilePair) -> dict[str, Any]:
     obj = _field(name, "object")
     place = where(obj, model)
     result = register(place.field, obj, place.box, place.options, request["seed"], None, initial, model, clouds)
-    return dict(
-        result_document(replace(result, camera=place.camera), None if truth is None else Sim3.from_matrix(truth))
-    )
+    return dict(result_document(place.seen(result), None if truth is None else Sim3.from_matrix(truth)))
 
 
 def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:

@@ -13,10 +13,10 @@ import typer
 
 import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.registration import Files, answer, check_box, image_detection_in_field
+from regnf_cli.registration import Files, answer, check_box
 from regnf_cli.report import tell
 from regnf_core.detections import Detection
-from regnf_core.detections.images import AnyDetection, plain_values
+from regnf_core.detections.images import AnyDetection, image_detection_in_field, plain_values
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.field_files import library_files, stored_bounds
 from regnf_core.field_source import FieldSource, SettingsChoice

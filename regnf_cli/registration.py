@@ -6,7 +6,7 @@ The request is the same in both places: the members of POST /register but the fi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,19 +15,20 @@ import typer
 
 from regnf_cli.report import exit_code, reporting, show, tell
 from regnf_core.detections import Bounds, Detection, require_in_scene
-from regnf_core.detections.images import AnyDetection, read_detection
+from regnf_core.detections.images import AnyDetection, image_detection_in_field, read_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfaceError, filled_folder, require_writable
 from regnf_core.field_source import FieldSource
 from regnf_core.options import RegistrationOptions, RobustOptions
 
 if TYPE_CHECKING:
     from regnf_client import Client, Job
-    from regnf_core.document import CameraView, RegistrationResult
+    from regnf_core.document import RegistrationResult
     from regnf_core.field_notes import FieldNotes
     from regnf_core.fields.observation import SdfField
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import LibraryObject, ObjectModel
-    from regnf_data.recordings.recording import Frame, Recording
+    from regnf_data.recordings.recording import Recording
+    from regnf_fit.images.place import Place
 
 Objects = FieldSource | list[FieldSource]
 """One object to register, or several to search among."""
@@ -77,7 +78,7 @@ class Files:
                 require_writable(folder)
 
     def write(
-        self, result: RegistrationResult, box: OrientedBox, more: Callable[[Path], None] | None = None, **said: Any
+        self, result: RegistrationResult, box: OrientedBox, more: Callable[[Path], object] | None = None, **said: Any
     ) -> None:
         """Write what is wanted, each file whole or not at all; ``said`` goes on to ``write_artifacts``.
 
@@ -103,19 +104,6 @@ class Files:
 
 
 # In this process.
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where one thing is looked for: a scene's field and a box, or the region of a recording. image: that of the
-    detection, for the overlay."""
-
-    field: SdfField
-    box: OrientedBox
-    options: RegistrationOptions
-    camera: CameraView | None = None
-    image: Frame | None = None
-    notes: tuple[str, ...] = ()
 
 
 def register_here(
@@ -162,12 +150,12 @@ def register_here(
                 place.field, obj.field, place.box, place.options, seed, report, initial, model, clouds=wanted
             )
             name = str(objects.named)
-        result = replace(result, camera=place.camera)
+        result = place.seen(result)
         report("exporting", 1.0)
     for note in place.notes:
         tell(f"note: {note}")
     said |= {"object_name": name, "fields": notes | {"object": obj.notes}}
-    files.write(result, place.box, partial(_overlay, result, place.image, obj.field), **said)
+    files.write(result, place.box, partial(place.draw, result, obj.field), **said)
     document: dict[str, Any] = result_document(result, **said)
     return document
 
@@ -184,42 +172,19 @@ def place_of(
 
     Raises InvalidDetectionError, DatasetError.
     """
-    from regnf_core.geometry.box import OrientedBox
     from regnf_data.recordings.recording import Recording
+    from regnf_fit.images.place import place_in
 
-    box = OrientedBox.from_detection(detection) if isinstance(detection, Detection) else None
     if not isinstance(scene, Recording):
-        if box is None or not isinstance(detection, Detection):
+        if not isinstance(detection, Detection):
             raise image_detection_in_field(named)
         check_box(named, detection, _bounds_of(scene), None if obj is None else _bounds_of(obj))
-        return Place(scene, box, options)
-    from regnf_fit.images.recorded_scene import recorded_scene
-
-    bounds = None if model is None else model.bounds.numpy()
-    where = box if isinstance(detection, Detection) else detection
-    assert where is not None
-    seen = recorded_scene(scene, where, bounds, options)
-    return Place(seen.field, seen.box, seen.options, seen.camera, seen.frame, seen.notes)
+    return place_in(scene, detection, None if model is None else model.bounds, options)
 
 
 def scene_name(scene: FieldSource | Recording) -> Path:
     """As the user named it."""
     return scene.named if isinstance(scene, FieldSource) else Path(scene.name)
-
-
-def image_detection_in_field(scene: object) -> InvalidDetectionError:
-    """The error for a mask, a box in pixels or a point where the scene has no images."""
-    return InvalidDetectionError(
-        f"the detection is about an image, and {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
-    )
-
-
-def _overlay(result: RegistrationResult, image: Frame | None, obj: SdfField, folder: Path) -> None:
-    """Write overlay.png into ``folder``, where the scene is a recording."""
-    if image is not None:
-        from regnf_fit.images.overlay import object_mesh, overlay_picture
-
-        overlay_picture(result, image, *object_mesh(obj)).save(folder / "overlay.png")
 
 
 def check_box(scene: Path, box: Detection, bounds: Bounds | None, obj: Bounds | None = None) -> None:

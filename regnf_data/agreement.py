@@ -56,6 +56,24 @@ _OPENGL = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 _BODY = ((0, -1, 0), (0, 0, -1), (1, 0, 0))
 
 
+@dataclass(frozen=True)
+class Terms:
+    """What the files of a layout call the things that a convention is about.
+
+    poses, intrinsics, unit: where they are stated · to_camera: whether poses lead from the world to the camera ·
+    axes: of the cameras, by --camera-axes.
+    """
+
+    poses: str = "the poses"
+    intrinsics: str = "the intrinsics"
+    unit: str = ""
+    to_camera: bool = False
+    axes: str = "opencv"
+
+
+NO_TERMS = Terms()
+
+
 @dataclass(frozen=True, eq=False)
 class _Views:
     """What a convention makes of the images: depths (N, H, W), to be multiplied by ``factor``, intrinsics and poses.
@@ -66,6 +84,7 @@ class _Views:
     poses: Floats
     factor: float = 1.0
     changes: tuple[tuple[str, str], ...] = ()
+    terms: Terms = NO_TERMS
 
     def because(self, wrong: str, mend: str) -> _Views:
         return replace(self, changes=(*self.changes, (wrong, mend)))
@@ -74,7 +93,7 @@ class _Views:
         """What is wrong, and what mends it."""
         changes = list(self.changes)
         if self.factor != 1.0:
-            changes.append(_of_factor(self.factor))
+            changes.append(_of_factor(self.factor, self.terms))
         mend = "; ".join(mend for _, mend in changes)
         return " and ".join(wrong for wrong, _ in changes), f"{mend[0].upper()}{mend[1:]}."
 
@@ -116,6 +135,11 @@ def score_of_scale(images: PosedImages, factor: float) -> float:
     return sample.agreement(_Views(images.depths, images.intrinsics, images.T_world_camera, factor)).score
 
 
+def check_views(depths: NDArray[np.float32], intrinsics: Floats, poses: Floats, terms: Terms) -> str | None:
+    """As :func:`check_agreement`, of depths (N, H, W), intrinsics (N, 3, 3), poses (N, 4, 4), in a layout's words."""
+    return _checked(_Views(depths, intrinsics, poses, terms=terms))
+
+
 def check_agreement(images: PosedImages) -> str | None:
     """A warning where the images disagree by every convention; None where they agree, or cannot tell.
 
@@ -124,18 +148,23 @@ def check_agreement(images: PosedImages) -> str | None:
     if images.depths is None or len(images) < 2:
         return None
     depths = np.where(images.measured, images.depths, np.float32(0.0))
-    stated = _Views(depths, images.intrinsics, images.T_world_camera)
-    if (sample := _Sample.of(depths, _PAIRS, _PIXELS)) is None:
+    return _checked(_Views(depths, images.intrinsics, images.T_world_camera))
+
+
+def _checked(stated: _Views) -> str | None:
+    if (sample := _Sample.of(stated.depths, _PAIRS, _PIXELS)) is None:
         return None
     found = sample.agreement(stated)
     if found.places >= _FEWEST and found.disagreement < _SUSPECT:
         return None
-    best, other = _search(stated, sample)
+    # Poses that are all the same, as of a camera on a stand, agree or not by every convention.
+    still = bool((np.ptp(stated.poses, axis=0) == 0.0).all())
+    best, other = (stated, found) if still else _search(stated, sample)
     # A factor above 1 may be but a way to be rid of the cameras' places: beside depths that are large enough, shifts
     # count for nothing, and images of one distant wall agree by their turns alone.
     beyond = sample.agreement(replace(best, factor=_BEYOND * best.factor)).disagreement
     tells_depth = best.factor <= 1.0 or other.disagreement <= _CLEAR * beyond
-    if best is not stated and tells_depth and _clearly_better(other, found, len(images)):
+    if best is not stated and tells_depth and _clearly_better(other, found, len(stated.poses)):
         wrong, mend = best.told()
         raise DatasetError(
             f"the images contradict each other: {found.said()}. With {wrong}: {other.said()}",
@@ -247,10 +276,10 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
         for inverted in (False, True):
             if inverted or not np.array_equal(axes, np.eye(3)):
                 changed = replace(views, poses=(inverse if inverted else views.poses) @ turn)
-                yield changed.because(*_of_axes(axes, inverted))
+                yield changed.because(*_of_axes(axes, inverted, views.terms))
     for step, wrong in ((-1, "quaternions written w first"), (1, "quaternions x y z w that were read w first")):
         rolled = replace(views, poses=rolled_quaternions(views.poses, step))
-        yield rolled.because(wrong, "make the matrices of quaternions anew, in the order that they are written in")
+        yield rolled.because(wrong, f"write the quaternions of {views.terms.poses} anew, in the order that is expected")
     count = len(views.poses)
     by_name = np.argsort([str(number) for number in range(count)], kind="stable")
     orders = {
@@ -260,24 +289,32 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
     }
     orders |= {f"poses {step:+d} images off": np.roll(np.arange(count), -step) for step in (-3, -2, -1, 1, 2, 3)}
     for name, order_of in orders.items():
-        yield replace(views, poses=views.poses[order_of]).because(name, "give each image its own pose")
+        yield replace(views, poses=views.poses[order_of]).because(
+            name, f"give each image its own pose in {views.terms.poses}"
+        )
 
 
-def _of_axes(axes: Pixels, inverted: bool) -> tuple[str, str]:
+def _of_axes(axes: Pixels, inverted: bool, terms: Terms) -> tuple[str, str]:
     """What is wrong with poses of such axes, and what mends it."""
     wrong, mend = [], []
     if inverted:
-        wrong.append("poses from the world to the camera")
-        mend.append("invert the matrices: poses lead from the camera to the world")
+        ways = ["from the camera to the world", "from the world to the camera"]
+        wrong.append(f"poses {ways[not terms.to_camera]}")
+        mend.append(f"invert the matrices: {terms.poses} must lead {ways[terms.to_camera]}")
     rows = tuple(tuple(int(number) for number in row) for row in axes)
     if rows == _OPENGL:
-        wrong.append("cameras that look against z (OpenGL's axes)")
-        mend.append("say --camera-axes opengl (opencv where it was), or negate columns two and three of each pose")
+        other = "opengl" if terms.axes == "opencv" else "opencv"
+        wrong.append(
+            "cameras that look " + ("against z (OpenGL's axes)" if other == "opengl" else "along z (OpenCV's axes)")
+        )
+        mend.append(f"say --camera-axes {other}, or negate columns two and three of each pose, to the world")
     elif not np.array_equal(axes, np.eye(3)):
         named = ["+-"[int(column.sum() < 0)] + "xyz"[int(np.abs(column).argmax())] for column in axes.T]
         body = " (x forward, as of a robot's body)" if rows == np.array(_BODY).T.tolist() else ""
         wrong.append(f"cameras whose right is {named[0]}, down {named[1]} and forward {named[2]}{body}")
-        mend.append("turn the axes of each pose: its columns are the camera's right, down and forward")
+        mend.append(
+            f"turn the axes of {terms.poses}: columns of a pose to the world are the camera's right, down and forward"
+        )
     return " and ".join(wrong), "; ".join(mend)
 
 
@@ -303,7 +340,7 @@ def _other_depths(views: _Views) -> Iterator[_Views]:
         yield replace(of_inverse, factor=float(factor))
 
 
-def _of_factor(factor: float) -> tuple[str, str]:
+def _of_factor(factor: float, terms: Terms) -> tuple[str, str]:
     """What is wrong where depths need a factor, and what mends it."""
     wrong = f"depths {factor:.3g} times as large"
     for known, name in (_UNITS | _STEPS).items():
@@ -311,15 +348,15 @@ def _of_factor(factor: float) -> tuple[str, str]:
             factor, wrong = known, f"depths in {name}"
         elif known in _UNITS and abs(factor * known - 1.0) < _NAMED:
             factor, wrong = 1.0 / known, f"poses in {name}"
-    change = "multiply the depths, or their unit (--depth-unit; depth_unit_scale_factor in meta_data.json)"
-    return wrong, f"{change}, by {factor:.4g}; or divide the poses"
+    unit = f"--depth-unit or {terms.unit}" if terms.unit else "--depth-unit"
+    return wrong, f"multiply the depths, or their unit ({unit}), by {factor:.3g}; or divide the poses"
 
 
 def _other_intrinsics(views: _Views) -> Iterator[_Views]:
     height, width = views.depths.shape[1:]
     K = views.intrinsics
     swapped = K[:, [1, 0, 2]][:, :, [1, 0, 2]]
-    mend = "write the intrinsics in pixels of these images"
+    mend = f"write {views.terms.intrinsics} in pixels of these images"
     yield replace(views, intrinsics=swapped).because("intrinsics whose width and height are exchanged", mend)
     middle = np.median(K[:, :2, 2], axis=0)
     fitting = {round(float(side / (2.0 * at)), 3) for side, at in zip((width, height), middle, strict=True) if at > 0.0}

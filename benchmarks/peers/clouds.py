@@ -42,8 +42,11 @@ class CloudPair:
         return self.T_work_object.inverse() @ similarity(T_object_scene_work) @ self.T_work_scene
 
 
-def cloud_pair(scene: SurfaceSamples, obj: SurfaceSamples, normalized: bool) -> CloudPair:
-    """Both clouds moved to their centroids; ``normalized``: each also scaled to a root mean square radius of one."""
+def cloud_pair(scene: SurfaceSamples, obj: SurfaceSamples, normalized: bool, voxel: float = VOXEL) -> CloudPair:
+    """Both clouds moved to their centroids; ``normalized``: each also scaled to a root mean square radius of one.
+
+    voxel: in root mean square radii of the object.
+    """
     T_scene, _ = _centering(scene, normalized)
     T_object, object_radius = _centering(obj, normalized)
     return CloudPair(
@@ -51,7 +54,7 @@ def cloud_pair(scene: SurfaceSamples, obj: SurfaceSamples, normalized: bool) -> 
         scene.normals.double().numpy(),
         T_object.apply(obj.points.double()).numpy(),
         obj.normals.double().numpy(),
-        VOXEL * (1.0 if normalized else object_radius),
+        voxel * (1.0 if normalized else object_radius),
         T_scene,
         T_object,
     )

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.peers.clouds import CloudPair, cloud_pair, described
+from benchmarks.peers.clouds import VOXEL, CloudPair, cloud_pair, described
 from benchmarks.peers.interface import PeerCase, PeerResult
 from regnf_core.errors import InitializationError
 
@@ -60,6 +60,7 @@ class RansacIcp:
     normalized: bool
     scaled: bool
     uses_samples: bool = True
+    voxel: float = VOXEL
 
     @property
     def name(self) -> str:
@@ -74,7 +75,7 @@ class RansacIcp:
         from open3d.pipelines import registration
 
         begun = time.perf_counter()
-        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalized)
+        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalized, self.voxel)
         scene, obj = _features(pair, seed)
         matched = self._ransac(scene, obj, pair.voxel)
         if len(matched.correspondence_set) == 0:

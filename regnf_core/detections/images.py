@@ -102,6 +102,13 @@ def read_detection(values: Any, index: int | None = None, folder: Path | None = 
     return found if folder is None else tuple(one.beside(folder) for one in found)
 
 
+def image_detection_in_field(scene: object = "the scene") -> InvalidDetectionError:
+    """The error for a mask, a box in pixels or a point where the scene has no images."""
+    return InvalidDetectionError(
+        f"the detection is about an image, and {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
+    )
+
+
 def plain_values(detection: AnyDetection) -> Any:
     """JSON values that ``read_detection`` reads again: what a request holds."""
     return detection.canonical() if isinstance(detection, Detection) else [one.values() for one in detection]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from regnf_core.errors import DatasetError, MissingExtraError
-from regnf_data.recordings.camera import Array, Camera, camera_of_values
+from regnf_data.recordings.camera import Array, Camera, camera_of_values, depth_unit
 from regnf_data.recordings.folders import interpolated, poses_of
 from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, recording_of
 
@@ -51,9 +52,16 @@ class Bag:
             self.reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self.reader.open()
 
-    def errors(self) -> _Errors:
+    @contextmanager
+    def errors(self) -> Iterator[None]:
         """Turns whatever the library raises of a broken file into DatasetError (DATASET_BAG_INVALID)."""
-        return _Errors(self.name)
+        try:
+            yield
+        except DatasetError:
+            raise
+        except Exception as error:
+            told = re.sub(r"(/[^\s/]+)+/", "", str(error))  # paths of this machine are nobody's business
+            raise DatasetError(f"{self.name} cannot be read as a bag: {told}"[:400], reason=_INVALID) from error
 
     def of_type(self, *types: str) -> list[Any]:
         """The connections whose messages are of one of the types."""
@@ -66,6 +74,11 @@ class Bag:
         with self.errors():
             for connection, time, raw in self.reader.messages(connections, start, stop):
                 yield connection, time, self.reader.deserialize(raw, connection.msgtype)
+
+    def first(self, connection: Any | None) -> Any:
+        """The first message of a connection, if there is one."""
+        found = () if connection is None else self.messages([connection])
+        return next((message for _, _, message in found), None)
 
     def at(self, connection: Any, time: int) -> Any:
         """The message of a time. Raises DatasetError (DATASET_BAG_INVALID) where the bag lost it."""
@@ -85,16 +98,8 @@ class Bag:
             self.reader.close()
 
 
-class _Errors:
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, Exception) and not isinstance(error, DatasetError):
-            raise DatasetError(f"{self._name} cannot be read as a bag: {error}"[:400], reason=_INVALID) from error
+def _numbers(place: Any, turn: Any) -> tuple[float, ...]:
+    return place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
 
 
 @dataclass
@@ -105,6 +110,10 @@ class Link:
     static: bool
     stamps: list[float] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, stamp: Any, place: Any, turn: Any) -> None:
+        self.stamps.append(stamp.sec + 1e-9 * stamp.nanosec)
+        self.values.append(_numbers(place, turn))
 
     def at(self, stamps: Array) -> list[Array | None]:
         """T_parent_child at each of the times; None where none is near."""
@@ -122,19 +131,25 @@ def read_bag(path: Path, given: Given) -> Recording:
     Raises DatasetError: DATASET_BAG_INVALID, DATASET_DEPTH_MISSING, DATASET_INTRINSICS_INVALID, ...
     """
     bag = Bag(path)
-    depth, notes = _depth_topic(bag)
+    with bag.errors():
+        return _recording(bag, path.name, given)
+
+
+def _recording(bag: Bag, name: str, given: Given) -> Recording:
+    depth, notes = _depth_topic(bag, (given.layout or "").partition(":")[2])
     stamps, times, frame_id = _stamps(bag, depth)
+    unit = given.depth_unit or _unit(bag, depth.topic)
     info = _info_of(bag, depth)
     camera = given.camera or (_camera(info, depth.topic) if info is not None else None)
     if camera is None:
         raise DatasetError(
-            f"{path.name}: {depth.topic} has no CameraInfo beside it: give --intrinsics fx,fy,cx,cy",
+            f"{name}: {depth.topic} has no CameraInfo beside it: give --intrinsics fx,fy,cx,cy",
             reason="DATASET_INTRINSICS_INVALID",
         )
     poses, how = _poses(bag, frame_id, stamps)
     notes.append(how)
     color = _color_topic(bag, depth)
-    color_times, color_camera, same = _color_side(bag, color, depth)
+    color_times, color_camera, same = _color_side(bag, color, frame_id)
     if color is not None and not same:
         notes.append(f"{color.topic} is taken as seen from the depth camera's place")
     frames: list[StoredFrame | None] = []
@@ -147,37 +162,56 @@ def read_bag(path: Path, given: Given) -> Recording:
             nearest = int(np.abs(color_times[0] - stamp).argmin())
             if abs(color_times[0][nearest] - stamp) <= _NEAREST_S:
                 picture = _color_reader(bag, color, int(color_times[1][nearest]))
-        reader = _depth_reader(bag, depth, time, given.depth_unit)
+        reader = _depth_reader(bag, depth, time, unit)
         frames.append(StoredFrame(f"{index:06d}", camera, pose, reader, picture, color_camera))
-    return recording_of(path.name, f"a ROS bag, {depth.topic}", frames, notes)
+    return recording_of(name, f"a ROS bag, {depth.topic}", frames, notes)
 
 
-def _depth_topic(bag: Bag) -> tuple[Any, list[str]]:
-    """The topic of depth images: by its encoding; those registered to the color first."""
-    found = []
+def _depth_topic(bag: Bag, wanted: str) -> tuple[Any, list[str]]:
+    """The topic of depth images: by its encoding; those registered to the color first. wanted: its name, or nothing.
+
+    Raises DatasetError (DATASET_DEPTH_MISSING, DATASET_TOPIC_AMBIGUOUS) naming the topics.
+    """
+    found: dict[str, tuple[Any, str]] = {}
     for connection in bag.of_type(_IMAGE, _COMPRESSED):
-        for _, _, message in bag.messages([connection]):
-            coding = message.encoding if connection.msgtype == _IMAGE else message.format
-            if coding in ("16UC1", "mono16", "32FC1") or "compressedDepth" in coding:
-                found.append(connection)
-            break
-    if not found:
-        listed = ", ".join(sorted({f"{each.topic} ({each.msgtype})" for each in bag.reader.connections})[:12])
+        message = bag.first(connection)
+        if message is not None and _is_depth(connection.msgtype, message):
+            found[connection.topic] = connection, message.header.frame_id or connection.topic.rsplit("/", 1)[0]
+    if not found or (wanted and wanted not in found):
+        listed = ", ".join(sorted(found or {f"{each.topic} ({each.msgtype})" for each in bag.reader.connections})[:12])
+        what = f"depth images on {wanted[:100]}" if wanted else "depth images (16UC1, 32FC1 or compressedDepth)"
         raise DatasetError(
-            f"{bag.name} has no depth images (16UC1, 32FC1 or compressedDepth). It has {listed or 'no messages'}",
-            reason="DATASET_DEPTH_MISSING",
+            f"{bag.name} has no {what}. It has {listed or 'no messages'}", reason="DATASET_DEPTH_MISSING"
         )
 
-    def rank(connection: Any) -> tuple[bool, bool, bool, int, str]:
-        topic = connection.topic
-        aligned = "aligned" in topic or "registered" in topic
-        return ("depth" not in topic, not aligned, "infra" in topic, -connection.msgcount, topic)
+    def rank(topic: str) -> tuple[bool, bool, bool]:
+        lower = topic.lower()
+        return ("depth" not in lower, "aligned" not in lower and "registered" not in lower, "infra" in lower)
 
-    found.sort(key=rank)
-    notes = [f"depth is {found[0].topic}"]
-    if len(found) > 1:
-        notes.append(f"not used: {', '.join(each.topic for each in found[1:])}")
-    return found[0], notes
+    topics = sorted(found, key=lambda topic: (rank(topic), -found[topic][0].msgcount, topic))
+    best = wanted or topics[0]
+    others = [topic for topic in topics if topic != best]
+    alike = [topic for topic in others if rank(topic) == rank(best) and found[topic][1] != found[best][1]]
+    if alike and not wanted:
+        raise DatasetError(
+            f"{bag.name} has depth images of several cameras: {', '.join([best, *alike])}",
+            reason="DATASET_TOPIC_AMBIGUOUS",
+            hint=f"Choose one: --layout rosbag2:{best}",
+        )
+    return found[best][0], [f"depth is {best}"] + ([f"not used: {', '.join(others)}"] if others else [])
+
+
+def _is_depth(kind: str, message: Any) -> bool:
+    if kind == _IMAGE:
+        return message.encoding in ("16UC1", "mono16", "32FC1")
+    return "compressedDepth" in message.format or message.format.startswith(("16UC1", "mono16"))
+
+
+def _unit(bag: Bag, topic: str) -> float | None:
+    """Meters a step, as bags of RealSense's own recorder say it beside their images."""
+    options = [each for each in bag.of_type("std_msgs/msg/Float32") if "depth_units" in each.topic.lower()]
+    message = bag.first(_near_topic(topic, options))
+    return None if message is None else depth_unit(float(message.data))
 
 
 def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
@@ -192,7 +226,7 @@ def _stamps(bag: Bag, connection: Any) -> tuple[Array, list[int], str]:
                 frame = first.header.frame_id
         # The header comes first: CDR has 4 bytes before it, ROS 1 a counter.
         seconds, nanoseconds = struct.unpack_from("<iI", raw, 4)
-        stamps.append(seconds + 1e-9 * nanoseconds)
+        stamps.append(seconds + 1e-9 * nanoseconds if seconds or nanoseconds else 1e-9 * time)
         times.append(time)
     return np.array(stamps), times, frame.lstrip("/")
 
@@ -210,10 +244,7 @@ def _near_topic(topic: str, connections: Sequence[Any]) -> Any | None:
 
 def _info_of(bag: Bag, image: Any) -> Any | None:
     """The first CameraInfo beside a topic of images."""
-    connection = _near_topic(image.topic, bag.of_type(_INFO))
-    for _, _, message in bag.messages([connection]) if connection is not None else ():
-        return message
-    return None
+    return bag.first(_near_topic(image.topic, bag.of_type(_INFO)))
 
 
 def _camera(info: Any, topic: str) -> Camera:
@@ -236,22 +267,14 @@ def _camera(info: Any, topic: str) -> Camera:
 def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str]:
     """T_world_camera at the times, and where from."""
     links = _links(bag)
-    chain: list[Link] = []
-    at = frame
-    while at in links and len(chain) < _LONGEST_CHAIN:
-        chain.append(links[at])
-        at = links[at].parent
+    chain, at = _chain(links, frame)
     if any(not link.static for link in chain):
         return _chained(chain, stamps), f"poses are tf's, from {at!r} to {frame!r}"
     odometry = bag.of_type(*_POSES)
     if odometry:
         best = max(odometry, key=lambda each: (each.msgtype == _POSES[0], each.msgcount))
         body, child = _odometry(bag, best)
-        below: list[Link] = []
-        at = frame
-        while at in links and at != child and len(below) < _LONGEST_CHAIN:
-            below.append(links[at])
-            at = links[at].parent
+        below, at = _chain(links, frame, child)
         if child and at != child:
             below = []
         return _chained([*below, body], stamps), f"poses are those of {best.topic}" + (
@@ -264,6 +287,15 @@ def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str
     return [np.eye(4) for _ in stamps], "the bag has no poses: use one frame at a time"
 
 
+def _chain(links: dict[str, Link], frame: str, top: str | None = None) -> tuple[list[Link], str]:
+    """The links from a frame up to ``top``, or as far as they go, and the frame at their end."""
+    chain: list[Link] = []
+    while frame in links and frame != top and len(chain) < _LONGEST_CHAIN:
+        chain.append(links[frame])
+        frame = links[frame].parent
+    return chain, frame
+
+
 def _links(bag: Bag) -> dict[str, Link]:
     links: dict[str, Link] = {}
     connections = bag.of_type(_TF)
@@ -273,9 +305,7 @@ def _links(bag: Bag) -> dict[str, Link]:
             child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
             link = links.setdefault(child, Link(parent, static))
             link.static &= static
-            place, turn = each.transform.translation, each.transform.rotation
-            link.stamps.append(each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec)
-            link.values.append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+            link.add(each.header.stamp, each.transform.translation, each.transform.rotation)
     return links
 
 
@@ -286,11 +316,8 @@ def _odometry(bag: Bag, connection: Any) -> tuple[Link, str]:
         while hasattr(pose, "pose"):
             pose = pose.pose
         child = getattr(message, "child_frame_id", "").lstrip("/")
-        place, turn = pose.position, pose.orientation
-        values = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
-        if all(map(math.isfinite, values)):
-            link.stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-            link.values.append(values)
+        if all(map(math.isfinite, _numbers(pose.position, pose.orientation))):
+            link.add(message.header.stamp, pose.position, pose.orientation)
     if not link.values:
         raise DatasetError(f"{bag.name}: {connection.topic} has no pose of finite numbers", reason="DATASET_NO_FRAMES")
     return link, child
@@ -327,8 +354,10 @@ def _meters(stored: NDArray[Any], unit: float) -> NDArray[np.float32]:
 
 
 def _compressed_depth(message: Any, name: str, unit: float) -> NDArray[np.float32]:
-    """A PNG behind 12 bytes; 32FC1 holds inverse depths: a / (value - b)."""
+    """A PNG, by compressedDepth behind 12 bytes; 32FC1 holds inverse depths: a / (value - b)."""
     data = bytes(message.data)
+    if "compressedDepth" not in message.format:
+        data = bytes(_DEPTH_HEAD.size) + data
     if "rvl" in message.format.lower() or len(data) < _DEPTH_HEAD.size:
         raise DatasetError(
             f"{name}: depth compressed as {message.format!r:.60} is not read", reason="DATASET_IMAGE_INVALID"
@@ -383,23 +412,20 @@ def _color_topic(bag: Bag, depth: Any) -> Any | None:
     for connection in bag.of_type(_IMAGE, _COMPRESSED):
         if connection.topic == depth.topic:
             continue
-        for _, _, message in bag.messages([connection]):
-            coding = message.encoding if connection.msgtype == _IMAGE else message.format
-            if coding in ("rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "8UC4") or (
-                ("jpeg" in coding or "png" in coding) and "Depth" not in coding
-            ):
-                found.append(connection)
-            break
+        message = bag.first(connection)
+        coding = "" if message is None else message.encoding if connection.msgtype == _IMAGE else message.format
+        is_file = ("jpeg" in coding or "png" in coding) and "Depth" not in coding
+        if is_file or coding in ("rgb8", "bgr8", "rgba8", "bgra8", "8UC3", "8UC4"):
+            found.append(connection)
     return _near_topic(depth.topic, found)
 
 
-def _color_side(bag: Bag, color: Any | None, depth: Any) -> tuple[tuple[Array, Array], Camera | None, bool]:
+def _color_side(bag: Bag, color: Any | None, depth_frame: str) -> tuple[tuple[Array, Array], Camera | None, bool]:
     """Stamps and bag times of the color images, their camera, and whether it is the depth camera's own place."""
     if color is None:
         return (np.zeros(0), np.zeros(0)), None, True
     stamps, times, frame = _stamps(bag, color)
     info = _info_of(bag, color)
-    _, _, depth_frame = next(((0, 0, m.header.frame_id.lstrip("/")) for _, _, m in bag.messages([depth])), (0, 0, ""))
     return (stamps, np.array(times)), None if info is None else _camera(info, color.topic), frame == depth_frame
 
 

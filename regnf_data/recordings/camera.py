@@ -22,10 +22,14 @@ Size = tuple[int, int]
 Lens = Literal["none", "brown", "fisheye"]
 """none: a pinhole · brown: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 · fisheye: OpenCV's four, of the angle from the axis."""
 
+HALF_A_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+"""Added to intrinsics of writers that take pixel centers to lie at whole numbers."""
 _INVALID = "DATASET_INTRINSICS_INVALID"
 _MOST_BYTES = 1 << 20
 _FOCAL = 0.05, 50.0
 """Focal lengths over the image's width that some lens has."""
+_OFF_MIDDLE = 0.9
+"""Of half of an image: intrinsics of images twice as large have their principal point at the border, give or take."""
 _CENTRAL = 0.25
 """Of half of an image's side: how far its principal point may be from its middle."""
 _UNITS_M = 1e-5, 0.01
@@ -56,18 +60,21 @@ class Camera:
             return replace(self, size=size)
         down, across = size[0] / self.size[0], size[1] / self.size[1]
         if abs(math.log(down / across)) > 0.02:
+            turned = "are its width and height exchanged?" if self.size == size[::-1] else "not the same shape"
             raise DatasetError(
                 f"{name}: the image has {size[1]} x {size[0]} pixels (width x height), its camera"
-                f" {self.size[1]} x {self.size[0]}: not the same shape",
+                f" {self.size[1]} x {self.size[0]}: {turned}",
                 reason=_INVALID,
             )
         return replace(self, K=np.diag([across, down, 1.0]) @ self.K, size=size)
 
+    def off_middle(self, size: Size) -> float:
+        """How far the principal point lies from the middle of images of a size: 1 at their border."""
+        return float(np.abs(2.0 * self.K[:2, 2] / size[::-1] - 1.0).max())
+
     def is_central(self, size: Size) -> bool:
         """Whether the principal point is near the middle of images of this size, as lenses are mounted."""
-        height, width = size
-        off = np.abs(2.0 * self.K[:2, 2] / (width, height) - 1.0)
-        return bool(off.max() <= _CENTRAL)
+        return self.off_middle(size) <= _CENTRAL
 
     def rays(self, pixels: Array) -> Array:
         """(P, 3): directions through image points (P, 2) of a camera without a lens; their z is 1."""
@@ -114,10 +121,10 @@ class Camera:
                 raise DatasetError(
                     f"{name}: focal lengths of {K[0, 0]:g}, {K[1, 1]:g} for {width} x {height}", reason=_INVALID
                 )
-            if not (0.0 <= K[0, 2] <= width and 0.0 <= K[1, 2] <= height):
+            if self.off_middle(self.size) > _OFF_MIDDLE:
                 raise DatasetError(
-                    f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is outside the image, {width} x {height}:"
-                    " are the intrinsics those of another resolution?",
+                    f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is not inside the image, {width} x"
+                    f" {height}: are the intrinsics those of another resolution?",
                     reason=_INVALID,
                 )
             self._check_lens(name)
@@ -164,11 +171,17 @@ class Camera:
 
 
 def camera_of(
-    fx: float, fy: float, cx: float, cy: float, size: Size | None = None, whole_centers: bool = False
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    size: Size | None = None,
+    lens: tuple[Lens, tuple[float, ...]] = ("none", ()),
+    whole_centers: bool = False,
 ) -> Camera:
-    """A pinhole. whole_centers: its writer takes a pixel's center to lie at whole numbers, as OpenCV does."""
-    shift = 0.5 if whole_centers else 0.0
-    return Camera(np.array([[fx, 0.0, cx + shift], [0.0, fy, cy + shift], [0.0, 0.0, 1.0]]), size)
+    """Of numbers in pixels. whole_centers: a pixel's center lies at whole numbers for its writer, as for OpenCV."""
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return Camera(K + HALF_A_PIXEL if whole_centers else K, size, *lens)
 
 
 # Files of intrinsics. Writers of sensors take pixel centers to lie at whole numbers.
@@ -211,9 +224,12 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             width, height = _first(each, "width", "w", "image_width"), _first(each, "height", "h", "image_height")
             size = (int(height), int(width)) if width and height else None
             lens, coefficients = _lens(each, name)
-            K = found + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+            K = found + HALF_A_PIXEL
             camera = Camera(K, size, lens, coefficients).check(name)
             unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            if unit is None and each.get("depth_unit") is not None:
+                told = f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters a step, such as 0.001"
+                raise DatasetError(told, reason=_INVALID)
             return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
 
@@ -320,11 +336,8 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
         matrix = np.array(rows[0]).reshape(3, 3)
     elif len(rows) == 1 and 4 <= len(rows[0]) <= 12:
         fx, fy, cx, cy = rows[0][:4]
-        lens, coefficients = lens_of(rows[0][4:], False, name)
-        return CameraFile(
-            replace(camera_of(fx, fy, cx, cy, whole_centers=True), lens=lens, distortion=coefficients).check(name)
-        )
+        lens = lens_of(rows[0][4:], False, name)
+        return CameraFile(camera_of(fx, fy, cx, cy, None, lens, whole_centers=True).check(name))
     else:
         return None
-    matrix = matrix + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    return CameraFile(Camera(matrix).check(name))
+    return CameraFile(Camera(matrix + HALF_A_PIXEL).check(name))

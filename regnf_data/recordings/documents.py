@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
-from regnf_data.recordings.camera import Array, Camera, camera_of, lens_of
+from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, camera_of, lens_of
 from regnf_data.recordings.folders import (
     _COLOR_FOLDERS,
     _COLORS,
@@ -24,10 +25,11 @@ from regnf_data.recordings.folders import (
     _first_file,
     _lines,
     _subfolder,
+    frame_of,
     poses_of,
     read_json,
 )
-from regnf_data.recordings.recording import Recording, StoredFrame, color_file, depth_file, pose_of, recording_of
+from regnf_data.recordings.recording import MOST_PIXELS, Recording, StoredFrame, checked_size, pose_of, recording_of
 from regnf_data.sdfstudio import resolve
 
 if TYPE_CHECKING:
@@ -86,11 +88,8 @@ def read_bop(folder: Path, given: Given) -> Recording:
         else:
             unplaced += 1
         depth = _first_file(depths, (name, key), _DEPTHS)
-        if pose is None or depth is None:
-            frames.append(None)
-            continue
         color = _first_file(colors, (name, key), _COLORS) if colors else None
-        frames.append(StoredFrame(name, camera, pose, depth_file(depth, unit), color_file(color) if color else None))
+        frames.append(frame_of(name, camera, pose, depth, unit, color))
     notes = []
     if unplaced and len(cameras) > 1:
         notes.append(f"{unplaced} of {len(cameras)} frames have no pose in a common world: use one frame at a time")
@@ -102,8 +101,7 @@ def _bop_camera(values: Mapping[str, Any], name: str) -> Camera:
         K = np.array(values.get("cam_K"), np.float64).reshape(3, 3)
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{name}: cam_K is not nine numbers", reason=_INTRINSICS) from error
-    shift = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    return Camera(K + shift).check(name)
+    return Camera(K + HALF_A_PIXEL).check(name)
 
 
 # nerfstudio: transforms.json with frames; its cameras look against z, y is up; pixel centers at one half.
@@ -144,17 +142,13 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
         if pose is None or depth is None:
             frames.append(None)
             continue
-        camera = given.camera or _nerfstudio_camera({**values, **each}, name)
         color = _color_path(folder, each.get("file_path"))
-        frames.append(
-            StoredFrame(
-                name,
-                camera,
-                pose @ _OPENGL,
-                depth_file(resolve(folder, depth, f"depth_file_path of {name}"), unit),
-                color_file(color) if color else None,
-            )
-        )
+        stated = {**values, **each}
+        if given.camera is None and color is not None and not ("w" in stated and "h" in stated):
+            stated["h"], stated["w"] = checked_size(color)
+        camera = given.camera or _nerfstudio_camera(stated, name)
+        image = resolve(folder, depth, f"depth_file_path of {name}")
+        frames.append(frame_of(name, camera, pose @ _OPENGL, image, unit, color))
     return recording_of(path.name, "nerfstudio", frames)
 
 
@@ -170,13 +164,16 @@ def _color_path(folder: Path, name: Any) -> Path | None:
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
+def _unsupported(name: str, model: str) -> DatasetError:
+    said = f"{name}: cameras of the model {model[:40]} are not modeled"
+    return DatasetError(said, reason="DATASET_CAMERA_UNSUPPORTED")
+
+
 def _nerfstudio_camera(values: Mapping[str, Any], name: str) -> Camera:
     model = str(values.get("camera_model", "OPENCV"))
     fisheye = model == "OPENCV_FISHEYE"
     if model not in _PINHOLES and not fisheye:
-        raise DatasetError(
-            f"{name}: cameras of the model {model[:40]} are not modeled", reason="DATASET_CAMERA_UNSUPPORTED"
-        )
+        raise _unsupported(name, model)
     try:
         width, height = (int(values[key]) if key in values else None for key in ("w", "h"))
         if "fl_x" in values:
@@ -191,13 +188,13 @@ def _nerfstudio_camera(values: Mapping[str, Any], name: str) -> Camera:
             for key, side in (("cx", width or 0), ("cy", height or 0))
         )
         keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        lens, coefficients = lens_of([float(values.get(key, 0.0) or 0.0) for key in keys], fisheye, name)
+        lens = lens_of([float(values.get(key, 0.0) or 0.0) for key in keys], fisheye, name)
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(
             f"{name}: the camera needs fl_x, fl_y, cx, cy, w and h as numbers: {error}", reason=_INTRINSICS
         ) from error
     size = (height, width) if width and height else None
-    return replace(camera_of(fx, fy, cx, cy, size), lens=lens, distortion=coefficients).check(name)
+    return camera_of(fx, fy, cx, cy, size, lens).check(name)
 
 
 # sdfstudio: meta_data.json. The reader of fits knows it; frames of it are read one at a time here.
@@ -228,15 +225,9 @@ def read_sdfstudio(folder: Path, given: Given) -> Recording:
             continue
         camera = given.camera or Camera(sdfstudio.intrinsics_of_frame(each, metadata, index), size).check(name)
         color = each.get("rgb_path")
-        frames.append(
-            StoredFrame(
-                name,
-                camera,
-                pose,
-                depth_file(resolve(folder, depth, f"sensor_depth_path of {name}"), unit),
-                color_file(resolve(folder, color, f"rgb_path of {name}")) if color else None,
-            )
-        )
+        picture = resolve(folder, color, f"rgb_path of {name}") if color else None
+        image = resolve(folder, depth, f"sensor_depth_path of {name}")
+        frames.append(frame_of(name, camera, pose, image, unit, picture))
     scale = None if T_metric_world is None else np.cbrt(np.linalg.det(T_metric_world[:3, :3]))
     is_metric = scale is not None and abs(scale - 1.0) < _METRIC
     return recording_of(folder.name, "sdfstudio", frames, (), T_metric_world, is_metric)
@@ -282,41 +273,33 @@ def read_colmap(folder: Path, given: Given) -> Recording:
         pose = np.linalg.inv(poses_of(place[None], quaternion[None], name)[0])
         path = PurePosixPath(name)
         depth = _first_file(depths, (str(path.with_suffix("")), name), _DEPTHS)
-        dense = next(
-            (p for p in (depths / f"{name}.{kind}.bin" for kind in ("geometric", "photometric")) if p.is_file()), None
-        )
-        if depth is None and dense is None:
-            frames.append(None)
-            continue
-        color = colors / name if colors and (colors / name).is_file() else None
-        is_dense |= depth is None
-        reader = depth_file(depth, unit) if depth is not None else _dense(dense)
-        frames.append(
-            StoredFrame(name, given.camera or cameras[number], pose, reader, color_file(color) if color else None)
-        )
+        dense = (depths / f"{name}.{kind}.bin" for kind in ("geometric", "photometric"))
+        depth = depth or next((path for path in dense if path.is_file()), None)
+        color = None if colors is None or depth is None else _color_path(colors, name)
+        frame = frame_of(name, given.camera or cameras[number], pose, depth, unit, color)
+        if frame is not None and depth is not None and depth.suffix == ".bin":
+            is_dense, frame = True, replace(frame, depth=partial(_dense, depth))
+        frames.append(frame)
     return recording_of(folder.name, "COLMAP with depth", frames, is_metric=not is_dense)
 
 
-def _dense(path: Path | None) -> Any:
-    """Reads COLMAP's own array: width&height&channels& and float32."""
-    assert path is not None
-
-    def read() -> NDArray[np.float32]:
-        try:
-            with path.open("rb") as file:
-                head = b""
-                while head.count(b"&") < 3 and len(head) < 64:
-                    head += file.read(1)
-                width, height, channels = (int(part) for part in head.split(b"&")[:3])
-                values = np.fromfile(file, np.float32, width * height * channels)
-                depth = values.reshape(height, width) if channels == 1 else None
-        except ValueError as error:
-            raise DatasetError(f"{path.name} is no depth map of COLMAP", reason="DATASET_IMAGE_INVALID") from error
-        if depth is None:
-            raise DatasetError(f"{path.name} has {channels} channels", reason="DATASET_IMAGE_INVALID")
-        return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
-
-    return read
+def _dense(path: Path) -> NDArray[np.float32]:
+    """COLMAP's own array: width&height&channels& and float32."""
+    try:
+        with path.open("rb") as file:
+            head = b""
+            while head.count(b"&") < 3 and len(head) < 64:
+                head += file.read(1)
+            width, height, channels = (int(part) for part in head.split(b"&")[:3])
+            if not 0 < width * height <= MOST_PIXELS:
+                raise ValueError(f"{width} x {height} pixels")
+            values = np.fromfile(file, np.float32, width * height * channels)
+            depth = values.reshape(height, width) if channels == 1 else None
+    except ValueError as error:
+        raise DatasetError(f"{path.name} is no depth map of COLMAP: {error}", reason="DATASET_IMAGE_INVALID") from error
+    if depth is None:
+        raise DatasetError(f"{path.name} has {channels} channels", reason="DATASET_IMAGE_INVALID")
+    return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
 
 
 # Parameters: f (or fx fy) cx cy, then the lens, in OpenCV's order.
@@ -330,15 +313,12 @@ _COLMAP_MODELS = {
 def _colmap_camera(model: str, size: tuple[int, int], numbers: list[float], name: str) -> Camera:
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
     if model in ("FOV", "THIN_PRISM_FISHEYE") or model not in {each for each, _ in _COLMAP_MODELS.values()}:
-        raise DatasetError(
-            f"{name}: cameras of the model {model[:40]} are not modeled", reason="DATASET_CAMERA_UNSUPPORTED"
-        )
+        raise _unsupported(name, model)
     fx, fy, cx, cy = (numbers[0], *numbers[:3]) if single else numbers[:4]
     rest = numbers[3:] if single else numbers[4:]
     if model in ("SIMPLE_RADIAL", "RADIAL", "OPENCV"):
         rest = [*rest, 0.0, 0.0, 0.0, 0.0][:4]
-    lens, coefficients = lens_of(rest, "FISHEYE" in model, name)
-    return replace(camera_of(fx, fy, cx, cy, size), lens=lens, distortion=coefficients).check(name)
+    return camera_of(fx, fy, cx, cy, size, lens_of(rest, "FISHEYE" in model, name)).check(name)
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:

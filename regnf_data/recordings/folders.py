@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from regnf_core.errors import DatasetError
@@ -64,16 +63,9 @@ def _tum_poses(folder: Path) -> Path | None:
 
 def read_tum(folder: Path, given: Given) -> Recording:
     """Poses between time stamps are interpolated."""
-    notes: list[str] = []
-    found = camera_beside(folder)
-    camera = given.camera or (found.camera if found else None)
-    if camera is None:
-        published = next((value for part, value in _TUM_CAMERAS.items() if part in folder.resolve().name), None)
-        if published is None:
-            raise no_intrinsics(folder.name)
-        camera = camera_of(*published, size=(480, 640), whole_centers=True)
-        notes.append("the folder has no intrinsics: those that the benchmark publishes for it are taken")
-    unit = given.depth_unit or (found.depth_unit if found else None) or _TUM_STEP_M
+    published = next((value for part, value in _TUM_CAMERAS.items() if part in folder.resolve().name), None)
+    note = "the folder has no intrinsics: those that the benchmark publishes for it are taken"
+    camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _TUM_STEP_M, published, note)
     depths, colors = _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
     color_stamps = np.array([stamp for stamp, _ in colors])
     wanted = np.array([stamp for stamp, _ in depths])
@@ -88,26 +80,24 @@ def read_tum(folder: Path, given: Given) -> Recording:
         )
     frames: list[StoredFrame | None] = []
     for (stamp, name), pose in zip(depths, placed, strict=True):
-        path = folder / name
-        if pose is None or not path.is_file():
-            frames.append(None)
-            continue
         color = None
         if len(color_stamps):
             nearest = int(np.abs(color_stamps - stamp).argmin())
             beside = folder / colors[nearest][1]
             if abs(color_stamps[nearest] - stamp) <= _MOST_APART_S and beside.is_file():
-                color = color_file(beside)
-        frames.append(StoredFrame(Path(name).stem, camera, pose, depth_file(path, unit), color))
+                color = beside
+        depth = folder / name
+        frames.append(frame_of(Path(name).stem, camera, pose, depth if depth.is_file() else None, unit, color))
     return recording_of(folder.name, "TUM RGB-D", frames, notes)
 
 
 def _tum_list(path: Path) -> list[tuple[float, str]]:
     found = []
     for line in _lines(path) if path.is_file() else ():
-        words = line.split()
-        if len(words) >= 2:
-            found.append((_number(words[0], path.name), words[1]))
+        words = line.split(maxsplit=1)
+        if len(words) == 2:
+            stamp = _number(words[0], path.name)
+            found.append((1e-9 * stamp if stamp > _NANOSECONDS else stamp, words[1]))
     return found
 
 
@@ -116,7 +106,7 @@ def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
 
     Also as EuRoC has it (ns, p, q w first, and more), and as KITTI does (12 numbers a line, in the images' order).
     """
-    rows = [[_number(word, path.name) for word in line.replace(",", " ").split()] for line in _lines(path)]
+    rows = matrix_file(path)
     lengths = {len(row) for row in rows}
     if lengths in ({12}, {16}) and len(rows) == len(wanted):
         found = [pose_of(row, path.name) for row in rows]
@@ -129,7 +119,7 @@ def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
         expected = "lines of t tx ty tz qx qy qz qw, or 12 numbers for each depth image"
         raise DatasetError(f"{path.name}: expected {expected}", reason=_INVALID)
     values = np.array(rows)
-    values = values[np.isfinite(values).all(axis=1)]
+    values = values[np.isfinite(values).all(axis=1) & values[:, 4:].any(axis=1)]  # zeros: a tracker was lost
     values = values[np.argsort(values[:, 0], kind="stable")]
     if not len(values):
         raise DatasetError(f"{path.name}: no pose has finite numbers", reason="DATASET_NO_FRAMES")
@@ -140,8 +130,10 @@ def poses_of(places: Array, quaternions: Array, name: str) -> Array:
     """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w. Raises DatasetError (DATASET_POSE_NOT_RIGID)."""
     from scipy.spatial.transform import Rotation
 
-    if (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > 0.05).any():
-        raise DatasetError(f"{name}: a quaternion has not the length 1", reason="DATASET_POSE_NOT_RIGID")
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if (odd := np.flatnonzero(~(np.abs(lengths - 1.0) <= 0.05))).size:
+        said = f"{name}: the quaternion of pose {odd[0]} has the length {lengths[odd[0]]:.3g}, not 1"
+        raise DatasetError(said, reason="DATASET_POSE_NOT_RIGID")
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
     poses[:, :3, 3] = places
@@ -154,21 +146,16 @@ def interpolated(stamps: Array, poses: Array, wanted: Array) -> list[Array | Non
 
     keep = np.concatenate([[True], np.diff(stamps) > 0.0])
     stamps, poses = stamps[keep], poses[keep]
-    gaps = np.abs(stamps[None] - wanted[:, None]).min(axis=1) if len(wanted) * len(stamps) < 1 << 26 else None
-    if gaps is None:
-        right = np.clip(np.searchsorted(stamps, wanted), 1, max(len(stamps) - 1, 1)) if len(stamps) > 1 else 0
-        gaps = np.minimum(np.abs(stamps[right] - wanted), np.abs(stamps[np.maximum(right - 1, 0)] - wanted))
-    if len(stamps) == 1:
-        return [poses[0] if gap <= _MOST_APART_S else None for gap in gaps]
-    inside = np.clip(wanted, stamps[0], stamps[-1])
-    turns = Slerp(stamps, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
-    places = np.stack([np.interp(inside, stamps, poses[:, axis, 3]) for axis in range(3)], axis=1)
-    found: list[Array | None] = []
-    for turn, place, gap in zip(turns, places, gaps, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = turn, place
-        found.append(pose if gap <= _MOST_APART_S else None)
-    return found
+    after = np.searchsorted(stamps, wanted)
+    sides = stamps[np.maximum(after - 1, 0)], stamps[np.minimum(after, len(stamps) - 1)]
+    gaps = np.minimum(*(np.abs(side - wanted) for side in sides))
+    found = np.tile(poses[:1], (len(wanted), 1, 1))
+    if len(stamps) > 1:
+        inside = np.clip(wanted, stamps[0], stamps[-1])
+        found[:, :3, :3] = Slerp(stamps, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
+        for axis in range(3):
+            found[:, axis, 3] = np.interp(inside, stamps, poses[:, axis, 3])
+    return [pose if gap <= _MOST_APART_S else None for pose, gap in zip(found, gaps, strict=True)]
 
 
 # 7-Scenes, 3DMatch and others: frame-000000.depth.png, .color.png, .pose.txt in one folder.
@@ -183,28 +170,22 @@ def is_seven_scenes(path: Path) -> bool:
 
 def read_seven_scenes(folder: Path, given: Given) -> Recording:
     """Millimeters; the largest number stands for none; poses lead from the camera to the world."""
-    notes: list[str] = []
-    found = camera_beside(folder)
-    camera = given.camera or (found.camera if found else None)
-    if camera is None:
-        camera = camera_of(*_SEVEN_SCENES, size=(480, 640), whole_centers=True)
-        notes.append(
-            "the folder has no intrinsics: those that 7-Scenes publishes for it are taken (585, 585, 320, 240)"
-        )
-    unit = given.depth_unit or (found.depth_unit if found else None) or _MILLIMETER
+    note = "the folder has no intrinsics: those that 7-Scenes publishes for it are taken (585, 585, 320, 240)"
+    camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _MILLIMETER, _SEVEN_SCENES, note)
     frames = []
     for pose_file in sorted(folder.glob("*.pose.txt")):
         name = pose_file.name.removesuffix(".pose.txt")
         depth = _first_file(folder, (f"{name}.depth",), _DEPTHS)
         pose = pose_of(matrix_file(pose_file), name)
         color = _first_file(folder, (f"{name}.color", f"{name}.rgb"), _COLORS)
-        frames.append(_frame(name, camera, pose, depth, unit, color))
+        frames.append(frame_of(name, camera, pose, depth, unit, color))
     return recording_of(folder.name, "7-Scenes, 3DMatch", frames, notes)
 
 
 # Redwood and Open3D: depth/, color/ or image/, a trajectory.
 
 _DEPTH_FOLDERS = ("depth", "depths", "depth_images")
+_PRIMESENSE = 525.0, 525.0, 319.5, 239.5
 _COLOR_FOLDERS = ("color", "image", "rgb", "images", "colors")
 
 
@@ -224,13 +205,8 @@ def read_redwood(folder: Path, given: Given) -> Recording:
     depths = _subfolder(folder, _DEPTH_FOLDERS)
     if path is None or depths is None:
         raise DatasetError(f"{folder.name} has no depth/ or no trajectory", reason="DATASET_NO_METADATA")
-    found = camera_beside(folder)
-    camera = given.camera or (found.camera if found else None)
-    notes: list[str] = []
-    if camera is None:
-        camera = camera_of(525.0, 525.0, 319.5, 239.5, (480, 640), whole_centers=True)
-        notes.append("the folder has no intrinsics: those of the PrimeSense camera, Open3D's default, are taken")
-    unit = given.depth_unit or (found.depth_unit if found else None) or _MILLIMETER
+    note = "the folder has no intrinsics: those of the PrimeSense camera, Open3D's default, are taken"
+    camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _MILLIMETER, _PRIMESENSE, note)
     colors = _subfolder(folder, _COLOR_FOLDERS)
     poses = _redwood_poses(path)
     images = _in_order(depths, _DEPTHS)
@@ -243,35 +219,28 @@ def read_redwood(folder: Path, given: Given) -> Recording:
     frames = []
     for index, image in enumerate(images):
         pose = pose_of(poses[index], image.stem) if index in poses else None
-        frames.append(_frame(image.stem, camera, pose, image, unit, pictures[index] if matched else None))
+        frames.append(frame_of(image.stem, camera, pose, image, unit, pictures[index] if matched else None))
     return recording_of(folder.name, "Redwood, Open3D", frames, notes)
 
 
 def _redwood_poses(path: Path) -> dict[int, Any]:
+    poses: dict[int, Any] = {}
     if path.suffix == ".log":
         lines = list(_lines(path))
         if len(lines) % 5:
             raise DatasetError(f"{path.name}: expected five lines a pose", reason=_INVALID)
-        poses: dict[int, Any] = {}
         for at in range(0, len(lines), 5):
             number = int(_number(lines[at].split()[0], path.name))
             poses[number] = [[_number(word, path.name) for word in line.split()] for line in lines[at + 1 : at + 5]]
         return poses
     values = read_json(path)
-    nodes = values.get("nodes") if isinstance(values, dict) else None
-    if isinstance(nodes, list):  # Open3D's PoseGraph: matrices by columns
-        return {
-            index: np.array(node["pose"], np.float64).reshape(4, 4).T
-            for index, node in enumerate(nodes)
-            if "pose" in node
-        }
-    parameters = values.get("parameters") if isinstance(values, dict) else None
-    if isinstance(parameters, list):  # Open3D's PinholeCameraTrajectory: world to camera, by columns
-        return {
-            index: np.linalg.inv(np.array(each["extrinsic"], np.float64).reshape(4, 4).T)
-            for index, each in enumerate(parameters)
-            if "extrinsic" in each
-        }
+    # Open3D's PoseGraph, and its PinholeCameraTrajectory, world to camera: matrices by columns.
+    for key, member, inverse in (("nodes", "pose", False), ("parameters", "extrinsic", True)):
+        listed = values.get(key) if isinstance(values, dict) else None
+        if isinstance(listed, list):
+            found = {index: each[member] for index, each in enumerate(listed) if member in each}
+            poses = {index: np.array(each, np.float64).reshape(4, 4).T for index, each in found.items()}
+            return {index: np.linalg.inv(pose) for index, pose in poses.items()} if inverse else poses
     raise DatasetError(f"{path.name} has no poses that are known: nodes or parameters of Open3D", reason=_INVALID)
 
 
@@ -284,21 +253,17 @@ def is_scannet(path: Path) -> bool:
 
 def read_scannet(folder: Path, given: Given) -> Recording:
     """Millimeters; color and depth have cameras of their own; rows of -inf are lost frames."""
-    depths, colors = _subfolder(folder, _DEPTH_FOLDERS), _subfolder(folder, _COLOR_FOLDERS)
-    assert depths is not None
+    depths, colors = _subfolder(folder, _DEPTH_FOLDERS) or folder / "depth", _subfolder(folder, _COLOR_FOLDERS)
     found = _named_camera(folder, "intrinsic_depth") or camera_beside(folder)
-    camera = given.camera or (found.camera if found else None)
-    if camera is None:
-        raise no_intrinsics(folder.name)
+    camera, unit, _ = _camera_of(folder.name, found, given, _MILLIMETER)
     of_color = _named_camera(folder, "intrinsic_color")
-    unit = given.depth_unit or (found.depth_unit if found else None) or _MILLIMETER
     frames = []
     for pose_file in sorted((folder / "pose").glob("*.txt"), key=_order):
         name = pose_file.stem
         depth = _first_file(depths, (name,), _DEPTHS)
         color = _first_file(colors, (name,), _COLORS) if colors else None
         pose = pose_of(matrix_file(pose_file), name)
-        frames.append(_frame(name, camera, pose, depth, unit, color, of_color.camera if of_color else None))
+        frames.append(frame_of(name, camera, pose, depth, unit, color, of_color.camera if of_color else None))
     return recording_of(folder.name, "ScanNet, extracted", frames)
 
 
@@ -317,21 +282,18 @@ def is_replica(path: Path) -> bool:
 def read_replica(folder: Path, given: Given) -> Recording:
     """A line of traj.txt is a pose to the world, 16 numbers. The intrinsics lie in the folder or the one above it."""
     found = camera_beside(folder) or camera_beside(folder.resolve().parent)
-    camera = given.camera or (found.camera if found else None)
-    if camera is None:
-        raise no_intrinsics(folder.name)
-    unit = given.depth_unit or (found.depth_unit if found else None) or 1.0 / 6553.5
+    camera, unit, _ = _camera_of(folder.name, found, given, 1.0 / 6553.5)
     images = _in_order(folder / "results", _DEPTHS, "depth")
-    lines = list(_lines(folder / "traj.txt"))
-    if len(lines) != len(images):
+    poses = matrix_file(folder / "traj.txt")
+    if len(poses) != len(images):
         raise DatasetError(
-            f"traj.txt has {len(lines)} poses, results {len(images)} depth images", reason="DATASET_SIZES_DIFFER"
+            f"traj.txt has {len(poses)} poses, results {len(images)} depth images", reason="DATASET_SIZES_DIFFER"
         )
     frames = []
-    for line, image in zip(lines, images, strict=True):
-        pose = pose_of([_number(word, "traj.txt") for word in line.split()], image.stem)
+    for row, image in zip(poses, images, strict=True):
+        pose = pose_of(row, image.stem)
         color = _first_file(folder / "results", (image.stem.replace("depth", "frame"),), _COLORS)
-        frames.append(_frame(image.stem, camera, pose, image, unit, color))
+        frames.append(frame_of(image.stem, camera, pose, image, unit, color))
     return recording_of(folder.name, "Replica (NICE-SLAM)", frames)
 
 
@@ -373,19 +335,14 @@ def read_frame(path: Path, given: Given) -> Recording:
     depth, color = files
     folder = path if path.is_dir() else path.parent
     found = camera_beside(folder) if path.is_dir() or given.camera is None else None
-    camera = given.camera or (found.camera if found else None)
-    if camera is None:
-        raise no_intrinsics(path.name)
-    notes = []
-    unit = given.depth_unit or (found.depth_unit if found else None)
-    if unit is None:
-        unit = _MILLIMETER
-        if depth.suffix.lower() != ".npy":
-            notes.append("no file says the depth's unit: millimeters are taken")
+    camera, unit, _ = _camera_of(path.name, found, given, _MILLIMETER)
+    stated = given.depth_unit or (found and found.depth_unit)
+    whole = depth.suffix.lower() != ".npy"
+    notes = ["no file says the depth's unit: millimeters are taken"] if whole and not stated else []
     # A camera file of the color image's resolution is scaled to the depth image's.
     size = checked_size(depth)
     pose = np.eye(4) if found is None or found.pose is None else pose_of(found.pose, "T_world_camera")
-    frame = _frame(depth.stem, camera.of_size(size, depth.name), pose, depth, unit, color)
+    frame = frame_of(depth.stem, camera.of_size(size, depth.name), pose, depth, unit, color)
     return recording_of(path.name, "one frame", [frame], notes)
 
 
@@ -409,27 +366,43 @@ def camera_beside(folder: Path) -> CameraFile | None:
     return None
 
 
-def no_intrinsics(name: str) -> DatasetError:
-    """The error where neither the layout nor the caller has a camera."""
-    return DatasetError(
-        f"{name} has no intrinsics: put a camera_intrinsic.json beside the images, or give --intrinsics fx,fy,cx,cy",
-        reason="DATASET_INTRINSICS_INVALID",
-    )
+def _camera_of(
+    name: str,
+    found: CameraFile | None,
+    given: Given,
+    unit: float,
+    published: tuple[float, float, float, float] | None = None,
+    note: str = "",
+) -> tuple[Camera, float, list[str]]:
+    """The camera and the meters a step: those given, else those of the file ``found``, else the layout's.
+
+    published: fx fy cx cy of the layout's cameras, taken with this note. Raises DatasetError without any camera.
+    """
+    unit = given.depth_unit or (found.depth_unit if found else None) or unit
+    if camera := given.camera or (found.camera if found else None):
+        return camera, unit, []
+    if published is None:
+        raise DatasetError(
+            f"{name} has no intrinsics: put a camera_intrinsic.json beside the images, or give --intrinsics"
+            " fx,fy,cx,cy",
+            reason="DATASET_INTRINSICS_INVALID",
+        )
+    return camera_of(*published, size=(480, 640), whole_centers=True), unit, [note]
 
 
-def _frame(
+def frame_of(
     name: str,
     camera: Camera,
     pose: Array | None,
     depth: Path | None,
-    unit: float,
+    unit: float | None,
     color: Path | None,
     color_camera: Camera | None = None,
 ) -> StoredFrame | None:
+    """A frame of image files; None where it has no pose or no depth."""
     if pose is None or depth is None:
         return None
-    picture: Callable[[], NDArray[np.uint8]] | None = color_file(color) if color else None
-    return StoredFrame(name, camera, pose, depth_file(depth, unit), picture, color_camera)
+    return StoredFrame(name, camera, pose, depth_file(depth, unit), color_file(color) if color else None, color_camera)
 
 
 def matrix_file(path: Path) -> list[list[float]]:

@@ -30,8 +30,6 @@ _MOST_NAMES = 2_000
 """Frames that a report names."""
 _KEPT_BYTES = 1 << 30
 """Of the arrays that are kept of a recording; frames beyond are left out, those that add least first."""
-_CHECKED = 24
-"""Frames that are compared with each other."""
 
 
 def import_recording(
@@ -128,6 +126,7 @@ def main(arguments: list[str]) -> int:
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
     from regnf_data.recordings.layouts import read_layout
+    from regnf_data.recordings.recording import check_recording
     from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
@@ -138,9 +137,9 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
     recording = read_layout(source, given_of(request["description"] or {}))
     if len(recording) == 1:  # somebody waits for it: it is decoded once
         recording = replace(recording, frames=recording_of_frames([recording.frames[0].read()]).frames)
+    warning = check_recording(recording)
     kept, bounds = _kept(recording)
     stored = write_recording(recording, kept, folder / "field.safetensors")
-    warning = _agreement(recording, kept, bounds)
     shutil.rmtree(folder / "unpacked", ignore_errors=True)
     return stored | {
         "layout": recording.layout,
@@ -171,15 +170,13 @@ def given_of(said: dict[str, Any]) -> Any:
 
 def unpack(upload: Path, kind: str, folder: Path, most: int) -> None:
     """Write an archive's files below ``folder``. Raises FieldFormatError with the ARCHIVE_* reasons."""
-    with upload.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        view = memoryview(data)
-        try:
-            for name, content in _members(view, kind, most):
-                target = folder / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(content)
-        finally:
-            view.release()
+    with upload.open("rb") as file:
+        # Closed with the last view of it: an error may hold one.
+        data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    for name, content in _members(data, kind, most):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(content)
 
 
 def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, bytes]]:
@@ -215,16 +212,6 @@ def _kept(recording: Recording) -> tuple[list[int], Any]:
     most = max(1, _KEPT_BYTES // one)
     chosen = choose_frames(recording, most)
     return list(range(len(recording))) if len(recording) <= most else list(chosen.indices), chosen.bounds
-
-
-def _agreement(recording: Recording, kept: list[int], bounds: Any) -> str | None:
-    """A warning where frames disagree. Raises DatasetError (DATASET_FRAMES_DISAGREE)."""
-    from regnf_data.agreement import check_agreement
-
-    if len(kept) < 2:
-        return None
-    some = kept[:: max(1, len(kept) // _CHECKED)][:_CHECKED]
-    return check_agreement(recording.posed_images(some, bounds))
 
 
 if __name__ == "__main__":

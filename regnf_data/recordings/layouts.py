@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, RegnfError
+from regnf_data.agreement import NO_TERMS, Terms
 from regnf_data.recordings import documents, folders
 from regnf_data.recordings.recording import Given, Recording
 from regnf_data.recordings.stored import is_stored, read_stored
@@ -24,22 +25,34 @@ _NEAR = 3
 @dataclass(frozen=True)
 class Layout:
     """name: for `--layout` · words: for people · fits: whether a folder or file has it · read: its recording ·
-    looks_for: the files that tell it · axes: of its cameras."""
+    looks_for: the files that tell it · terms: where its files state what."""
 
     name: str
     words: str
     looks_for: str
     fits: Callable[[Path], bool]
     read: Callable[[Path, Given], Recording]
-    axes: Literal["opencv", "opengl"] = "opencv"
+    terms: Terms = NO_TERMS
 
     def recording(self, path: Path, given: Given) -> Recording:
         """That at ``path``, with cameras whose axes are those that were given."""
-        found = self.read(path, given)
-        if given.axes in (None, self.axes):
+        try:
+            found = replace(self.read(path, given), terms=self.terms)
+        except (OSError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            if isinstance(error, RegnfError):
+                raise
+            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EMFILE, errno.ENFILE):
+                raise
+            if isinstance(error, FileNotFoundError | NotADirectoryError):
+                said = f"{path.name} is not of the layout {self.words}: it has no {Path(str(error.filename)).name}"
+                raise DatasetError(said, reason="DATASET_NO_METADATA") from error
+            # Readers check what is often wrong; of the rest the reason is all that there is to say.
+            said = f"{path.name} cannot be read as {self.words}: {type(error).__name__}: {error}"
+            raise DatasetError(said[:400], reason="DATASET_METADATA_INVALID") from error
+        if given.axes in (None, self.terms.axes):
             return found
         turned = (replace(one, T_world_camera=one.T_world_camera @ _OPENGL) for one in found.frames)
-        return replace(found, frames=tuple(turned))
+        return replace(found, frames=tuple(turned), terms=replace(self.terms, axes=str(given.axes)))
 
 
 def _bag(path: Path, given: Given) -> Recording:
@@ -52,22 +65,36 @@ def _is_bag(path: Path) -> bool:
     return path.suffix in (".mcap", ".db3", ".bag") if path.is_file() else (path / "metadata.yaml").is_file()
 
 
+_BOP = Terms("cam_R_w2c and cam_t_w2c", "cam_K", "depth_scale", to_camera=True)
+_SDFSTUDIO = Terms("camtoworld in meta_data.json", "intrinsics in meta_data.json", "depth_unit_scale_factor")
+_NERFSTUDIO = Terms("transform_matrix", "fl_x, fl_y, cx, cy", "depth_unit_scale_factor", axes="opengl")
+_BAG = Terms("tf and odometry", "CameraInfo", "the images' encoding")
+_REDWOOD = Terms("the trajectory or pose graph", "camera_intrinsic.json")
+_COLMAP = Terms("images.txt or .bin", "cameras.txt or .bin", to_camera=True)
 LAYOUTS = (
     Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
-    Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop),
-    Layout("sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio),
-    Layout("nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio, "opengl"),
-    Layout("rosbag2", "a ROS bag", "metadata.yaml, *.mcap, *.db3", _is_bag, _bag),
-    Layout("tum", "TUM RGB-D", "depth.txt, groundtruth.txt", folders.is_tum, folders.read_tum),
-    Layout("scannet", "ScanNet, extracted", "pose/, depth/", folders.is_scannet, folders.read_scannet),
-    Layout("replica", "Replica (NICE-SLAM)", "traj.txt, results/", folders.is_replica, folders.read_replica),
-    Layout("redwood", "Redwood, Open3D", "depth/, *.log or pose_graph.json", folders.is_redwood, folders.read_redwood),
-    Layout("colmap", "COLMAP with depth", "cameras.txt or .bin, depth/", documents.is_colmap, documents.read_colmap),
+    Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop, _BOP),
     Layout(
-        "7scenes", "7-Scenes, 3DMatch", "*.pose.txt, *.depth.png", folders.is_seven_scenes, folders.read_seven_scenes
+        "sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio, _SDFSTUDIO
     ),
+    Layout(
+        "nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio, _NERFSTUDIO
+    ),
+    Layout("rosbag2", "a ROS bag", "metadata.yaml, *.mcap, *.db3, *.bag", _is_bag, _bag, _BAG),
+    Layout("tum", "TUM RGB-D", "depth.txt, groundtruth.txt", folders.is_tum, folders.read_tum,
+           Terms("groundtruth.txt", "camera.json")),
+    Layout("scannet", "ScanNet, extracted", "pose/, depth/", folders.is_scannet, folders.read_scannet,
+           Terms("pose/*.txt", "intrinsic/")),
+    Layout("replica", "Replica (NICE-SLAM)", "traj.txt, results/", folders.is_replica, folders.read_replica,
+           Terms("traj.txt", "cam_params.json", "scale")),
+    Layout("redwood", "Redwood, Open3D", "depth/, *.log or pose_graph.json", folders.is_redwood, folders.read_redwood,
+           _REDWOOD),
+    Layout("colmap", "COLMAP with depth", "cameras.txt or .bin, depth/", documents.is_colmap, documents.read_colmap,
+           _COLMAP),
+    Layout("7scenes", "7-Scenes, 3DMatch", "*.pose.txt, *.depth.png", folders.is_seven_scenes,
+           folders.read_seven_scenes, Terms("*.pose.txt", "camera-intrinsics.txt")),
     Layout("frame", "one frame", "one depth image, intrinsics", folders.is_frame, folders.read_frame),
-)
+)  # fmt: skip
 
 
 def read_layout(path: str | os.PathLike[str], given: Given | None = None) -> Recording:
@@ -80,11 +107,12 @@ def read_layout(path: str | os.PathLike[str], given: Given | None = None) -> Rec
         raise DatasetError(f"there is no {source}", reason="DATASET_NOT_RECOGNIZED")
     if given.layout is not None:
         named = {layout.name: layout for layout in LAYOUTS}
-        if given.layout not in named:
+        name = given.layout.partition(":")[0]  # a bag's topic may follow
+        if name not in named:
             raise DatasetError(
                 f"no layout is called {given.layout[:40]!r}: {', '.join(named)}", reason="DATASET_NOT_RECOGNIZED"
             )
-        return named[given.layout].recording(source, given)
+        return named[name].recording(source, given)
     for layout in LAYOUTS:
         if layout.fits(source):
             return layout.recording(source, given)

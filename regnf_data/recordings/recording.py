@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import NO_TERMS, Terms, check_views
 from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array, Camera, Size
 from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
@@ -22,6 +24,8 @@ _FARTHEST = 1e6
 """Camera positions beyond are no meters."""
 _NOT_RIGID = 0.02
 _MILLIMETER, _EIGHT_BITS = 0.001, 255.5
+_FEW = 4
+"""Different depths of an image that shows but a wall."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +115,7 @@ class StoredFrame:
         if not color or self.color is None:
             return frame
         picture = self.color()
-        colored = (self.color_camera or given).of_size((picture.shape[0], picture.shape[1]), self.name)
+        colored = (self.color_camera or with_lens).of_size((picture.shape[0], picture.shape[1]), self.name)
         return replace(frame, color=picture, color_camera=colored.check(self.name))
 
 
@@ -120,8 +124,8 @@ class Recording:
     """Frames whose poses share a world, in the order of their recording.
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
-    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world is in
-    meters.
+    T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is
+    the meter, as far as files can tell · terms: what the layout's files call things.
     """
 
     name: str
@@ -130,6 +134,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     T_metric_world: Array | None = None
     is_metric: bool = True
+    terms: Terms = NO_TERMS
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -156,8 +161,7 @@ class Recording:
         frames: list[Frame] = []
         for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
             frame = self.frames[index].read()
-            gray = np.full((*frame.depth.shape, 3), 128, np.uint8)
-            frames.append(replace(frame, color=gray if frame.color is None else frame.registered(frame.color)))
+            frames.append(frame if frame.color is None else replace(frame, color=frame.registered(frame.color)))
         return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
 
 
@@ -176,6 +180,37 @@ def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
         bounds=bounds,
         depths=np.stack([frame.depth for frame in frames]),
     )
+
+
+_FRAMES, _ACROSS = 32, 200
+"""Of a recording that are compared, and pixels of them across."""
+_OFFSETS = 0.0, 1.0 / 16.0, 0.25, 0.5
+"""Where frames are taken of each part of a recording: some follow each other closely, whatever its length."""
+
+
+def check_recording(recording: Recording) -> str | None:
+    """As :func:`regnf_data.agreement.check_agreement`, of some frames of a recording, in the words of its layout.
+
+    Frames are read. Raises DatasetError as their readers do, too.
+    """
+    count = len(recording)
+    parts = _FRAMES // len(_OFFSETS)
+    spread = {int((part + offset) * count / parts) for part in range(parts) for offset in _OFFSETS}
+    if count < 2:
+        return None
+    chosen = sorted(spread) if count > _FRAMES else range(count)
+    views = [_smaller(recording.frames[index].read(color=False)) for index in chosen]
+    shape = Counter(depth.shape for depth, _, _ in views).most_common(1)[0][0]
+    depths, intrinsics, poses = zip(*(view for view in views if view[0].shape == shape), strict=True)
+    return check_views(np.stack(depths), np.stack(intrinsics), np.stack(poses), recording.terms)
+
+
+def _smaller(frame: Frame) -> tuple[NDArray[np.float32], Array, Array]:
+    """Depth, intrinsics and pose of every so many pixels: the center of the first one stays where it is."""
+    step = max(1, frame.depth.shape[1] // _ACROSS)
+    shift = 0.5 - 0.5 / step
+    intrinsics = np.array([[1.0 / step, 0.0, shift], [0.0, 1.0 / step, shift], [0.0, 0.0, 1.0]]) @ frame.camera.K
+    return frame.depth[::step, ::step].copy(), intrinsics, frame.T_world_camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,13 +244,16 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
     """Reads a depth image: whole numbers of ``unit`` meters, or numbers in meters where the file has a point."""
 
     def read() -> NDArray[np.float32]:
-        depth = read_depth(path, checked_size(path), unit)
-        if unit is not None and path.suffix.lower() == ".npy" and _whole_numbers(path):
-            depth = depth * np.float32(unit)
-        if unit is not None and unit <= _MILLIMETER and 0.0 < depth.max() <= _EIGHT_BITS * unit:
+        size = checked_size(path)
+        if unit is None or not _whole_numbers(path):
+            return read_depth(path, size, unit and 1.0)
+        depth = read_depth(path, size, unit) * np.float32(unit if path.suffix.lower() == ".npy" else 1.0)
+        some = np.round(depth[::4, ::4] / unit)
+        spread = next((by for by in (256, 257) if not (some % by).any() and len(np.unique(some)) > _FEW), None)
+        if unit <= _MILLIMETER and (spread or 0.0 < depth.max() <= _EIGHT_BITS * unit):
+            which = f"multiples of {spread}" if spread else f"whole numbers up to {round(depth.max() / unit)}"
             raise DatasetError(
-                f"{path.name}: its depths are whole numbers up to {round(depth.max() / unit)}: an image of 8 bits",
-                reason="DATASET_IMAGE_INVALID",
+                f"{path.name}: its depths are {which}: an image of 8 bits", reason="DATASET_IMAGE_INVALID"
             )
         return depth
 
@@ -252,7 +290,10 @@ def checked_size(path: Path) -> Size:
 
 
 def _whole_numbers(path: Path) -> bool:
-    return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
+    if path.suffix.lower() == ".npy":
+        return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
+    with opened_image(path) as image:
+        return bool(image.mode != "F")
 
 
 def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) -> Array | None:
@@ -318,7 +359,5 @@ def recording_of(
     if len(found) > MOST_FRAMES:
         raise DatasetError(f"{name}: {len(found)} frames; at most {MOST_FRAMES}", reason="DATASET_TOO_LARGE")
     lost = len(frames) - len(found)
-    said = (
-        (*notes, f"{lost} of {len(frames)} frames have no pose or no depth and are left out") if lost else tuple(notes)
-    )
-    return Recording(name, layout, found, said, T_metric_world, is_metric)
+    told = (f"{lost} of {len(frames)} frames have no pose or no depth and are left out",) if lost else ()
+    return Recording(name, layout, found, (*notes, *told), T_metric_world, is_metric)

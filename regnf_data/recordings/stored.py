@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import DatasetError, atomic_path
-from regnf_data.recordings.camera import Array, Camera, Lens, lens_of
+from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, Lens, camera_of, lens_of
 from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
 
 _KEY = "recording"
@@ -195,19 +195,12 @@ def _color(path: Path, number: int) -> NDArray[np.uint8]:
 def recording_of_frames(frames: Sequence[Frame], name: str = "frames", layout: str = "frames") -> Recording:
     """Frames in memory as a recording."""
 
-    def held(frame: Frame) -> StoredFrame:
-        color: Callable[[], NDArray[np.uint8]] | None = None if frame.color is None else partial(_same, frame.color)
-        return StoredFrame(
-            frame.name,
-            frame.camera,
-            frame.T_world_camera,
-            partial(_same, frame.depth),
-            color,
-            frame.color_camera,
-            taken=frame.taken,
-        )
-
-    return Recording(name, layout, tuple(held(frame) for frame in frames))
+    held = []
+    for one in frames:
+        color: Callable[[], NDArray[np.uint8]] | None = None if one.color is None else partial(_same, one.color)
+        depth, pose = partial(_same, one.depth), one.T_world_camera
+        held.append(StoredFrame(one.name, one.camera, pose, depth, color, one.color_camera, taken=one.taken))
+    return Recording(name, layout, tuple(held))
 
 
 def _same(array: NDArray[Any]) -> NDArray[Any]:
@@ -242,18 +235,16 @@ def frame_of_arrays(
     meters[~((meters > 0.0) & (image < limit))] = 0.0
     matrix: Array = np.array(K, np.float64)
     if matrix.shape == (4,):
-        fx, fy, cx, cy = matrix
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        matrix = camera_of(*matrix).K
     if matrix.shape != (3, 3):
         raise DatasetError(
             f"K has the shape {matrix.shape}, expected (3, 3) or fx, fy, cx, cy", reason="DATASET_INTRINSICS_INVALID"
         )
-    matrix = matrix + np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
     pose = np.eye(4) if T_world_camera is None else pose_of(T_world_camera, name)
     if pose is None:
         raise DatasetError(f"{name}: the pose is not finite", reason="DATASET_POSE_NOT_RIGID")
     height, width = meters.shape
-    camera = Camera(matrix, (height, width)).check(name)
+    camera = Camera(matrix + HALF_A_PIXEL, (height, width)).check(name)
     if color is None:
         return Frame(name, meters, camera, pose)
     picture = np.asarray(color)

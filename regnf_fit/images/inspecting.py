@@ -12,9 +12,9 @@ from PIL import Image, ImageDraw, ImageOps
 
 from regnf_core.errors import DatasetError
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR
-from regnf_data.agreement import check_agreement
+from regnf_core.viewing.splats import Surfels, render, view_from
 from regnf_data.recordings.choosing import choose_frames
-from regnf_data.recordings.recording import Frame, Given, Recording
+from regnf_data.recordings.recording import Frame, Given, Recording, check_recording
 from regnf_fit.images.overlay import shaded
 
 Floats = NDArray[np.float64]
@@ -23,15 +23,14 @@ _LOOKED_AT = 24
 """Frames that the report is about; those that add most."""
 _SHOWN, _HEIGHT, _WIDTH = 2, 360, 480
 """Frames of a row of images alone, twice as many above their depths; and the room of one, pixels."""
-_POINTS = 40_000
-_ACROSS, _ALIKE = 80, 0.97
-"""Pixels of an image across that its surfaces' directions are told by; the cosine between directions that are one."""
-_BACKGROUND = (249, 249, 247)
+_ACROSS, _DISC, _ALIKE = 120, 2.0, 0.97
+"""Points across an image, their radius in the view from above, pixels, and the cosine of directions that are one."""
+_BACKGROUND = np.array([249.0, 249.0, 247.0])
 
 
 @dataclass(frozen=True, eq=False)
 class InspectedRecording:
-    """report: plain values, the recording's unit and pixels · picture: some images, and the points from above with the
+    """report: plain values, the recording's unit and pixels · picture: some images, and the surface from above with the
     cameras' path."""
 
     report: dict[str, Any]
@@ -77,7 +76,7 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
         },
         "bounds": [[_rounded(value) for value in row] for row in chosen.bounds.tolist()],
         "path": _rounded(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())),
-        "agreement": _agreement(recording, chosen.indices, chosen.bounds),
+        "agreement": _agreement(recording),
         "notes": list(recording.notes),
     }
     return InspectedRecording(report, _picture(frames, places))
@@ -97,12 +96,12 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def _agreement(recording: Recording, indices: tuple[int, ...], bounds: Floats) -> str:
+def _agreement(recording: Recording) -> str:
     """How the depths of one surface agree from frame to frame, in words."""
-    if len(indices) < 2:
+    if len(recording) < 2:
         return "one frame: nothing to compare"
     try:
-        return check_agreement(recording.posed_images(indices, bounds)) or "frames that see the same place agree"
+        return check_recording(recording) or "frames that see the same place agree"
     except DatasetError as error:
         return f"{error.reason}: {error}. {error.hint or ''}".strip()
 
@@ -112,7 +111,7 @@ def _picture(frames: list[Frame], places: Floats) -> Image.Image:
     rows = 1 if all(one.color is None for one in frames) else 2
     picked = [frames[at] for at in np.unique(np.linspace(0, len(frames) - 1, _SHOWN * rows).astype(int))]
     height, width = _HEIGHT // rows, _WIDTH // rows
-    sheet = Image.new("RGB", (width * len(picked) + _HEIGHT, _HEIGHT), _BACKGROUND)
+    sheet = Image.new("RGB", (width * len(picked) + _HEIGHT, _HEIGHT), (249, 249, 247))
     for number, frame in enumerate(picked):
         for row, image in enumerate((frame.color, shaded(frame))[-rows:]):
             if image is not None:
@@ -123,63 +122,51 @@ def _picture(frames: list[Frame], places: Floats) -> Image.Image:
     return sheet
 
 
-def _down(frames: list[Frame]) -> Floats:
-    """(3,): the direction, within 60 degrees of the images' own down, that most of the surface lies across."""
-    own = np.mean([one.T_world_camera[:3, 1] for one in frames], axis=0)
-    own /= max(float(np.linalg.norm(own)), 1e-9)
-    found = []
-    for frame in frames:
-        stride = max(1, frame.depth.shape[1] // _ACROSS)
-        depth = frame.depth[::stride, ::stride]
-        rows, columns = np.indices(depth.shape) * stride + 0.5
-        rays = frame.camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1)).reshape(*depth.shape, 3)
-        places = rays * depth[..., None]
-        normals = np.cross(places[1:, :-1] - places[:-1, :-1], places[:-1, 1:] - places[:-1, :-1])
-        known = (depth[1:, :-1] > 0.0) & (depth[:-1, 1:] > 0.0) & (depth[:-1, :-1] > 0.0)
-        found.append(normals[known] @ frame.T_world_camera[:3, :3].T)
-    normals = np.concatenate(found)
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    normals *= np.sign(normals @ own)[:, None]
-    normals = normals[normals @ own > 0.5]
-    if not len(normals):
-        return np.asarray(own)
-    tried = normals[:: len(normals) // 300 + 1]
-    best = tried[int((tried @ normals.T > _ALIKE).sum(axis=1).argmax())]
-    down = normals[normals @ best > _ALIKE].sum(axis=0)
-    found_down: Floats = down / float(np.linalg.norm(down))
-    return found_down
-
-
 def _from_above(frames: list[Frame], places: Floats, edge: int) -> Image.Image:
-    """The points below the highest camera, by their colors; the cameras' path, from the orange end to the blue one."""
-    down = _down(frames)
-    across = np.cross(np.eye(3)[np.abs(down).argmin()], down)
-    across /= max(float(np.linalg.norm(across)), 1e-9)
-    axes = np.stack([across, np.cross(down, across), down], axis=1)
-    rng, points, colors = np.random.default_rng(0), [], []
-    for frame in frames:
-        found, measured = frame.points()
-        taken = rng.integers(len(found), size=_POINTS // len(frames)) if len(found) else np.zeros(0, np.int64)
-        image = shaded(frame) if frame.color is None else frame.registered(frame.color)
-        points.append(found[taken] @ axes)
-        colors.append(image[measured][taken])
-    cloud, paint, path = np.concatenate(points), np.concatenate(colors), places @ axes
-    below = cloud[:, 2] > path[:, 2].min()
-    cloud, paint = (cloud[below], paint[below]) if below.any() else (cloud, paint)
-    low, high = np.quantile(cloud, 0.01, axis=0), np.quantile(cloud, 0.99, axis=0)
-    low, high = np.minimum(low, path.min(0)), np.maximum(high, path.max(0))
-    scale = 0.92 * edge / max(float((high - low)[:2].max()), 1e-9)
-    order = np.argsort(-cloud[:, 2])
-    pixels = ((cloud[order, :2] - (low + high)[:2] / 2.0) * scale + edge / 2.0).astype(np.int64)
-    inside = ((pixels >= 0) & (pixels < edge - 1)).all(axis=1)
-    image = np.full((edge, edge, 3), _BACKGROUND, np.uint8)
-    for down_by, right_by in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        image[pixels[inside, 1] + down_by, pixels[inside, 0] + right_by] = paint[order][inside]
-    shown = Image.fromarray(image)
+    """The surface below the highest camera; the cameras' path, from the orange end to the blue one. The cameras look up
+    in the picture."""
+    cloud = Surfels.join(*map(_surface, frames))
+    axes = np.stack([one.T_world_camera[:3, :3] for one in frames]).mean(axis=0)
+    down = _down(cloud.normals, axes[:, 1])
+    below = cloud.points @ down > (places @ down).min()
+    if below.any():
+        cloud = Surfels(cloud.points[below], cloud.normals[below], cloud.colors[below])
+    low, high = np.quantile(cloud.points, (0.01, 0.99), axis=0)
+    within = ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
+    view = view_from(-down, axes[:, 2] - axes[:, 1], np.concatenate([cloud.points[within], places]), edge)
+    pixels = (render(cloud, view, edge, _DISC / view.pixels_per_unit, _BACKGROUND / 255.0) * 255.0).astype(np.uint8)
+    shown = Image.fromarray(pixels)
     draw = ImageDraw.Draw(shown)
-    line = [tuple(at) for at in ((path[:, :2] - (low + high)[:2] / 2.0) * scale + edge / 2.0).tolist()]
+    line = [(edge / 2.0 + x, edge / 2.0 - y) for x, y, _ in (places - view.center) @ view.axes.T * view.pixels_per_unit]
     orange, blue = (tuple(int(255 * part) for part in color) for color in (OBJECT_COLOR, SCENE_COLOR))
     draw.line(line, fill=orange, width=2)
-    for at, color in ((line[-1], blue), (line[0], orange)):
-        draw.ellipse((at[0] - 4, at[1] - 4, at[0] + 4, at[1] + 4), fill=color)
+    for (x, y), color in ((line[-1], blue), (line[0], orange)):
+        draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=color)
     return shown
+
+
+def _surface(frame: Frame) -> Surfels:
+    """Some of what a frame shows, world."""
+    step = max(1, frame.depth.shape[1] // _ACROSS)
+    image = shaded(frame) if frame.color is None else frame.registered(frame.color)
+    rows, columns = np.indices(frame.depth.shape)[:, ::step, ::step]
+    depth = frame.depth[rows, columns]
+    rays = frame.camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5).reshape(*depth.shape, 3)
+    places = (rays * depth[..., None]) @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
+    normals = np.cross(places[1:, :-1] - places[:-1, :-1], places[:-1, 1:] - places[:-1, :-1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    known = (depth[1:, :-1] > 0.0) & (depth[:-1, 1:] > 0.0) & (depth[:-1, :-1] > 0.0)
+    return Surfels(places[:-1, :-1][known], normals[known], image[rows, columns][:-1, :-1][known] / 255.0)
+
+
+def _down(normals: Floats, own: Floats) -> Floats:
+    """(3,): the direction, within 60 degrees of the images' ``own`` down, that most of the surface lies across."""
+    own = own / max(float(np.linalg.norm(own)), 1e-9)
+    facing = normals * np.sign(normals @ own)[:, None]
+    facing = facing[facing @ own > 0.5]
+    if not len(facing):
+        return own
+    tried = facing[:: len(facing) // 300 + 1]
+    best = tried[int((tried @ facing.T > _ALIKE).sum(axis=1).argmax())]
+    down = facing[facing @ best > _ALIKE].sum(axis=0)
+    return np.asarray(down / np.linalg.norm(down))

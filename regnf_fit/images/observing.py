@@ -180,7 +180,7 @@ def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
     valid = depth > 0.0
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=valid)
     x, y = rays[..., 0], rays[..., 1]
-    count, sums = _moments(np.asarray(np.linalg.inv(camera)[:2, :2], np.float64), inverse, valid)
+    count, sums = _moments(np.asarray(np.linalg.inv(camera))[:2, :2], inverse, valid)
     known = valid & (count >= _MIN_PIXELS)
     mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
     # all relative to the pixel itself, see _moments

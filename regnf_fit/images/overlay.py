@@ -20,6 +20,7 @@ from regnf_data.recordings.recording import Frame
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Mesh = tuple[Floats, NDArray[Any]]
 
 _HEIGHT, _WIDEST, _CAPTION = 540, 960, 52
 _BACKGROUND, _INK, _GRAY = (249, 249, 247), (52, 56, 62), (120, 124, 130)
@@ -85,7 +86,7 @@ def overlay_picture(result: RegistrationResult, frame: Frame, vertices: Floats, 
         box = (*np.maximum(low, 0.0), *np.minimum(high, image.shape[1::-1]))
         shown = Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC, box=box)
         for points, color in [*((each, SCENE_COLOR) for each in placed[1:]), (placed[0], OBJECT_COLOR)]:
-            shown = _with_lines(shown, frame, panel, points[faces], color, diameter)
+            shown = _with_lines(shown, frame, panel, (points, faces), color, diameter)
         sheet.paste(shown, (left, _CAPTION))
         left += width
     away = float(np.linalg.norm(poses[0].apply(result.center_object[None])[0]))
@@ -128,13 +129,13 @@ def _panels(frame: Frame, shape: tuple[int, ...], points: Floats) -> list[_Panel
 
 
 def _with_lines(
-    shown: Image.Image, frame: Frame, panel: _Panel, corners: Floats, color: tuple[float, float, float], diameter: float
+    shown: Image.Image, frame: Frame, panel: _Panel, mesh: Mesh, color: tuple[float, float, float], diameter: float
 ) -> Image.Image:
-    """The panel with the edges of triangles (F, 3, 3), camera frame."""
+    """The panel with the edges of a mesh, camera frame."""
     camera = frame.color_camera or frame.camera
     K = np.diag([panel.zoom, panel.zoom, 1.0]) @ camera.K
     K[:2, 2] -= panel.zoom * panel.corner
-    inverse = inverse_depths(corners, K, panel.size)
+    inverse = inverse_depths(*mesh, K, panel.size)
     inside = inverse > 0.0
     outline, inner = _edges(inverse, inside, float(K[0, 0]))
     rows, columns = np.nonzero(outline | inner)
@@ -168,17 +169,18 @@ def _edges(inverse: Floats, inside: Mask, focal: float) -> tuple[Mask, Mask]:
     return outline, within & (bent * focal > _CREASE * inverse)
 
 
-def inverse_depths(corners: Floats, K: Floats, size: tuple[int, int]) -> Floats:
-    """(H, W): the inverse of the nearest depth of triangles (F, 3, 3), camera frame, at pixels' centers; 0 without one.
+def inverse_depths(points: Floats, faces: NDArray[Any], K: Floats, size: tuple[int, int]) -> Floats:
+    """(H, W): the inverse of the nearest depth of triangles at pixels' centers, 0 without one.
 
-    Triangles that reach behind the camera are left out.
+    points: (V, 3), camera frame · faces: (F, 3). Triangles that reach behind the camera are left out.
     """
     height, width = size
     buffer = np.zeros(height * width)
-    corners = corners[(corners[..., 2] > 1e-6).all(axis=1)]
-    share = 1.0 / corners[..., 2]
-    x = corners[..., 0] * share * K[0, 0] + K[0, 2]
-    y = corners[..., 1] * share * K[1, 1] + K[1, 2]
+    before = points[:, 2] > 1e-6
+    faces = faces[before[faces].all(axis=1)]
+    inverse = 1.0 / np.where(before, points[:, 2], 1.0)
+    pixels = points[:, :2] * inverse[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    share, x, y = inverse[faces], pixels[:, 0][faces], pixels[:, 1][faces]
     left, right = _covered(x, width)
     top, bottom = _covered(y, height)
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])

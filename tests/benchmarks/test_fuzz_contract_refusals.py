@@ -59,7 +59,7 @@ def test_every_reason_has_a_status_at_which_reasons_are_looked_at() -> None:
 
 def test_a_rejected_field_may_be_met_wherever_a_field_is_named_and_a_malformed_body_nowhere() -> None:
     naming = {operation for operation in _OPERATIONS if "FIELD_REJECTED" in beyond_schemas(_CONTRACT, operation)}
-    assert naming == {"POST /library", "POST /register", "POST /render"}
+    assert naming == {"POST /library", "POST /recordings/{sha256}/frames", "POST /register", "POST /render"}
     assert not any("MALFORMED_JSON" in beyond_schemas(_CONTRACT, operation) for operation in _OPERATIONS)
 
 

@@ -58,12 +58,13 @@ def test_a_frame_in_parts_is_one_file_with_the_parts_as_they_came(world: World) 
 
 
 def test_files_are_taken_as_they_are_and_have_a_label(world: World) -> None:
-    for data in (FOLDER, b"\x89MCAP0\r\n" + bytes(90), b"SQLite format 3\0" + bytes(90)):
+    like_others = [archive(**{name: b"1"}) for name in ("depth_npy", "config_json", "a/data/0_png")]
+    for data in (FOLDER, b"\x89MCAP0\r\n" + bytes(90), b"SQLite format 3\0" + bytes(90), *like_others):
         answer = world.client.post("/recordings?label=kitchen", content=data)
         assert (answer.status_code, answer.json()["sha256"]) == (201, sha256(data)), answer.text
         assert answer.json()["label"] == "kitchen"
     listed = world.client.get("/recordings?label=kitchen").json()["recordings"]
-    assert len(listed) == 3
+    assert len(listed) == 6
     assert world.client.get("/recordings?label=other").json()["recordings"] == []
     assert world.client.get("/fields").json()["fields"] == []
 

@@ -75,7 +75,8 @@ def test_an_object_outside_the_image_leaves_it_bare(found: Sim3, color: bool) ->
 def test_the_nearest_triangle_counts() -> None:
     corners = np.array([[[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0], [0.0, 2.0, 2.0]]])
     K = np.array([[20.0, 0.0, 20.0], [0.0, 20.0, 20.0], [0.0, 0.0, 1.0]])
-    found = inverse_depths(np.concatenate([corners, corners * 2.0, corners * 0.5]), K, (40, 40))
+    points = np.concatenate([corners, corners * 2.0, corners * 0.5]).reshape(-1, 3)
+    found = inverse_depths(points, np.arange(9).reshape(3, 3), K, (40, 40))
     assert found[20, 20] == pytest.approx(1.0)
     assert found[0, 0] == 0.0
 

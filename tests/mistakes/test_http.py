@@ -43,7 +43,7 @@ CASES = [
     Case("trailing comma", "MALFORMED_JSON", 400, "line 1, column 12", "not JSON", "Remove the comma", {"content": b'{"seed": 1,}', "headers": {"Content-Type": "application/json"}}),
     Case("parts without a boundary", "MALFORMED_MULTIPART", 400, "boundary|parts", "boundary|told apart", "curl -F", {"content": b"--x", "headers": {"Content-Type": "multipart/form-data"}}),
     Case("parts of other names", "MALFORMED_MULTIPART", 400, "part", "does not know|scene", "docs/api.md", {"files": {"file": ("a.ckpt", b"PK\x03\x04")}}),
-    Case("a part is missing", "MALFORMED_MULTIPART", 400, "`object`", "missing", "docs/api.md", {"files": {"scene": ("a", field_bytes("a"))}}),
+    Case("a part is missing", "MALFORMED_MULTIPART", 400, "`request`", "missing", "docs/api.md", {"files": {"scene": ("a", field_bytes("a"))}}),
     Case("GET on a POST address", "METHOD_NOT_ALLOWED", 405, "/register", "answers to", "Allow", {"method": "GET"}),
     Case("address with a typo", "NOT_FOUND", 404, "/regsiter", "nothing under this address", "GET /", {"path": "/regsiter"}),
     Case("POST to a field's address", "METHOD_NOT_ALLOWED", 405, "/fields/0", "answers to", "Allow", {"path": f"/fields/{ANY}", "content": b"PK\x03\x04"}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import zlib
 from pathlib import Path
@@ -75,9 +76,13 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
         ({"after": "c" * 64, "frame": "left"}, frame(), "FIELD_NOT_FOUND"),
         ({}, frame(png(np.zeros(SIZE, np.uint16))), "DATASET_DEPTH_MISSING"),
         ({}, frame(cx=900.0), "DATASET_INTRINSICS_INVALID"),
+        ({}, frame(depth_unit=1e9), "DATASET_INTRINSICS_INVALID"),
+        ({}, frame(depth_unit="mm"), "DATASET_INTRINSICS_INVALID"),
         ({}, frame(T_world_camera=np.diag([1, 1, -1, 1]).tolist()), "DATASET_POSE_NOT_RIGID"),
         ({}, frame()[:300], "FILE_TRUNCATED"),
         ({}, archive(notes_txt=b"nothing"), "DATASET_NOT_RECOGNIZED"),
+        ({}, gzip.compress(bytes(range(256)) * 20), "ARCHIVE_MALFORMED"),
+        ({}, b"SQLite format 3\0" + bytes(5000), "DATASET_BAG_INVALID"),
     ],
 )
 def test_a_recording_that_is_none_leaves_nothing(
@@ -120,6 +125,7 @@ def test_a_thing_in_an_image_is_registered_where_the_camera_saw_it(scene: Path, 
     made = engine.register(scene, object_, model, request, lambda *_: None, tmp_path, {})
     told = json.loads((tmp_path / "result.json").read_text())
     assert (told["verdict"], told["camera"]["frame"], told["camera"]["object_unit_m"]) == ("registered", "b", 0.001)
+    assert any("unit is taken to be mm" in warning for warning in told["fields"]["scene"]["warnings"])
     truth = shots(2)[1].T_camera_object
     assert error_m(told["camera"]["T_camera_object"]["matrix"], truth) < 0.01
     assert "overlay.png" in made.to_come

@@ -183,8 +183,9 @@ class Fields:
         if field is None:
             raise InvalidInputError(f"field {name} was deleted", reason="FIELD_NOT_FOUND")
         if field.state == "rejected":
-            why = (field.error or {}).get("reason", "unknown")
-            raise InvalidInputError(f"field {name} was rejected: {why}", reason="FIELD_REJECTED")
+            why = field.error or {}
+            message = f"field {name} was rejected: {why.get('reason', 'unknown')}: {why.get('detail', '')}"
+            raise InvalidInputError(message.rstrip(": "), reason="FIELD_REJECTED", hint=why.get("hint"))
         settings = self._context.settings
         longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
         if field.state == "validating" and self._context.records.now() - field.updated > longest:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -108,7 +108,7 @@ class Engine:
         # errors against a truth are those of the clouds' points
         result = place.seen(register(*fields, box, options, request.seed, report, initial, model, bool(truth)))
         T_true = Sim3.from_matrix(truth) if truth else None
-        said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object)}
+        said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object, place.notes)}
         names = write_result(result, folder, truth=T_true, **said)
 
         def finish() -> list[str]:
@@ -146,7 +146,11 @@ class Engine:
         found = search_library(place.field, box, [*objects.values()], options, request.seed, report, clouds=False)
         result = place.seen(found.result)
         winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
-        said: dict[str, Any] = {"object_name": winner, "candidates": ranking, "fields": _fields(notes, winner)}
+        said: dict[str, Any] = {
+            "object_name": winner,
+            "candidates": ranking,
+            "fields": _fields(notes, winner, place.notes),
+        }
         names = write_result(result, folder, **said)
 
         def finish() -> list[str]:
@@ -205,9 +209,11 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _fields(notes: Notes, obj: str | None) -> dict[str, FieldNotes]:
-    """What a result repeats of the notes: the scene's and those of its object."""
-    return {"scene": notes.get("scene", NO_NOTES), "object": notes.get(obj or "", NO_NOTES)}
+def _fields(notes: Notes, obj: str | None, told: Sequence[str]) -> dict[str, FieldNotes]:
+    """What a result repeats of the notes: the scene's, with what was ``told`` of it now, and those of its object."""
+    scene = notes.get("scene", NO_NOTES)
+    scene = replace(scene, warnings=(*scene.warnings, *(f"NOTE: {note}" for note in told)))
+    return {"scene": scene, "object": notes.get(obj or "", NO_NOTES)}
 
 
 def core_importer(limits: ImportLimits) -> Importer:

@@ -142,6 +142,8 @@ _PICTURE = "picture; a field is expected: a checkpoint, a safe field, a mesh or 
 _PAGE = "an HTML page, not a field; the download failed, or it needs a login"
 BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n")
 """How recordings of robots begin, beside those that are SQLite databases."""
+RECORDINGS = (*BAGS, _ZIP_LOCAL_HEADER)
+"""How files begin that may be recordings, whatever else they look like."""
 _OTHER_FILES = (
     *((magic, "a recording of a robot, not a field; a service takes it at POST /recordings") for magic in BAGS),
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),

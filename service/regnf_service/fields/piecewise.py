@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from regnf_core.importing.containers.sniff import BAGS, HEAD_BYTES
+from regnf_core.importing.containers.sniff import HEAD_BYTES, RECORDINGS
 from regnf_service.concurrency import Claim, in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, keep_held, store_upload
 from regnf_service.fields.uploads import Upload
@@ -35,7 +35,7 @@ class PieceUpload(Upload):
         self._recognized = piece.first != 0 or piece.length < HEAD_BYTES
 
     def _recognize(self) -> None:
-        if not self._pending.startswith(BAGS):  # which become recordings
+        if not self._pending.startswith(RECORDINGS):  # which become recordings
             super()._recognize()
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from regnf_core.importing.containers.sniff import BAGS, HEAD_BYTES, RUN_ARCHIVES, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, RECORDINGS, RUN_ARCHIVES, sniff_format
 from regnf_service.concurrency import Claim
 from regnf_service.fields.ingest import Beside
 from regnf_service.fields.uploads import Received, Upload
@@ -22,7 +22,7 @@ from regnf_state.records import RECORDING
 FRAME_BYTES = 256 << 20
 """Of all parts of a frame."""
 CAMERA_BYTES = 64 * 1024
-_RECORDINGS = RUN_ARCHIVES | {"sqlite", "safetensors"}
+_FORMATS = RUN_ARCHIVES | {"sqlite", "safetensors"}
 _WRITTEN = (1980, 1, 1, 0, 0, 0)
 _IMAGES: dict[str, dict[bytes, str]] = {
     "depth": {b"\x89PNG": ".png", b"II*\0": ".tiff", b"MM\0*": ".tiff", b"\x93NUM": ".npy"},
@@ -53,7 +53,7 @@ class RecordingUpload(Upload):
     """A file: an archive, a bag, or a stored recording."""
 
     def _recognize(self) -> None:
-        if sniff_format(bytes(self._pending[:HEAD_BYTES])) not in _RECORDINGS and not self._pending.startswith(BAGS):
+        if sniff_format(bytes(self._pending[:HEAD_BYTES])) not in _FORMATS and not self._pending.startswith(RECORDINGS):
             raise Problem("RECORDING_NOT_RECOGNIZED")
         self._recognized = True
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,10 @@ def later(folder: Path) -> None:
         (folder / name).write_text("\n".join(f"{1.4e9 + float(row[0]):.6f} {row[1]}" for row in rows))
 
 
+def spread_over_16_bits(path: Path) -> Any:
+    return (np.asarray(Image.open(path)) // 20 % 256 * 257).astype(np.uint16)
+
+
 DEPTHS, SCENES = "*.depth.png", "seven_scenes"
 REFUSED: dict[str, tuple[str, Change, str, str]] = {
     "zeros": (SCENES, all_of(DEPTHS, lambda p: put(p, np.zeros((HEIGHT, WIDTH), np.uint16))), "DEPTH_MISSING", "depth"),
@@ -87,6 +92,8 @@ REFUSED: dict[str, tuple[str, Change, str, str]] = {
                "8 bit"),
     "8 of 16": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((HEIGHT, WIDTH), 200, np.uint16))), "IMAGE_INVALID",
                 "up to 200"),
+    "8 spread over 16": (SCENES, all_of(DEPTHS, lambda p: put(p, spread_over_16_bits(p))), "IMAGE_INVALID",
+                         "multiples of 257"),
     "colors": (SCENES, all_of(DEPTHS, lambda p: put(p, np.ones((HEIGHT, WIDTH, 3), np.uint8))), "IMAGE_INVALID",
                "frame-000000.depth.png has more than one channel"),
     "empty": (SCENES, first_of(DEPTHS, lambda p: p.write_bytes(b"")), "IMAGE_INVALID", "frame-000000.depth.png"),
@@ -135,7 +142,24 @@ def test_what_cannot_be_used_is_refused_by_name(name: str, tmp_path: Path) -> No
     assert said in str(refused.value)
 
 
+def as_float_tiff(path: Path) -> None:
+    """Meters, as numbers with a point."""
+    put(path.with_suffix(".tiff"), (np.asarray(Image.open(path)) / 1000.0).astype(np.float32))
+    path.unlink()
+
+
 READ: dict[str, tuple[str, Change, int]] = {
+    "meters": (SCENES, all_of(DEPTHS, as_float_tiff), 3),
+    "zeros of a lost tracker": (
+        "tum",
+        first_of(
+            "groundtruth.txt",
+            lambda p: p.write_text(
+                re.sub(r"^(100\.0\d* \S+ \S+ \S+) .*$", r"\1 0 0 0 0", p.read_text(), flags=re.MULTILINE)
+            ),
+        ),
+        2,
+    ),
     "a lost pose": (SCENES, first_of("*.pose.txt", lambda p: np.savetxt(p, np.full((4, 4), np.nan))), 2),
     "a lost image": (SCENES, first_of(DEPTHS, lambda p: p.unlink()), 2),
     "no colors": (SCENES, all_of("*.color.*", lambda p: p.unlink()), 3),
@@ -157,7 +181,8 @@ def test_what_apps_leave_is_read(name: str, tmp_path: Path) -> None:
     assert len(recording) == count
     places = np.stack([frame.T_world_camera for frame in recording.frames])
     np.testing.assert_allclose(places, TRUTH.poses[-count:], atol=1e-4)
-    assert all((frame.read().depth > 0.0).any() for frame in recording.frames)
+    for frame, depth in zip(recording.frames, TRUTH.depths[-count:], strict=True):
+        assert np.median(np.abs(frame.read().depth - depth)) < 0.03  # a lens moves some
 
 
 def test_poses_of_euroc_are_read(tmp_path: Path) -> None:

@@ -1,94 +1,147 @@
-"""Recordings whose files say something wrong: the depth images tell what, and right ones are not accused."""
+"""Conventions that a recording's files state wrongly are named in its layout's words; right ones are not accused."""
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import DatasetError
-from regnf_data.agreement import check_agreement
 from regnf_data.recordings.opening import open_recording
+from regnf_data.recordings.recording import Given, check_recording
 from tests.data.recordings import writers
-from tests.data.recordings.truth import HEIGHT, WIDTH, K, Truth, walk
+from tests.data.recordings.truth import HEIGHT, WIDTH, Array, K, Truth, walk
 
-TRUTH = walk(12)
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def lengths() -> Any:
-    """(H, W): of rays whose part along the axis is 1."""
-    rows, columns = np.indices((HEIGHT, WIDTH)).astype(float)
-    return np.sqrt(1.0 + ((columns - K[0, 2]) / K[0, 0]) ** 2 + ((rows - K[1, 2]) / K[1, 1]) ** 2)
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+AT = np.eye(4)[3] * [[1.0], [1.0], [1.0], [0.0]]
+"""One where a pose has the camera's place."""
 
 
-def quaternions_rolled(poses: Any) -> Any:
-    """Poses whose quaternions were written w first and are read w last."""
-    rolled = poses.copy()
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    rolled[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, 1, axis=1)).as_matrix()
-    return rolled
+@cache
+def truth() -> Truth:
+    return walk(12)
 
 
-def told(truth: Truth, folder: Path, intrinsics: Any = None) -> str | None:
-    """What the check says of the recording as 7-Scenes has it."""
-    writers.seven_scenes(folder, truth)
-    if intrinsics is not None:
-        np.savetxt(next(folder.glob("*ntrinsic*")), intrinsics)
-    recording = open_recording(folder)
-    try:
-        return check_agreement(recording.posed_images(range(len(recording)), np.zeros((2, 3))))
-    except DatasetError as error:
-        return f"{error.reason}: {error} {error.hint}"
+def posed(change: Callable[[Array], Array]) -> Truth:
+    return replace(truth(), poses=change(truth().poses))
 
 
-WRONG: dict[str, tuple[Any, str]] = {
-    "the inverse of the poses": (lambda t: replace(t, poses=np.linalg.inv(t.poses)), "from the world to the camera"),
-    "OpenGL's axes": (lambda t: replace(t, poses=t.poses @ FLIP), "OpenGL's axes"),
-    "both": (lambda t: replace(t, poses=np.linalg.inv(t.poses @ FLIP)), "from the world to the camera and cameras"),
-    "distances along rays": (lambda t: replace(t, depths=t.depths * lengths()), "distances along the rays"),
-    "steps of 1/5000": (lambda t: replace(t, depths=5.0 * t.depths), "steps of 1/5000"),
-    "poses in millimeters": (
-        lambda t: replace(t, poses=np.concatenate([t.poses[:, :3, :3], 1000.0 * t.poses[:, :3, 3:]], axis=2)),
-        "poses in millimeters",
-    ),
-    "quaternions w first": (lambda t: replace(t, poses=quaternions_rolled(t.poses)), "w first"),
-    "poses one image off": (lambda t: replace(t, poses=np.roll(t.poses, 1, axis=0)), "poses [-+]1 images off"),
-    "poses in reverse": (lambda t: replace(t, poses=t.poses[::-1]), "in reverse order"),
-}
+def deep(change: Callable[[Array], Array]) -> Truth:
+    return replace(truth(), depths=change(truth().depths))
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_convention_is_named(name: str, tmp_path: Path) -> None:
-    change, said = WRONG[name]
-    truth = change(TRUTH)
-    if truth.poses.shape[1] == 3:
-        rows = np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(truth.poses), 1, 1))
-        truth = replace(truth, poses=np.concatenate([truth.poses, rows], axis=1))
-    assert re.search(said, str(told(truth, tmp_path)))
+def lengths() -> Array:
+    v, u = np.indices((HEIGHT, WIDTH)).astype(np.float64)
+    return np.asarray(np.sqrt(((u - K[0, 2]) / K[0, 0]) ** 2 + ((v - K[1, 2]) / K[1, 1]) ** 2 + 1.0))
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        (np.diag([2.0, 2.0, 1.0]) @ K, "are the intrinsics those of another resolution"),
-        (np.diag([0.5, 0.5, 1.0]) @ K, "intrinsics of images 0.5 times as large"),
-    ],
-)
-def test_intrinsics_of_other_images_are_named(wrong: Any, said: str, tmp_path: Path) -> None:
-    assert said in str(told(TRUTH, tmp_path, wrong))
+def edit(name: str, old: str, new: str) -> Callable[[Path], None]:
+    """Change a file by a pattern."""
+
+    def change(folder: Path) -> None:
+        path = folder / name
+        text, count = re.subn(old, new, path.read_text(), flags=re.MULTILINE)
+        assert count
+        path.write_text(text)
+
+    return change
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 12])
-@pytest.mark.parametrize("still", [False, True])
-def test_what_is_right_is_not_accused(count: int, still: bool, tmp_path: Path) -> None:
-    truth = walk(count)
-    if still:
-        truth = replace(truth, poses=np.repeat(truth.poses[:1], count, axis=0),
-                        depths=np.repeat(truth.depths[:1], count, axis=0))  # fmt: skip
-    assert told(truth, tmp_path) is None
+def half_the_intrinsics(folder: Path) -> None:
+    writers.text(folder / "camera-intrinsics.txt", np.diag([0.5, 0.5, 1.0]) @ (K + writers.HALF) - writers.HALF)
+
+
+def nothing(_: Path) -> None:
+    return None
+
+
+ROW = r"^(1\d\d\.\d+) (\S+ \S+ \S+) (\S+) (\S+) (\S+) (\S+)$"
+WRONG: dict[str, tuple[str, Callable[[], Truth], Callable[[Path], None], str]] = {
+    "OpenGL's axes": ("7scenes", lambda: posed(lambda T: T @ OPENGL), nothing, "--camera-axes opengl"),
+    "OpenCV's axes": ("nerfstudio", lambda: posed(lambda T: T @ OPENGL), nothing, "--camera-axes opencv"),
+    "world to camera": ("redwood", lambda: posed(np.linalg.inv), nothing, "Invert.*must lead from the camera to"),
+    "camera to world": ("bop", lambda: posed(np.linalg.inv), nothing, "cam_R_w2c.*must lead from the world to"),
+    "inverse and OpenGL": (
+        "scannet", lambda: posed(lambda T: np.linalg.inv(T @ OPENGL)), nothing, "pose/.*--camera-axes opengl"),
+    "along rays": ("replica", lambda: deep(lambda d: d * lengths()), nothing, "divide each by the length of its ray"),
+    "millimeters as 1/5000": ("tum", lambda: deep(lambda d: d / 5.0), nothing, "--depth-unit.*by 5"),
+    "another scale": ("colmap", lambda: deep(lambda d: d * 1.7), nothing, "--depth-unit.*by 0.58"),
+    "BOP's depth_scale 1": ("bop", truth, edit("scene_camera.json", '"depth_scale": 0.1', '"depth_scale": 1'),
+                            "depth_scale.*by 0.1;"),
+    "K of half the size": ("7scenes", truth, half_the_intrinsics,
+                           "camera-intrinsics.txt in pixels"),
+    "poses in millimeters": ("7scenes", lambda: posed(lambda T: T * (1.0 + 999.0 * AT)), nothing,
+                             "or divide the poses"),
+    "poses in reverse": ("scannet", lambda: posed(lambda T: T[::-1]), nothing, "own pose in pose/"),
+    "w first": ("tum", truth, edit("groundtruth.txt", ROW, r"\1 \2 \6 \3 \4 \5"), "quaternions of groundtruth.txt"),
+    "poses one off": ("redwood", lambda: posed(lambda T: np.roll(T, 1, axis=0)), nothing, "own pose in the trajectory"),
+    "order of text": (
+        "replica", lambda: posed(lambda T: T[[0, 1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9]]), nothing, "own pose in traj.txt"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_convention_is_named(wrong: str, tmp_path: Path) -> None:
+    layout, make, change, mend = WRONG[wrong]
+    folder = writers.FOLDERS[layout][0](tmp_path / "recording", make())
+    change(folder)
+    with pytest.raises(DatasetError, match="contradict each other") as found:
+        check_recording(open_recording(folder))
+    assert found.value.reason == "DATASET_FRAMES_DISAGREE"
+    assert re.search(mend, str(found.value.hint)), found.value.hint
+    assert "meta_data" not in str(found.value.hint)
+
+
+@pytest.mark.parametrize(("layout", "axes"), [("7scenes", "opengl"), ("nerfstudio", "opencv")])
+def test_what_the_hint_says_mends_it(layout: str, axes: str, tmp_path: Path) -> None:
+    folder = writers.FOLDERS[layout][0](tmp_path / "recording", posed(lambda T: T @ OPENGL))
+    assert check_recording(open_recording(folder, Given(axes=axes))) is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("frames", [[0], [0, 1], [0, 11], [0, 4, 8], [5] * 4, [*range(12)]], ids=str)
+def test_right_recordings_are_not_accused(frames: list[int], tmp_path: Path) -> None:
+    """One frame, two, ones that share little, a camera that stands still."""
+    some = Truth(truth().depths[frames], truth().colors[frames], truth().poses[frames], truth().stamps[: len(frames)])
+    for layout in ("7scenes", "bop", "nerfstudio"):
+        assert check_recording(open_recording(writers.FOLDERS[layout][0](tmp_path / layout, some))) is None
+
+
+# Intrinsics of which no file says the resolution.
+
+
+@pytest.mark.parametrize("of", ["depth", "color"])
+def test_intrinsics_are_of_the_images_whose_middle_they_have(of: str, tmp_path: Path) -> None:
+    """Color images twice as large as the depth images, and one matrix for both."""
+    folder = writers.seven_scenes(tmp_path / "recording", truth())
+    for path in folder.glob("*.color.png"):
+        writers.png(path, truth().colors[0].repeat(2, axis=0).repeat(2, axis=1))
+    if of == "color":
+        twice = np.diag([2.0, 2.0, 1.0]) @ (K + writers.HALF) - writers.HALF
+        writers.text(folder / "camera-intrinsics.txt", twice)
+    frame = open_recording(folder).frames[0].read()
+    np.testing.assert_allclose(frame.camera.K, K + writers.HALF)
+    assert frame.color_camera is not None
+    np.testing.assert_allclose(frame.color_camera.K, np.diag([2.0, 2.0, 1.0]) @ (K + writers.HALF))
+
+
+def test_intrinsics_of_another_resolution_are_refused_for_one_frame(tmp_path: Path) -> None:
+    writers.depth_png(tmp_path / "depth.png", truth().depths[0], 1000.0)
+    for values, said in (
+        ({"fx": 140, "fy": 144, "cx": 78.5, "cy": 62.5}, "intrinsics those of another resolution"),
+        ({"fx": 70, "fy": 72, "cx": 31, "cy": 39, "width": HEIGHT, "height": WIDTH}, "width and height exchanged"),
+        ({"K": K.T.tolist()}, "transposed"),
+        ({"K": [[70, 0, 39], [0, 72, 31], [0, 0, 0]]}, "not a camera matrix"),
+        ({"fx": float("nan"), "fy": 72, "cx": 39, "cy": 31}, "not finite"),
+        ({"fx": -70, "fy": 72, "cx": 39, "cy": 31}, "camera matrix"),
+        ({"fx": 0.7, "fy": 0.72, "cx": 39, "cy": 31}, "focal lengths"),
+    ):
+        (tmp_path / "camera.json").write_text(json.dumps(values))
+        with pytest.raises(DatasetError, match=said) as found:
+            open_recording(tmp_path).frames[0].read()
+        assert found.value.reason == "DATASET_INTRINSICS_INVALID"

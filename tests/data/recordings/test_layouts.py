@@ -7,10 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from regnf_core.errors import DatasetError
+from regnf_core.fields.build import open_field
+from regnf_data.recordings.camera import Camera
 from regnf_data.recordings.opening import open_recording
-from regnf_data.recordings.recording import Recording
+from regnf_data.recordings.recording import Frame, Recording, as_posed_images
+from regnf_fit.images.fusion import FusionOptions, fuse_images
 from tests.data.recordings import writers
 from tests.data.recordings.truth import HEIGHT, WIDTH, K, Truth, walk
 
@@ -94,8 +98,6 @@ def test_a_folder_of_recordings_names_them(tmp_path: Path) -> None:
 
 def test_a_lens_is_undone(tmp_path: Path) -> None:
     """Depth by the truth through a lens: the pinhole's image comes back where the lens saw it."""
-    from regnf_data.recordings.camera import Camera
-
     ideal = Camera(K + HALF, (HEIGHT, WIDTH))
     lens = Camera(K + HALF, (HEIGHT, WIDTH), "brown", (-0.2, 0.05, 0.001, -0.002, 0.0))
     # An image whose value is the slope of the ray, as the lens takes it: invert the lens by a fine search.
@@ -114,3 +116,26 @@ def test_a_lens_is_undone(tmp_path: Path) -> None:
     middle = (slice(15, 45), slice(20, 60))
     assert np.abs(taken - wanted)[middle].max() < 1.5 / K[0, 0]
     assert np.abs(image - wanted)[middle].max() > 1.5 / K[0, 0] * 0.5
+
+
+@pytest.mark.long
+def test_every_layout_gives_the_same_map(tmp_path: Path) -> None:
+    """Distances on the grid of the truth's own map differ by less than a voxel, mostly by far less."""
+    bounds = np.array([[-1.6, 0.2, -0.1], [1.2, 2.2, 1.5]])
+    options = FusionOptions(voxel=0.03, observation_voxels=32)
+    paths = {name: write(tmp_path / name, truth()) for name, (write, _) in writers.FOLDERS.items()}
+    paths |= {"mcap": writers.bag(tmp_path / "mcap", truth()), "db3": writers.bag(tmp_path / "db3", truth(), "sqlite3")}
+    own = [
+        Frame(str(number), depth.astype(np.float32), Camera(K + HALF, (HEIGHT, WIDTH)), pose)
+        for number, (depth, pose) in enumerate(zip(truth().depths, truth().poses, strict=True))
+    ]
+    report = fuse_images(as_posed_images(own, bounds), tmp_path / "own.safetensors", options)
+    points = torch.from_numpy(np.random.default_rng(0).uniform(*bounds, size=(50_000, 3))).float()
+    wanted = open_field(tmp_path / "own.safetensors").signed_distance(points)
+    near = wanted.abs() < 2.0 * report.voxel
+    for name, path in paths.items():
+        recording = open_recording(path)
+        fuse_images(recording.posed_images(range(len(recording)), bounds), tmp_path / f"{name}.safetensors", options)
+        apart = (open_field(tmp_path / f"{name}.safetensors").signed_distance(points) - wanted).abs()[near]
+        assert float(apart.quantile(0.99)) < report.voxel, name
+        assert float(apart.median()) < 0.1 * report.voxel, name

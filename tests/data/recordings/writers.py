@@ -26,6 +26,12 @@ def png(path: Path, image: NDArray[Any]) -> None:
     Image.fromarray(image).save(path)
 
 
+def png_bytes(image: NDArray[Any]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "PNG")
+    return file.getvalue()
+
+
 def depth_png(path: Path, depth: Array, steps_a_meter: float) -> None:
     """Whole steps; 0 for none."""
     png(path, np.round(depth * steps_a_meter).astype(np.uint16))
@@ -325,7 +331,5 @@ def _coded(depth: Array, coding: str) -> tuple[Any, ...]:
         return HEIGHT, WIDTH, coding, 0, 2 * WIDTH, np.frombuffer(millimeters.tobytes(), np.uint8)
     if coding == "32FC1":
         return HEIGHT, WIDTH, coding, 0, 4 * WIDTH, np.frombuffer(depth.astype(np.float32).tobytes(), np.uint8)
-    file = io.BytesIO()
-    Image.fromarray(millimeters).save(file, "PNG")
-    data = struct.pack("<iff", 0, 0.0, 0.0) + file.getvalue()
+    data = struct.pack("<iff", 0, 0.0, 0.0) + png_bytes(millimeters)
     return "16UC1; compressedDepth png", np.frombuffer(data, np.uint8)

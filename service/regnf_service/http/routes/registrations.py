@@ -259,7 +259,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
 def _check_parts(parts: Mapping[str, bytes]) -> None:
     """Raises Problem MALFORMED_MULTIPART."""
     if "request" not in parts:
-        raise Problem("MALFORMED_MULTIPART", "The part `request` is missing.")
+        raise Problem("MALFORMED_MULTIPART", "The part `request` is missing. It names the object, or `object` is sent.")
     if ("scene" in parts) == ("depth" in parts):
         raise Problem("MALFORMED_MULTIPART", "Send the part `scene`, or `depth` and `camera` of a frame.")
     needed = {"camera": "depth", "depth": "camera", "color": "depth", "mask": "depth"}
