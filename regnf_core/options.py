@@ -148,7 +148,7 @@ class RobustOptions:
     """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
     min_probability: _Share = 0.7
     """Minimum ``probability`` (0..1) of an answer; below it: LOW_PROBABILITY. Increase it for fewer wrong poses; an
-    answer below it is never accepted."""
+    answer below it is never accepted. For detections in images it is 0.9 at least."""
     share_limits_below: _Share = 0.9
     """Below this probability (0..1) the three limits that follow, of shares, must be kept too. 1: always, 0: never."""
     min_inlier_share: _Ratio = 0.6
@@ -164,7 +164,8 @@ class RobustOptions:
     max_occluded_share: _Ratio = 0.85
     """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
     Increase it for objects that were observed from one side only. Whatever it says, no pose is accepted at which more
-    than 0.95 is hidden: of such poses the probability knows nothing."""
+    than 0.95 is hidden: of such poses the probability knows nothing. For detections in images the probability knows of
+    hidden objects: the limit is 0.98 of the surface there, and this option says nothing."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score, and they are at most 20 times less likely. Increase it to list less exact symmetry equivalents

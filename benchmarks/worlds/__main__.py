@@ -109,12 +109,12 @@ def _evidence(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    rows, measured = (
+    rows, measured, beside = (
         [json.loads(line) for path in paths for line in _text(path).splitlines()]
-        for paths in (arguments.rows, arguments.measured)
+        for paths in (arguments.rows, arguments.measured, arguments.beside)
     )
     given = arguments.alone and ProbabilityModel.from_dict(json.loads(arguments.alone.read_text())["alone"])
-    found = training.trained(rows, arguments.left_out, arguments.calibrated_on, given, measured)
+    found = training.trained(rows, arguments.left_out, arguments.calibrated_on, given, measured, beside)
     arguments.output.write_text(json.dumps(found.model, indent=1) + "\n")
     if arguments.table is not None:
         title = f"# The verdict's probability in {arguments.left_out}s that were left out"
@@ -201,6 +201,9 @@ def _add_training(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     learning = commands.add_parser("train", help="the verdict's probability model")
     learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
     learning.add_argument("--measured", type=Path, nargs="*", default=[], help="the same, not trained with")
+    learning.add_argument(
+        "--beside", type=Path, nargs="*", default=[], help="the same of other scenes: trained with, not calibrated on"
+    )
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
     learning.add_argument("--diagram", type=Path, help="the same as a picture, the reliability diagram, SVG")

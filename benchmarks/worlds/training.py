@@ -35,8 +35,8 @@ from regnf_core.robust.verdict.answer import LEAD, SPEAKS_FOR_AMONG, Probability
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 Array = NDArray[np.float64]
-LeftOut = Literal["world", "part"]
-LEFT_OUT: tuple[LeftOut, ...] = ("world", "part")
+LeftOut = Literal["world", "part", "eighth"]
+LEFT_OUT: tuple[LeftOut, ...] = ("world", "part", "eighth")
 CalibratedOn = Literal["all", "chosen"]
 CALIBRATED_ON: tuple[CalibratedOn, ...] = ("all", "chosen")
 
@@ -53,6 +53,8 @@ MEASURED = {
 """What rows are not trained with, by their model, and what tables call them."""
 OF_OTHERS = 0.5
 """Weight of poses that no registration chose."""
+BESIDE = 0.1
+"""Weight of a pose of other scenes, which are trained with beside those that the model is for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +137,21 @@ def trained(
     calibrated_on: CalibratedOn = "all",
     alone: ProbabilityModel | None = None,
     measured: Sequence[dict[str, Any]] = (),
+    beside: Sequence[dict[str, Any]] = (),
 ) -> Trained:
     """A model from the rows of :mod:`benchmarks.worlds.evidence`.
 
     alone: the model of a pose alone, by which poses are chosen and lead: the one that is made knows a pose ``among``
     its candidates. None: it knows a pose ``alone`` · left_out: one world at a time, or a part with all of its meshes,
-    which no other part has · calibrated_on: the poses that the probabilities are to be right of on average, all or
-    those that registrations chose · measured: further rows, which nothing is trained with; objects are compared in
-    these. Of the features those count that all rows have: some rows are older than a feature.
+    which no other part has, or an eighth of the worlds · calibrated_on: the poses that the probabilities are to be
+    right of on average, all or those that registrations chose · measured: further rows, which nothing is trained with;
+    objects are compared in these · beside: rows of other scenes, which are trained with at a small weight, and neither
+    calibrated on nor in the table. Of the features those count that all rows have: some rows are older than a feature.
     """
-    taught = np.arange(len(rows) + len(measured)) < len(rows)
-    rows = [*rows, *measured]
+    own = len(rows)
+    taught = np.arange(own + len(beside) + len(measured)) < own + len(beside)
+    rows = [*rows, *beside, *measured]
+    of_model = ~taught | (np.arange(len(rows)) < own)
     names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
     models, chosen = np.array([row["model"] for row in rows]), np.array([row["winner"] for row in rows])
     alike = np.isin(models, list(MEASURED))
@@ -154,22 +160,23 @@ def trained(
         names,
         np.array([[row["features"][name] for name in names] for row in rows]),
         np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
-        np.where(chosen, 1.0, OF_OTHERS) * counts,
+        np.where(chosen, 1.0, OF_OTHERS) * counts * np.where(of_model, 1.0, BESIDE),
         np.array([_group(row, left_out) for row in rows]),
-        chosen | (calibrated_on == "all"),
+        of_model & (chosen | (calibrated_on == "all")),
     )
     of_alone = None if alone is None else _odds(rows, alone)
     if of_alone is not None:
         found = np.array([row["found"] for row in rows])
         evidence = evidence.with_feature(LEAD, _leads(rows, of_alone), found)
     model, odds = train(evidence)
-    used = [row for row, one in zip(rows, counts, strict=True) if one]
-    table = calibration_table(used, odds[counts])
+    shown = counts & of_model
+    used = [row for row, one in zip(rows, shown, strict=True) if one]
+    table = calibration_table(used, odds[shown])
     for asked, name in MEASURED.items():
         table += measured_line(name, [row for row in rows if row["model"] == asked], odds[models == asked])
         table += "" if of_alone is None else compared_line(asked, measured, of_alone[~taught])
     named = {"alone" if alone is None else "among": model.to_dict()}
-    return Trained(named, table, reliability_diagram(used, odds[counts]))
+    return Trained(named, table, reliability_diagram(used, odds[shown]))
 
 
 def _odds(rows: Sequence[dict[str, Any]], model: ProbabilityModel) -> Array:
@@ -179,7 +186,8 @@ def _odds(rows: Sequence[dict[str, Any]], model: ProbabilityModel) -> Array:
 
 
 def _group(row: dict[str, Any], left_out: LeftOut) -> str | int:
-    return str(row["part"]) if left_out == "part" else parts_of_name(row["world"])[1]
+    seed = parts_of_name(row["world"])[1]
+    return str(row["part"]) if left_out == "part" else seed % 8 if left_out == "eighth" else seed
 
 
 def _leads(rows: Sequence[dict[str, Any]], odds: Array) -> Array:

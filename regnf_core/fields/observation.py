@@ -137,13 +137,15 @@ class Observation:
     """A grid of cubic voxels, each UNSEEN, FREE or SURFACE (one was measured in it).
 
     states: (X, Y, Z) uint8 · low: (3,) float64, the grid's lowest corner · voxel: edge · T_grid_frame: from the frame
-    that points are given in to the grid's; None: the same.
+    that points are given in to the grid's; None: the same · of_thing: SURFACE is the surface of one thing
+    alone, the one of a detection; where others were measured is UNSEEN: nobody saw that thing there.
     """
 
     states: Tensor
     low: Tensor
     voxel: float
     T_grid_frame: Sim3 | None = None
+    of_thing: bool = False
 
     def at(self, points: Tensor) -> Tensor:
         """The states (N,) at points (N, 3) on the CPU; UNSEEN beyond the grid."""
@@ -167,6 +169,11 @@ class Observation:
             corners = self.T_grid_frame.inverse().apply(corners)
         return torch.stack([corners.amin(0), corners.amax(0)])
 
+    def measured(self) -> Tensor:
+        """(V, 3) float64: the middles of the voxels in which a surface was measured, in the points' frame."""
+        points = ((self.states == SURFACE).nonzero().double() + 0.5) * self.voxel + self.low.double()
+        return points if self.T_grid_frame is None else self.T_grid_frame.inverse().apply(points)
+
     def stored(self) -> tuple[ObservationGrid, NDArray[np.int32]]:
         """The grid and the tensor that a file keeps, both of the grid's own frame."""
         low, counts = self.low.tolist(), list(self.states.shape)
@@ -178,7 +185,7 @@ class Observation:
         T = self.T_grid_frame
         if T is None or float(T.scale) != 1.0 or not torch.equal(T.rotation, torch.eye(3).to(T.rotation)):
             return self
-        return Observation(self.states, self.low - T.translation, self.voxel)
+        return replace(self, low=self.low - T.translation, T_grid_frame=None)
 
     def seen_in(self, T_frame_new: Sim3) -> Observation:
         """The same for points of a new frame, which ``T_frame_new`` carries to the present one."""

@@ -200,6 +200,7 @@ class SearchConstants:
     # worlds]
     box_width: float = 0.25
     min_face_distance: float = 0.2  # diagonals: shorter edges count as so long; flat things' boxes are not [by hand]
+    facing_cosine: float = -0.2  # of normal and line of sight, below: surface that faces the camera [by hand]
     seed_tolerance: float = 2.0  # so many times as far as poses may seeds, which are rough, leave the box [by hand]
     batch: int = 512  # poses at once: bounds memory, and stays in the processor's cache [by hand]
     grid_cells: int = 40  # along each edge of a distance grid [by hand]
@@ -260,6 +261,11 @@ class VerdictConstants:
     # Share of the object's samples that may be hidden, wherever they lie: of 696 right poses of scenes of which it is
     # known none has more than .935, so the probability knows nothing of poses beyond. [random worlds]
     max_hidden: float = 0.95
+    # The same where a detection in an image says which surface is the thing's. [simulated frames]
+    max_hidden_of_thing: float = 0.98
+    # The least probability there: of 157 answers, eighths of the objects left out, 1 of 59 from here on is wrong, 1 of
+    # 7 from .8 to it, and 4 of 14 from .6 to .8. [simulated frames]
+    min_probability_of_thing: float = 0.9
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
     # better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right
     # after it, and 11 instead of 17 answers are wrong. [random worlds]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import count
@@ -30,6 +31,7 @@ from regnf_core.robust.search.bounds import (
     ScaleBound,
     seed_poses,
     seed_poses_around,
+    seen_seeds,
     start_rotations,
 )
 from regnf_core.robust.search.distance_grid import feature_seeds
@@ -120,9 +122,13 @@ def _starts(
 def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
     """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
     box, device = view.detection, view.foreground.points.device
+    scene, obj = view.foreground.on_surface(), model.samples.on_surface()
+    if view.of_thing and scale.log_width < math.inf:
+        middle = math.sqrt(scale.low * scale.high)
+        return seen_seeds(scene, obj, model.samples.normals, box.rotation.to(device), rotations.to(device), middle)
     return seed_poses(
-        view.foreground.on_surface(),
-        model.samples.on_surface(),
+        scene,
+        obj,
         box.rotation.to(device),
         (box.size / box.diagonal).to(device),
         rotations.to(device),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.bundle import Bundle
@@ -62,4 +62,5 @@ def make_problem(
 def pose_bound(view: SceneView, model: ObjectModel, options: RobustOptions) -> PoseBound:
     """What the detection and the options say of poses between the working frames."""
     scale = ScaleBound.of(options, view.frame.length, model.frame.length)
-    return PoseBound.of(view.detection, model.extremal_points, options.box_tolerance, scale)
+    bound = PoseBound.of(view.detection, model.extremal_points, options.box_tolerance, scale)
+    return replace(bound, seen=view.of_thing)

@@ -285,6 +285,12 @@ class SceneView(Bundle):
     evaluations: int
     observation: WorkingObservation | None = None
 
+    @property
+    def of_thing(self) -> bool:
+        """Whether a detection in an image said which surface is the thing's, see
+        :class:`regnf_core.fields.observation.Observation`; the box has that camera's axes then."""
+        return self.observation is not None and self.observation.of_thing
+
     def field(self, scene: SdfField) -> WorkingField:
         """The scene's field, the one that this view is of, in the working frame."""
         return WorkingField(scene, self.frame)
@@ -331,7 +337,9 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
         half = (detection.size / detection.diagonal / 2).to(observed.points)
         outside = ~((observed.points @ detection.rotation.to(observed.points)).abs() <= half).all(-1)
     edges = detection.rotation.mT * (detection.size / detection.diagonal)[:, None]
-    foreground = observed[~support_planes(observed, generator, edges, outside)]
+    foreground = observed
+    if observation is None or not observation.of_thing:  # else what the thing stands on is known
+        foreground = observed[~support_planes(observed, generator, edges, outside)]
     if len(foreground) < SCENE.min_foreground:
         foreground = observed if len(observed) >= SCENE.min_foreground else everything
     share = float(removed.float().mean())

@@ -207,6 +207,7 @@ class WorkingObservation:
         ahead = (clearance(observation) / to_cells).float()
         states, counts = observation.states.reshape(-1), torch.tensor(observation.states.shape)
         self._observation = observation
+        self.of_thing = observation.of_thing
         # A point x is in the voxel floor(x turn + shift), z fastest.
         self._parts = CopiedOnce(states, counts, turn, shift, ahead)
 
@@ -316,7 +317,15 @@ def sample_scene_surface(
     def value(local: Tensor) -> Tensor:
         return field.value(local.to(rotation) @ rotation.T)
 
-    cells, space = surface_cells(value, -half, half, SAMPLING.scene_base, SAMPLING.levels)
+    low, high = -half, half
+    known = observation_of(scene)
+    if known is not None and known.of_thing and len(seen := known.measured()):
+        # Finely where the thing was seen, not where its back may be.
+        seen = frame.into(seen).double() @ rotation
+        edge = known.voxel / detection.diagonal
+        low, high = low.maximum(seen.amin(0) - edge), high.minimum(seen.amax(0) + edge)
+        low, high = (low, high) if bool((high > low).all()) else (-half, half)
+    cells, space = surface_cells(value, low, high, SAMPLING.scene_base, SAMPLING.levels)
     cells = Cells(cells.centers @ rotation.T, cells.values, cells.edge)
     found = _samples_near(field, cells, limit, generator)
     axes = rotation.to(found.points)

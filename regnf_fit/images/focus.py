@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import product, zip_longest
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from regnf_data.recordings.recording import Frame
 from regnf_fit.images.observing import pixel_planes
 
 Floats = NDArray[np.float64]
+Masks = Sequence[NDArray[np.bool_]]
 
 _MOST_NODES = 1_000_000
 _SHARP = 0.25
@@ -36,6 +37,9 @@ _BEHIND = 8.0
 """Voxels behind a surface that count as matter; what lies farther behind it was not seen."""
 _AROUND = 8
 """Pixels around the region's picture, for the planes at its edge."""
+_FEW, _TRIED, _PLANES, _PLANE_SHARE, _ALONG = 3000, 100, 3, 0.15, 0.8
+"""Points beside the thing that planes are looked for in, those that one is tried through, planes at most, the share of
+the points on one, and the cosine between its normal and theirs."""
 _MARGIN = 1.5
 """Voxels before a surface that are not called free yet, and as many standard deviations of the depth."""
 
@@ -44,10 +48,12 @@ _MARGIN = 1.5
 class _View:
     """What one image measured in the region, in the region's frame. points, normals: (P, 3) · T_camera_region: (4, 4) ·
     K: (3, 3), of the part of the image that shows the region · depth: (H, W) of that part, 0 for none ·
-    margin: (H, W), a standard deviation of the depth."""
+    margin: (H, W), a standard deviation of the depth · told: (P,) 1 for points
+    of the thing of a detection, -1 for those beside it, 0 where the image has none."""
 
     points: Floats
     normals: Floats
+    told: NDArray[np.int8]
     T_camera_region: Floats
     K: Floats
     depth: NDArray[np.float32]
@@ -55,20 +61,24 @@ class _View:
 
 
 def focused_field(
-    frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None, spread: float = 0.0
+    frames: Sequence[Frame], region: OrientedBox, voxel: float | None = None, spread: float = 0.0, things: Masks = ()
 ) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
+    things: of the first frames, (H, W) each, where they show the thing of a detection. What they show beside it hides
+    and is in the way, but nobody saw the thing there: its surface counts as unobserved.
     voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
     nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
     spread: a standard deviation of depths from frame to frame, beside the noise of each.
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image measured a surface in the region.
     """
     T_region_world, half = region_frame(region)
-    views = [view for frame in frames if (view := _view(frame, T_region_world, half)) is not None]
+    pairs = zip_longest(frames, things)
+    views = [view for frame, thing in pairs if (view := _view(frame, T_region_world, half, thing)) is not None]
     if not views:
         raise DatasetError("no depth image shows a surface in the region", reason="DATASET_NOTHING_IN_BOUNDS")
-    points, normals = (np.concatenate([getattr(one, name) for one in views]) for name in ("points", "normals"))
+    measured = ((one.points, one.normals, one.told) for one in views)
+    points, normals, told = (np.concatenate(part) for part in zip(*measured, strict=True))
     edge = max(voxel or _pixel_width(views), float(np.prod(2.0 * half) / _MOST_NODES) ** (1.0 / 3.0))
     shape = tuple(int(n) for n in np.ceil(2.0 * half / edge) + 1)
     low = -half
@@ -76,7 +86,8 @@ def focused_field(
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     free, behind = _carved(nodes, views, edge, spread)
     values = _distances(nodes, points, normals, behind, low, edge, shape)
-    observation = _observation(points, free.reshape(shape), low, edge, shape)
+    told = np.where((told == 0) & _on_planes(points, normals, told, 2.0 * edge), np.int8(-1), told)
+    observation = _observation(points, told, free.reshape(shape), low, edge, shape)
     high = low + edge * (np.array(shape) - 1)
     origin, top, step = (torch.from_numpy(v.astype(np.float32)) for v in (low, high, np.full(3, edge)))
     function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step), origin, top, 1.0)
@@ -98,7 +109,7 @@ def surface_in(frame: Frame, T_region_world: Floats, half: Floats, around: float
     return (np.zeros((0, 3)), np.zeros((0, 3))) if view is None else (view.points, view.normals)
 
 
-def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
+def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.bool_] | None = None) -> _View | None:
     """The pixels whose surface lies in the region; those that share a plane with too few others are left out: at edges
     sensors mix two depths."""
     T_region_camera = T_region_world @ frame.T_world_camera
@@ -119,7 +130,8 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats) -> _View | None:
     if not inside.any():
         return None
     normals = planes.normals[row[inside], column[inside]].astype(np.float64) @ T_region_camera[:3, :3].T
-    return _View(points[inside], normals, T_camera_region, K, kept, planes.deviations)
+    told = np.zeros(len(points), np.int8) if thing is None else np.where(thing[rows, columns][row, column], 1, -1)
+    return _View(points[inside], normals, told[inside], T_camera_region, K, kept, planes.deviations)
 
 
 def _part(frame: Frame, T_camera_region: Floats, half: Floats) -> tuple[slice, slice]:
@@ -196,10 +208,36 @@ def _distances(
     return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32).reshape(shape)
 
 
+def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:
+    """(P,): on a plane that holds much of what lies beside the thing, as a table, and little of the thing: what such a
+    plane shows to other images, where the thing hid it, is not the thing's either."""
+    out = np.zeros(len(points), np.bool_)
+    beside, thing = np.flatnonzero(told < 0), told > 0
+    if not len(beside) or not (told == 0).any():
+        return out
+    left = np.random.default_rng(0).permutation(beside)[:_FEW]
+    total = len(left)
+    for _ in range(_PLANES):
+        if len(left) < _PLANE_SHARE * total:
+            break
+        tried = normals[left[:_TRIED]]
+        offsets = np.einsum("tc,tc->t", tried, points[left[:_TRIED]])
+        on = (np.abs(points[left] @ tried.T - offsets) <= within) & (normals[left] @ tried.T >= _ALONG)
+        best = int(on.sum(axis=0).argmax())
+        if on[:, best].sum() < _PLANE_SHARE * total:
+            break
+        there = (np.abs(points @ tried[best] - offsets[best]) <= within) & (normals @ tried[best] >= _ALONG)
+        if there[thing].mean() < _PLANE_SHARE:
+            out |= there
+        left = left[~on[:, best]]
+    return out
+
+
 def _observation(
-    points: Floats, free: NDArray[np.bool_], low: Floats, edge: float, shape: tuple[int, ...]
+    points: Floats, told: NDArray[np.int8], free: NDArray[np.bool_], low: Floats, edge: float, shape: tuple[int, ...]
 ) -> Observation:
-    """Voxels of two nodes' edge: free where all their nodes are, a surface where a point lies."""
+    """Voxels of two nodes' edge: free where all their nodes are, a surface where a point lies, but for those where
+    points beside the thing lie and none of it."""
     counts = tuple(max(1, -(-(n - 1) // 2)) for n in shape)
     states = np.full(counts, UNSEEN, np.uint8)
     padded = np.zeros(tuple(2 * n for n in counts), np.bool_)
@@ -209,6 +247,16 @@ def _observation(
     blocks = padded.reshape(counts[0], 2, counts[1], 2, counts[2], 2)
     states[blocks.all(axis=(1, 3, 5))] = FREE
     cells = np.floor((points - low) / (2.0 * edge)).astype(np.int64)
-    cells = cells[((cells >= 0) & (cells < np.array(counts))).all(axis=1)]
-    states[tuple(cells.T)] = SURFACE
-    return Observation(torch.from_numpy(states), torch.from_numpy(low.copy()), 2.0 * edge)
+    within = ((cells >= 0) & (cells < np.array(counts))).all(axis=1)
+    surfaces = np.zeros((3, *counts), np.bool_)
+    for layer, which in enumerate((0, -1, 1)):
+        surfaces[layer][tuple(cells[within & (told == which)].T)] = True
+    shown, beside, thing = surfaces
+    somebody = shown
+    if thing.any():  # what other images show may be the thing's where it goes on from what the detection shows
+        somebody = shown & ~ndimage.binary_dilation(beside, iterations=2)
+        pieces, _ = ndimage.label(somebody | thing, np.ones((3, 3, 3)))
+        somebody &= np.isin(pieces, np.unique(pieces[thing]))
+        states[beside | shown] = UNSEEN
+    states[somebody | thing] = SURFACE
+    return Observation(torch.from_numpy(states), torch.from_numpy(low.copy()), 2.0 * edge, of_thing=bool(thing.any()))

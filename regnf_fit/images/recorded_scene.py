@@ -63,6 +63,7 @@ def recorded_scene(
     """
     options = options or RegistrationOptions()
     said: Unit = options.robust.object_unit if recording.is_metric else "free"
+    first: list[Lifted] = []
     own: list[Frame] = []
     told: tuple[str, ...] = ()
     if isinstance(detection, OrientedBox):
@@ -87,7 +88,7 @@ def recorded_scene(
     disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)))) if len(frames) > 1 else None
     aligned = align_frames(frames, region)
     frames = list(aligned.frames)
-    field = focused_field(frames, region, spread=aligned.spread)
+    field = focused_field(frames, region, spread=aligned.spread, things=[one.pixels for one in first])
     frame = frames[0] if own else max(frames, key=lambda one: _shown(one, box))
     camera = CameraView(frame.name, Sim3.from_matrix(frame.T_world_camera.tolist()), METERS.get(unit))
     known = replace(options, robust=replace(options.robust, object_unit=unit))

@@ -53,6 +53,23 @@ def test_distances_near_the_seen_surface_are_those_of_the_ball(noise: float) -> 
     assert [int(observation.at(p)) for p in (before, on, behind)] == [FREE, SURFACE, UNSEEN]
 
 
+def test_nobody_saw_the_thing_where_an_image_shows_others() -> None:
+    frame, ball = ball_image()
+    left = ball & (np.arange(ball.shape[1]) < np.median(np.nonzero(ball)[1]))
+    frame = replace(frame, T_world_camera=TURN)
+    told, all_of_it = (focused_field([frame], region(), things=[mask]) for mask in (left, ball))
+    observation, whole = observation_of(told), observation_of(all_of_it)
+    assert observation is not None
+    assert whole is not None
+    assert observation.of_thing
+    middle = (observation.measured() - world(CENTER[None])) @ torch.from_numpy(TURN[:3, :3].copy())
+    assert 0.3 < len(middle) / len(whole.measured()) < 0.7
+    assert float(middle[:, 0].max()) < float(-middle[:, 0].min()) / 2.0, "no surface right of the middle"
+    points = world(CENTER + 0.1 * np.random.default_rng(0).normal(size=(500, 3)))
+    assert torch.equal(told.signed_distance(points), all_of_it.signed_distance(points)), "what is there, is there"
+    assert torch.equal(observation.at(points) == FREE, whole.at(points) == FREE)
+
+
 def test_a_region_without_a_surface_is_refused() -> None:
     frame, _ = ball_image()
     with pytest.raises(DatasetError, match="no depth image shows a surface in the region") as found:

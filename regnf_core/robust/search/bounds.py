@@ -70,7 +70,8 @@ class PoseBound(Bundle):
     points: (E, 3) outermost points of the object · axes: (3, 3) the box's, columns, scene frame · edges: (3,) of the
     box · tolerance: how far the object may reach beyond each of the box's faces, as a share of the edge. The edges of
     flat boxes count as SEARCH.min_face_distance there: a flat thing's field may be much thicker than its box ·
-    scale: what the caller knows of it.
+    scale: what the caller knows of it · seen: the box is of what an image shows of the object: other things may hide
+    the rest, so the object may reach beyond by its own extent too, and nothing is said of where it ends.
     """
 
     points: Tensor
@@ -78,6 +79,7 @@ class PoseBound(Bundle):
     edges: Tensor
     tolerance: float
     scale: ScaleBound = ANY_SCALE
+    seen: bool = False
 
     @classmethod
     def of(
@@ -92,13 +94,16 @@ class PoseBound(Bundle):
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""
         placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
         low, high = placed.amin(-2), placed.amax(-2)
-        reach = self.edges / 2 + self.tolerance * self._lengths
+        beyond = torch.maximum(self._lengths, high - low) if self.seen else self._lengths
+        reach = self.edges / 2 + self.tolerance * beyond
         within = (low >= -reach).all(-1) & (high <= reach).all(-1)  # the box's center is 0
         size = ((high - low) / self._lengths).amax(-1)
         return within & (size >= SEARCH.min_share_of_detection)
 
     def penalty(self, T: Sim3) -> Tensor:
         """(H,): how badly the posed object fills the box, as a score: a Geman-McClure loss over the box's six faces."""
+        if self.seen:
+            return torch.zeros_like(T.scale)
         placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
         off = torch.cat([placed.amin(-2) + self.edges / 2, placed.amax(-2) - self.edges / 2], -1)
         off = off / self._lengths.repeat(2)
@@ -146,6 +151,27 @@ def seed_poses(
     by_points = _from_extents(rotations, box_axes, (low, high), (lowest, highest))
     by_box = _from_extents(rotations, box_axes, (low, high), (-box_size[None] / 2, box_size[None] / 2))
     return Sim3.cat([by_moments, bound.limited_poses(by_points), bound.limited_poses(by_box)])
+
+
+def seen_seeds(scene: Tensor, points: Tensor, normals: Tensor, axes: Tensor, rotations: Tensor, scale: float) -> Sim3:
+    """Poses T_object_scene (2K,), as those of ``seed_poses``, of an object of known scale that one image shows.
+
+    Its side that faces the camera is laid on what was seen: for every rotation by the middle of that side, and by its
+    nearest point and the middles across. scene: (N, 3) · points, normals: (M, 3) of the object · axes: (3, 3), columns,
+    the camera's, the last one away from it.
+    """
+    scene, points, axes = scene.double(), points.double(), axes.double()
+    turned = rotations @ axes  # (K, 3, 3): the camera's axes in the object's frame
+    facing = (normals.double() @ turned[:, :, 2].mT < SEARCH.facing_cosine).double()  # (M, K)
+    of_side = facing.mT @ points / facing.sum(0).clamp_min(1.0)[:, None]
+    by_side = of_side - scale * (rotations @ scene.mean(0))
+    low, high = _object_extents(points, rotations, axes)
+    seen = scene @ axes
+    object_end, scene_end = (low + high) / 2.0, (seen.amin(0) + seen.amax(0)) / 2.0
+    object_end[:, 2], scene_end[2] = low[:, 2], seen[:, 2].amin()
+    by_end = (turned @ (object_end - scale * scene_end)[..., None]).squeeze(-1)
+    s = scene.new_full((2 * len(rotations),), scale)
+    return Sim3(s, rotations.repeat(2, 1, 1), torch.cat([by_side, by_end]))
 
 
 def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:

@@ -90,13 +90,16 @@ def _alike(symmetry: SelfSymmetry) -> Sim3:
 #
 # "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make
 # equal. The functions are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).
-# The second sum has two models: one for scenes of which it is known what was seen, one for the others. What a feature
-# tells depends on that: a field has surface that nobody saw, and only an observation says which it is.
+# The second sum has several models: one for scenes of which it is known what was seen, one for the others. What a
+# feature tells depends on that: a field has surface that nobody saw, and only an observation says which it is. Where a
+# detection in an image says which surface is the thing's, it has a third one: nothing else is sampled, one side of the
+# thing was seen, and depths of one image are noisier than a map.
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
 _ALONE = "probability-alone.json"
 _AMONG = {True: "probability-observed.json", False: "probability-unobserved.json"}
+_OF_THING = "probability-thing.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,9 +176,10 @@ class PoseOdds:
 
 
 @cache
-def pose_odds(observed: bool) -> PoseOdds:
-    """The models that are shipped. observed: whether it is known what was seen of the scene."""
-    among = _stored(_AMONG[observed], "among")
+def pose_odds(observed: bool, of_thing: bool = False) -> PoseOdds:
+    """The models that are shipped. observed: whether it is known what was seen of the scene · of_thing: whether a
+    detection said which surface is the thing's."""
+    among = _stored(_OF_THING if of_thing else _AMONG[observed], "among")
     return PoseOdds(_stored(_ALONE, "alone"), among, None if observed else _stored(_AMONG[True], "among"))
 
 
@@ -210,7 +214,8 @@ def choose(
     rival_margin: float,
 ) -> Answer:
     """The answer from the candidates' features, each (H,), and scores (H,), all on the CPU."""
-    odds = pose_odds(problem.view.observation is not None)
+    observation = problem.view.observation
+    odds = pose_odds(observation is not None, observation is not None and observation.of_thing)
     alone, scores = odds.alone.logit(features), scores.double()
     demerits = -merits(alone, scores)
     winner = int(demerits.argmin())

@@ -72,20 +72,25 @@ class _Limit:
         return f"{self.name} {value}, {rule}"
 
 
+_MOST_HIDDEN = {False: VERDICT.max_hidden, True: VERDICT.max_hidden_of_thing}
+
+
 def evaluate_pose(
-    held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float
+    held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float, of_thing: bool = False
 ) -> PoseVerdict:
     """The verdict on pose number ``index``, which ``rivals`` other poses equal.
 
-    probability: that the pose or one of its rivals is right, 0..1.
+    probability: that the pose or one of its rivals is right, 0..1 · of_thing: an image showed the object from one side,
+    and a mask or a box said where. Most of it is hidden then, and what was said is off by some pixels: the probability
+    has learned from such poses, so neither rejects one by itself.
     Written so that a number that is not finite can only lead to a rejection.
     """
     told, hidden = held_out.of(index), float(held_out.features["hidden"][index])
-    limits = [
-        _Limit("TOO_LITTLE_SURFACE", "occluded share", told["occluded_share_object"], options.max_occluded_share, True),
-        _Limit("TOO_LITTLE_SURFACE", "hidden share", hidden, VERDICT.max_hidden, True),
-    ]
-    if held_out.evidence.partial or hidden > VERDICT.mostly_hidden:
+    limits = [_Limit("TOO_LITTLE_SURFACE", "hidden share", hidden, _MOST_HIDDEN[of_thing], True)]
+    if not of_thing:
+        occluded, most = told["occluded_share_object"], options.max_occluded_share
+        limits.insert(0, _Limit("TOO_LITTLE_SURFACE", "occluded share", occluded, most, True))
+    if not of_thing and (held_out.evidence.partial or hidden > VERDICT.mostly_hidden):
         allowed = VERDICT.unexplained + VERDICT.unexplained_per_noise * told["residual_rms"]
         unexplained = told["unexplained_share_scene"]
         limits.append(_Limit("SURFACE_UNEXPLAINED", "unexplained share", unexplained, allowed, True))
@@ -98,7 +103,8 @@ def evaluate_pose(
             _Limit("LOW_OVERLAP", "scene inliers", told["inlier_share_scene"], enough),
             _Limit("SCENE_UNEXPLAINED", "explained share", explained, options.min_explained_share),
         ]
-    limits.append(_Limit("LOW_PROBABILITY", "probability", probability, options.min_probability))
+    least = max(options.min_probability, VERDICT.min_probability_of_thing) if of_thing else options.min_probability
+    limits.append(_Limit("LOW_PROBABILITY", "probability", probability, least))
     margin = min(one.slack for one in limits)
     if not bool(held_out.admitted[index]):
         return PoseVerdict("rejected", "OUTSIDE_DETECTION", -1.0)
@@ -126,7 +132,7 @@ def considered_poses(
     poses = []
     for number in chosen.tolist():
         likely = float(answer.probability[number])
-        found = evaluate_pose(held_out, number, 0, options, likely)
+        found = evaluate_pose(held_out, number, 0, options, likely, problem.view.of_thing)
         T = problem.in_field_frames(candidates.T[number])
         metrics = {**held_out.of(number), "probability": likely}
         poses.append(ConsideredPose(T, found.reason, metrics, found.broken))
@@ -209,7 +215,7 @@ def evaluate_candidates(
     scores = held_out.evidence.numbers["score"]
     answer = choose(problem, candidates, held_out.features, scores, options.robust.rival_margin)
     winner, likely = answer.winner, float(answer.probability[answer.winner])
-    found = evaluate_pose(held_out, winner, len(answer.rivals), options.robust, likely)
+    found = evaluate_pose(held_out, winner, len(answer.rivals), options.robust, likely, problem.view.of_thing)
     T = problem.in_field_frames(candidates.T[winner])
     metrics = {
         **held_out.of(winner),

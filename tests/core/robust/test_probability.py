@@ -98,29 +98,28 @@ def test_what_is_mostly_hidden_at_the_best_pose_is_known_to_be(hidden: float, as
     assert torch.equal(pose_odds(False).log_odds(fewer, scores, apart), found) is as_if_observed
 
 
-OBSERVED = pytest.mark.parametrize("observed", [True, False])
+ODDS = pytest.mark.parametrize("odds", [pose_odds(True), pose_odds(False), pose_odds(True, of_thing=True)])
 
 
-@OBSERVED
+@ODDS
 @given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
-def test_the_shipped_models_are_monotone(observed: bool, name: str, low: float, step: float) -> None:
+def test_the_shipped_models_are_monotone(odds: PoseOdds, name: str, low: float, step: float) -> None:
     others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}
     changed = others | {name: torch.tensor([low, low + step], dtype=torch.float64)}
-    odds, single = pose_odds(observed), torch.zeros(2, 2, dtype=torch.bool)
+    single = torch.zeros(2, 2, dtype=torch.bool)
     for logits in (odds.alone.logit(changed), odds.log_odds(changed, torch.full((2,), 0.3), single)):
         less, more = logits.tolist()
         assert more >= less if SPEAKS_FOR[name] else more <= less
 
 
-@OBSERVED
-def test_the_shipped_models_use_what_they_must(observed: bool) -> None:
+@ODDS
+def test_the_shipped_models_use_what_they_must(odds: PoseOdds) -> None:
     """A pose that is perfect in all respects is likely; one in free space, or without any agreement, is not; one of two
     perfect poses is less likely than a single one."""
     best = {name: torch.tensor([1e3 if better else -1e3] * 2).double() for name, better in SPEAKS_FOR.items()}
     worst = {name: -values for name, values in best.items()}
     single, several = torch.zeros(2, 2, dtype=torch.bool), ~torch.eye(2, dtype=torch.bool)
     alike = torch.full((2,), 0.3)
-    odds = pose_odds(observed)
     likely = float(odds.log_odds(best, alike, single)[0].sigmoid())
     assert likely > 0.98, "among the others: what results tell"
     for logits in (odds.alone.logit(worst), odds.log_odds(worst, alike, single)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -106,6 +107,15 @@ def test_extent_and_place(edge: float, center: tuple[float, float, float], toler
     assert bound(tolerance).admits(placed(edge, center)).tolist() == [admitted]
 
 
+def test_an_object_may_reach_beyond_what_was_seen_of_it_by_its_own_extent() -> None:
+    """A third of it is seen: the box holds that part, at one end of the object."""
+    poses = Sim3.cat([placed(3.0, (1.0, 0.0, 0.0)), placed(3.0, (1.0, 1.0, 1.0)), placed(3.0, (3.1, 0.0, 0.0))])
+    seen = replace(bound(0.7), seen=True)
+    assert bound(0.7).admits(poses).tolist() == [False, False, False]
+    assert seen.admits(poses).tolist() == [True, True, False]
+    assert seen.penalty(poses).tolist() == [0.0, 0.0, 0.0], "nobody knows where it ends"
+
+
 def test_the_boxs_own_axes_count() -> None:
     """A box turned by 45 degrees about z sees the cube's diagonal, sqrt 2 edges long."""
     half = math.sqrt(0.5)
@@ -172,6 +182,19 @@ def test_the_pose_is_among_the_seeds_at_any_scale() -> None:
     again = feature_seeds(one.samples, two.samples, 4, seed=1)
     torch.testing.assert_close(again.rotation, found.rotation, rtol=0, atol=0)
     torch.testing.assert_close(again.scale, found.scale, rtol=0, atol=0)
+
+
+def test_the_side_that_the_camera_sees_is_laid_on_what_was_seen() -> None:
+    """Of a ball one side is seen: its middle is half a radius before the ball's."""
+    normals = unit_directions()
+    truth = Sim3(torch.tensor(1.5).double(), super_fibonacci(24)[7], torch.tensor([0.3, -0.2, 0.1]).double())
+    axes = super_fibonacci(24)[3]
+    seen = normals.double() @ truth.rotation @ axes[:, 2] < SEARCH.facing_cosine
+    scene = truth.inverse().apply(0.5 * normals[seen].double())
+    seeds = bounds.seen_seeds(scene, 0.5 * normals, normals, axes, super_fibonacci(24), 1.5)
+    middle = seeds.inverse().apply(torch.zeros(1, 3).double())[:, 0]
+    assert len(seeds) == 48
+    assert torch.allclose(middle, truth.inverse().translation.expand_as(middle), atol=0.02)
 
 
 def test_too_small_a_cloud_gives_no_seed() -> None:

@@ -235,7 +235,7 @@ def test_a_pose_of_extreme_scale_far_away_has_features_too(problem: Registration
 
 LONG = ([-0.4, -0.1, -0.1], [0.4, 0.1, 0.1])
 """A long box: turned half about an upright axis it is the same, moved along its length by .05 nearly so."""
-OBSERVED = object()
+OBSERVED = SimpleNamespace(of_thing=False)
 GOOD = {name: 1.0 if better else 0.0 for name, better in SPEAKS_FOR.items()}
 
 

@@ -137,7 +137,7 @@ def test_a_thing_is_lifted_to_its_box(kind: str) -> None:
         "mask": ImageDetection(mask=shown),
         "mask grown": ImageDetection(mask=grown(shown, 4)),
         "mask shrunk": ImageDetection(mask=grown(shown, -3)),
-        "box": ImageDetection(box_2d=tight),  # type: ignore[arg-type]
+        "box": ImageDetection(box_2d=tight),
         "box loose": ImageDetection(box_2d=(tight[0] - 9, tight[1] - 9, tight[2] + 9, tight[3] + 9)),
         "point": ImageDetection(point_2d=middle),
         "point beside": ImageDetection(point_2d=(middle[0] + 8, middle[1] - 6)),
@@ -203,7 +203,7 @@ def test_a_mask_is_in_pixels_of_the_image_with_its_lens(colored: bool, tmp_path:
     write_recording(Recording("r", "frames", (stored,)), [0], tmp_path / "r.safetensors")
     rows, columns = np.indices((H, W))
     corner = (rows > 88) & (rows < 104) & (columns > 128) & (columns < 144)
-    seen = bent.project(CAMERA.rays(np.stack(np.nonzero(corner)[::-1], axis=1) + 0.5))
+    seen = bent.project(CAMERA.rays(np.stack(np.nonzero(corner)[::-1], axis=1).astype(np.float64) + 0.5))
     assert np.abs(seen - (np.stack(np.nonzero(corner)[::-1], axis=1) + 0.5)).max() > 3.0
     mask = np.zeros((H, W), np.bool_)
     mask[np.floor(seen[:, 1]).astype(int), np.floor(seen[:, 0]).astype(int)] = True
