@@ -38,6 +38,6 @@ def test_every_page_that_a_message_names_is_there() -> None:
 
 
 def test_hints_name_the_command(tmp_path: Path, run: Run) -> None:
-    picture = tmp_path / "photo.png"
-    picture.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(600))
+    picture = tmp_path / "photo.webp"
+    picture.write_bytes(b"RIFF\x00\x01\x00\x00WEBP" + bytes(600))
     assert "`regnf manual import-gate`" in run("inspect", picture).stderr

@@ -15,8 +15,8 @@ from regnf_cli.main import _set_threads
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 NEEDED = {
     "PIL", "annotated_doc", "annotated_types", "click", "numpy", "pydantic", "pydantic_core", "regnf_cli", "regnf_core",
-    "rich", "safetensors", "scipy", "shellingham", "torch", "torchgen", "typer", "typing_extensions",
-    "typing_inspection",
+    "regnf_data", "regnf_fit", "rich", "safetensors", "scipy", "shellingham", "torch", "torchgen", "typer",
+    "typing_extensions", "typing_inspection", "yaml",
 }  # fmt: skip
 """What `register` loads of its own and of others. torch itself loads torchgen, rich and numpy look for some more."""
 SOUGHT = {"charset_normalizer", "cython_runtime", "pygments", "markdown_it", "mdurl", "colorama"}

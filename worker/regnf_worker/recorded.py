@@ -23,7 +23,9 @@ def place_of(scene: Path, request: RegistrationRequest, obj: Any, device: str) -
     from regnf_data.recordings.stored import is_stored, read_stored
     from regnf_fit.images.place import place_in
 
-    held = read_stored(scene, "the recording") if is_stored(scene) else open_field(scene, device)
+    if not is_stored(scene):
+        return place_in(open_field(scene, device), request.detection, None, request.options)
+    held = read_stored(scene, "the recording")
     found = place_in(held, request.detection, None if obj is None else obj.bounds, request.options)
     return replace(found, field=found.field.to(device))
 

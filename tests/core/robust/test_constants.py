@@ -11,7 +11,16 @@ import pytest
 from regnf_core.robust import constants
 
 TABLE = Path(constants.__file__)
-SOURCES = ("derived", "published", "main pairs", "early fits", "library", "random worlds", "by hand")
+SOURCES = (
+    "derived",
+    "published",
+    "main pairs",
+    "early fits",
+    "library",
+    "random worlds",
+    "simulated frames",
+    "by hand",
+)
 PLAIN = {0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 36, 0.5, 1.5, 9, 20, 180, 1e-9, 1e-6, 1009, 1.533751168755204288118041}
 """Counts, dimensions, halves, degrees, guards against a division by zero, the prime that separates seeds, the published
 constant of the super-Fibonacci spirals, and a length of text in an error message."""
