@@ -48,6 +48,20 @@ def print_report(figures: dict[str, Any]) -> None:
     warn(warnings)
 
 
+_Iterations = Annotated[int | None, typer.Option(min=1, help="Training steps; more is finer. Without it 3000.")]
+_TableLog2 = Annotated[
+    int | None,
+    typer.Option(
+        min=8, max=22, help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show."
+    ),
+]
+_Extent = Annotated[
+    float | None,
+    typer.Option(
+        help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
+        "Else its own frame."
+    ),
+]
 _OF_IMAGES_UNSAID = (None, None, False, "auto", False, "auto", None, None, None, None)
 
 
@@ -60,24 +74,9 @@ def fit(
         ),
     ],
     output: SafeField,
-    iterations: Annotated[
-        int | None, typer.Option(min=1, help="Training steps; more is finer. Without it 3000.")
-    ] = None,
-    table_log2: Annotated[
-        int | None,
-        typer.Option(
-            min=8,
-            max=22,
-            help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show.",
-        ),
-    ] = None,
-    extent: Annotated[
-        float | None,
-        typer.Option(
-            help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
-            "Else its own frame."
-        ),
-    ] = None,
+    iterations: _Iterations = None,
+    table_log2: _TableLog2 = None,
+    extent: _Extent = None,
     label: Label = None,
     seed: Seed = 0,
     hidden_width: Annotated[

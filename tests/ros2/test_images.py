@@ -291,8 +291,10 @@ def test_a_rectified_image_is_known_by_its_topic(monkeypatch: pytest.MonkeyPatch
 def test_the_requests_are_ones_that_the_contract_takes(robot: Robot) -> None:
     robot.see(boxes(12.5, BOX))
     robot.see(masks(12.5, (H, W), ("chair", OUTLINE)))
-    for number in (0, 1):
-        contract_takes("OneShotRequest", robot.answers.json("request", number))
+    requests = [robot.answers.json("request", number) for number in (0, 1)]
+    for request in requests:
+        contract_takes("OneShotRequest", request)
+    assert [{"mask", "box_2d"} & set(request["detection"]) for request in requests] == [{"box_2d"}, {"mask"}]
 
 
 # What is published.
