@@ -53,7 +53,8 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
     record = imported(context, frame())
     assert (record.state, record.views, record.report["kind"]) == ("ready", "none", "recording"), record.error
     assert list(context.blobs.list("")) == [f"fields/{SHA}/{name}" for name in ("field.safetensors", "report.json")]
-    assert record.kept_bytes == context.blobs.size(f"fields/{SHA}/field.safetensors")
+    sizes = {entry.key: entry.bytes for entry in context.blobs.entries("")}
+    assert record.kept_bytes == sizes[f"fields/{SHA}/field.safetensors"]
     assert context.records.undrawn_fields() == []
     moved = [[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     far = frame(png(np.full(SIZE, 9000, np.uint16)), T_world_camera=moved)
