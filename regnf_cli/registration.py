@@ -128,17 +128,17 @@ def register_here(
         seen: SdfField | Recording
         if isinstance(scene, FieldSource):
             opened = load_field(scene)
-            seen, notes["scene"] = opened.field, opened.notes
+            seen, name, notes["scene"] = opened.field, scene.named, opened.notes
         else:
-            seen = scene
-        where = partial(place_of, seen, detection, options, scene_name(scene))
+            seen, name = scene, Path(scene.name)
+        where = partial(place_of, seen, detection, options, name)
         if isinstance(objects, list):
             place = where()
             library, unusable = _modeled(objects, options.robust, partial(report, "library"))
             found = search_library(place.field, place.box, library, place.options, seed, report, clouds=wanted)
-            result, name = found.result, found.ranking[0].name
+            result, said["object_name"] = found.result, found.ranking[0].name
             said["candidates"] = ranking_document(found.ranking, unusable)
-            obj = load_field(next(one for one in objects if str(one.named) == name))
+            obj = load_field(next(one for one in objects if str(one.named) == said["object_name"]))
         else:
             obj = load_field(objects)
             model = None if notes else object_model(objects, options.robust)
@@ -149,12 +149,12 @@ def register_here(
             result = register(
                 place.field, obj.field, place.box, place.options, seed, report, initial, model, clouds=wanted
             )
-            name = str(objects.named)
+            said["object_name"] = str(objects.named)
         result = place.seen(result)
         report("exporting", 1.0)
     for note in place.notes:
         tell(f"note: {note}")
-    said |= {"object_name": name, "fields": notes | {"object": obj.notes}}
+    said["fields"] = notes | {"object": obj.notes}
     files.write(result, place.box, partial(place.draw, result, obj.field), **said)
     document: dict[str, Any] = result_document(result, **said)
     return document
@@ -180,11 +180,6 @@ def place_of(
             raise image_detection_in_field(named)
         check_box(named, detection, _bounds_of(scene), None if obj is None else _bounds_of(obj))
     return place_in(scene, detection, None if model is None else model.bounds, options)
-
-
-def scene_name(scene: FieldSource | Recording) -> Path:
-    """As the user named it."""
-    return scene.named if isinstance(scene, FieldSource) else Path(scene.name)
 
 
 def check_box(scene: Path, box: Detection, bounds: Bounds | None, obj: Bounds | None = None) -> None:

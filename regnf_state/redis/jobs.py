@@ -412,5 +412,5 @@ class RecordStore(RedisLibrary):
         names = sorted(map(text, self._redis.smembers(owned_key(owner_of(sha256), "active"))))
         for name, _, stored in self._fetch_in_portions(JOB, names):
             record = self._readable(JOB, name, stored)
-            if record is not None and transitions.uses_field(record, sha256):
+            if record is not None and sha256 in (*transitions.fields_of(record), *record.inputs.values()):
                 yield record.id
