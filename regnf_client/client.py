@@ -30,11 +30,9 @@ class SyncDriver:
         self._http = http
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
         time.sleep(seconds)
 
     def run(self, flow: Flow[_T]) -> _T:
-        """What the flow returns."""
         answer: Any = None
         try:
             while True:
@@ -75,7 +73,6 @@ class AsyncDriver:
         self._http = http
 
     async def run(self, flow: Flow[_T]) -> _T:
-        """What the flow returns."""
         answer: Any = None
         try:
             while True:

@@ -74,7 +74,6 @@ def similarity(value: Any, what: str, reason: str) -> NDArray[np.float64]:
 
 
 def whole_number(value: Any, what: str, reason: str) -> int:
-    """A positive whole number."""
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
     if isinstance(value, bool) or not whole or value < 1:
         raise DatasetError(f"{what} is not a positive whole number", reason=reason)

@@ -68,7 +68,6 @@ class Pieces:
         self._blobs.delete_prefix(_folder(caller, sha256))
 
     def bytes_of(self, caller: str) -> int:
-        """What the pieces of a caller hold."""
         return sum(one.bytes for one in self._uploads(f"{_TOP}/{caller}"))
 
     def make_room(self, caller: str, sha256: str, coming: int) -> None:

@@ -300,7 +300,6 @@ def document_of(record: JobRecord | FieldRecord) -> dict[str, Any]:
 
 
 def encoded(record: JobRecord | FieldRecord) -> str:
-    """The record as JSON."""
     return json.dumps(document_of(record), separators=(",", ":"))
 
 

@@ -297,7 +297,6 @@ async def compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[byt
 
 
 def upload_answer(taken: StoredUpload, prefix: str) -> JSONResponse:
-    """The document of what was taken in."""
     document = field_document(taken.record, prefix)
     headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
     return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)
