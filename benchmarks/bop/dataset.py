@@ -23,8 +23,7 @@ from benchmarks.bop.writing import Picture
 from regnf_core.detections.images import ImageDetection
 from regnf_core.errors import DatasetError
 from regnf_core.importing.mesh_file import read_mesh_file
-from regnf_data.recordings.recording import checked_size
-from regnf_data.sdfstudio import read_mask
+from regnf_data.recordings.recording import mask_file
 
 LEAST_VISIBLE = 0.1
 """A target shows so much of its silhouette at least."""
@@ -142,7 +141,7 @@ class Dataset:
     def mask(self, scene_id: int, im_id: int, number: int) -> NDArray[np.bool_] | None:
         """(H, W): what is visible of the true object of a number; None where it is not given."""
         file = self.scene(scene_id) / "mask_visib" / f"{im_id:06d}_{number:06d}.png"
-        return read_mask(file, checked_size(file)) if file.is_file() else None
+        return mask_file(file) if file.is_file() else None
 
     def object_file(self, obj_id: int) -> Path:
         """Raises DatasetError where there is none."""

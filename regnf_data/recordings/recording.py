@@ -15,7 +15,7 @@ from regnf_core.errors import DatasetError
 from regnf_data.agreement import NO_TERMS, Terms, check_views
 from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array, Camera, Size
-from regnf_data.sdfstudio import decoded, opened_image, read_depth
+from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
 
 MOST_FRAMES = 100_000
 MOST_PIXELS = 1 << 25
@@ -263,6 +263,11 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
 def color_file(path: Path) -> Callable[[], NDArray[np.uint8]]:
     """Reads a color image."""
     return lambda: np.asarray(decoded(path, checked_size(path), "RGB"), dtype=np.uint8)
+
+
+def mask_file(path: Path) -> NDArray[np.bool_]:
+    """(H, W): the mask of an image file of any size."""
+    return read_mask(path, checked_size(path))
 
 
 def checked_size(path: Path) -> Size:
