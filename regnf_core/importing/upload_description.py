@@ -13,8 +13,13 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.library_entries import LABEL_PATTERN, MOST_OF_LABEL
 from regnf_core.schema.similarity import require_similarity
 
-_FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
+
+
+class _Said:
+    """Base of a part of a description: no other members are taken, and no text for a number."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
 
 
 def _sound_box(box: list[list[float]]) -> list[list[float]]:
@@ -40,10 +45,8 @@ _Box = Annotated[list[_Corner], Len(2, 2), AfterValidator(_sound_box)]
 
 
 @dataclass(frozen=True)
-class GridDescription:
+class GridDescription(_Said):
     """What the table's size alone may leave open about a hash grid. Anything left out is searched for."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     levels: Annotated[int, Ge(1), Le(32)] | None = None
     features_per_level: Annotated[int, Ge(1), Le(32)] | None = None
@@ -58,10 +61,8 @@ class GridDescription:
 
 
 @dataclass(frozen=True)
-class EncodingDescription:
+class EncodingDescription(_Said):
     """What the widths alone may leave open about the sines and cosines of the position."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     degree: Annotated[int, Ge(0), Le(24)] | None = None
     """Number of frequencies."""
@@ -81,10 +82,8 @@ Inputs = Literal["all", "no_direction", "no_gradient", "features"]
 
 
 @dataclass(frozen=True)
-class ColorOverrides:
+class ColorOverrides(_Said):
     """What the widths alone may leave open about a network of colors. It changes nothing about the geometry."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     keep: bool | None = None
     """False: leave the color out."""
@@ -106,10 +105,8 @@ class ColorOverrides:
 
 
 @dataclass(frozen=True)
-class CamerasDescription:
+class CamerasDescription(_Said):
     """What the file of cameras does not say of them."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     intrinsics: Annotated[list[Annotated[float, Gt(0), Le(1e6)]], Len(4, 4)] | None = None
     """fx, fy, cx, cy of all images, in pixels."""
@@ -120,10 +117,8 @@ class CamerasDescription:
 
 
 @dataclass(frozen=True)
-class UploadDescription:
+class UploadDescription(_Said):
     """Overrides of what the gate would conclude by itself. None means: conclude it."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     family: Annotated[str, MaxLen(64)] | None = None
     contraction: Literal["none", "linf", "linf_grid"] | None = None
