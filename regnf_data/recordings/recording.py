@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
-from regnf_data.agreement import NO_TERMS, Terms, check_views
-from regnf_data.posed_images import PosedImages
-from regnf_data.recordings.camera import Array, Camera, Size
+from regnf_core.importing.recording_description import RecordingDescription
+from regnf_data.agreement import check_views
+from regnf_data.posed_images import NO_TERMS, PosedImages, Terms
+from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, Size, camera_of_values
 from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
 
 MOST_FRAMES = 100_000
@@ -162,10 +163,10 @@ class Recording:
         for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
             frame = self.frames[index].read()
             frames.append(frame if frame.color is None else replace(frame, color=frame.registered(frame.color)))
-        return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
+        return replace(as_posed_images(frames, bounds, self.terms), T_metric_world=self.T_metric_world)
 
 
-def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
+def as_posed_images(frames: Sequence[Frame], bounds: Array, terms: Terms = NO_TERMS) -> PosedImages:
     """Frames as images of one size, the most common among them; gray where a frame has no color of that size. bounds:
     (2, 3), world."""
     shapes = [frame.depth.shape for frame in frames]
@@ -179,6 +180,7 @@ def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
         T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
         bounds=bounds,
         depths=np.stack([frame.depth for frame in frames]),
+        terms=terms,
     )
 
 
@@ -225,6 +227,23 @@ class Given:
     depth_unit: float | None = None
     layout: str | None = None
     axes: Literal["opencv", "opengl"] | None = None
+
+    @classmethod
+    def of(cls, said: RecordingDescription) -> Given:
+        """Raises DatasetError (DATASET_INTRINSICS_INVALID)."""
+        found = None if said.intrinsics is None else camera_of_values(said.intrinsics, "intrinsics")
+        if found is None and said.intrinsics is not None:
+            raise DatasetError("the description's intrinsics hold none", reason="DATASET_INTRINSICS_INVALID")
+        unit = said.depth_unit or (found.depth_unit if found else None)
+        return cls(found.camera if found else None, unit, said.layout, said.camera_axes)
+
+    def described(self) -> RecordingDescription:
+        """The same in plain values."""
+        camera, said = self.camera, None
+        if camera is not None:
+            said = {"K": (camera.K - HALF_A_PIXEL).tolist(), "model": camera.lens, "D": list(camera.distortion)}
+            said |= {} if camera.size is None else {"height": camera.size[0], "width": camera.size[1]}
+        return RecordingDescription(self.depth_unit, self.layout, self.axes, said)
 
 
 def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[Any]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import DatasetError, atomic_path
+from regnf_data.posed_images import NO_TERMS, Terms
 from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, Lens, camera_of, lens_of
 from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
 
@@ -76,6 +78,7 @@ def write_recording(recording: Recording, indices: Sequence[int], path: Path) ->
         "lens": [bent.lens, list(bent.distortion)],
         "color_lens": [seen.lens, list(seen.distortion)],
         "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
+        "terms": asdict(recording.terms),
     }
     arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]] = {
         "depth": ("I16", (count, *shape), depths),
@@ -152,6 +155,10 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
         metric = None if said.get("T_metric_world") is None else np.array(said["T_metric_world"], np.float64)
         lens, color_lens = (_lens_of(said.get(one, ["none", []]), path.name) for one in ("lens", "color_lens"))
         layout, notes = str(said["layout"])[:100], tuple(str(one)[:500] for one in said["notes"])
+        told = said.get("terms", {})
+        terms = Terms(**{key: type(usual)(told.get(key, usual)) for key, usual in asdict(NO_TERMS).items()})
+        if terms.axes not in ("opencv", "opengl"):
+            raise ValueError("the axes of its cameras are not known")
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         message = f"{path.name} is no recording of regnf: {error}"
         raise DatasetError(message[:300], reason="DATASET_FILE_INVALID") from error
@@ -172,7 +179,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
                 taken=None if lens[0] == "none" else Camera(K[number].astype(np.float64), (height, width), *lens),
             )
         )
-    return Recording(name or path.name, layout, tuple(frames), notes, metric, bool(said.get("is_metric", True)))
+    return Recording(name or path.name, layout, tuple(frames), notes, metric, bool(said.get("is_metric", True)), terms)
 
 
 def _lens_of(said: Any, name: str) -> tuple[Lens, tuple[float, ...]]:

@@ -68,9 +68,21 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
         assert held.frames[1].T_world_camera.tolist() == moved
 
 
+def test_what_is_said_of_a_recording_goes_before_its_files(context: Context) -> None:
+    said = {"depth_unit": 0.002, "layout": "frame", "camera_axes": "opengl", "intrinsics": {"K": [16, 16, 8, 6]}}
+    record = imported(context, frame(), **said)
+    assert record.state == "ready", record.error
+    with context.blobs.local_copy(f"fields/{SHA}/field.safetensors") as path:
+        (held,) = read_stored(path).frames
+        assert held.read().depth.max() == pytest.approx(1.6, abs=1e-3)
+        assert (held.camera.K[0, 0], held.T_world_camera[1, 1]) == (16.0, -1.0)
+
+
 @pytest.mark.parametrize(
     ("said", "data", "reason"),
     [
+        ({"intrinsics": {"nothing": 1}}, frame(), "DATASET_INTRINSICS_INVALID"),
+        ({"layout": "none such"}, frame(), "DATASET_NOT_RECOGNIZED"),
         ({"after": SHA, "frame": "depth"}, frame(), "DATASET_FRAMES_INVALID"),
         ({"after": SHA, "frame": "left"}, frame(png(np.full((24, 32), 700, np.uint16))), "DATASET_SIZES_DIFFER"),
         ({"after": "c" * 64, "frame": "left"}, frame(), "FIELD_NOT_FOUND"),

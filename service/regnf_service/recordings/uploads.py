@@ -17,7 +17,7 @@ from regnf_service.fields.ingest import Beside
 from regnf_service.fields.uploads import Received, Upload
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.records import RECORDING
+from regnf_state.records import RECORDING, FieldRecord
 
 FRAME_BYTES = 256 << 20
 """Of all parts of a frame."""
@@ -34,8 +34,8 @@ _MAGIC_BYTES = 4
 
 @dataclass(frozen=True)
 class AsRecording(Beside):
-    """What makes an upload a recording. name: for people · said: ``after`` and ``frame`` of a frame that is added to
-    another recording."""
+    """What makes an upload a recording. name: for people · said: entries of a RecordingDescription; ``after`` and
+    ``frame`` of a frame that is added to another recording."""
 
     name: str | None = None
     said: Mapping[str, Any] = field(default_factory=dict)
@@ -47,6 +47,10 @@ class AsRecording(Beside):
 
     def function(self) -> dict[str, Any]:
         return {"as": RECORDING, **self.said}
+
+    def is_function_of(self, known: FieldRecord) -> bool:
+        """Where nothing is said, any recording of the same bytes is meant."""
+        return known.is_recording and (not self.said or super().is_function_of(known))
 
 
 class RecordingUpload(Upload):
