@@ -182,7 +182,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         pixels[pixels] = near
         camera_points = camera_points[near]
     if len(camera_points) < _FEWEST:
-        raise _without_depth(frame, f"{len(camera_points)} pixels of the thing")
+        raise _without_depth(frame, f"{len(camera_points)} of the thing's pixels")
     low, high = (np.quantile(camera_points, share, axis=0) for share in (_TRIMMED, 1.0 - _TRIMMED))
     behind = max(float((high - low)[:2].max()), diameter or 0.0)
     high[2] = max(high[2], low[2] + behind)
@@ -194,7 +194,8 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
 
 
 def _without_depth(frame: Frame, said: str) -> InvalidDetectionError:
-    return InvalidDetectionError(f"frame {frame.name}: {said} have a measured depth", reason="DETECTION_WITHOUT_DEPTH")
+    said = f"frame {frame.name}: depth was measured in {said}; {_FEWEST} are needed"
+    return InvalidDetectionError(said, reason="DETECTION_WITHOUT_DEPTH")
 
 
 def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float, float] | None]:

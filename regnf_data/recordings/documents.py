@@ -131,7 +131,8 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
     named = [each for each in listed if each.get("depth_file_path") or each.get("depth_path")]
     if not named:
         raise DatasetError(
-            f"{file.name} names no depth images (depth_file_path): colors alone make no map. regnf fit takes them",
+            f"{file.name} names no depth images (depth_file_path): colors alone make no map. Name one"
+            " for each frame, beside its file_path",
             reason="DATASET_DEPTH_MISSING",
         )
     frames: list[StoredFrame | None] = []

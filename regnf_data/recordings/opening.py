@@ -10,6 +10,8 @@ import zipfile
 import zlib
 from pathlib import Path
 
+from regnf_core.errors import made_folder
+from regnf_core.version import __version__
 from regnf_data.recordings.layouts import has_layout, read_layout
 from regnf_data.recordings.recording import Given, Recording
 from regnf_data.recordings.stored import read_stored
@@ -62,8 +64,9 @@ def _archive(path: Path, given: Given) -> Recording:
     description = given.described().non_default()
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256")
-    digest.update(json.dumps(description, sort_keys=True).encode())
+    digest.update(json.dumps([__version__, description], sort_keys=True).encode())
     kept = default_cache_dir().parent / "recordings" / digest.hexdigest()[:32]
     if not (kept / "field.safetensors").is_file():
-        import_recording(path, kept, description)
+        with made_folder(kept):
+            import_recording(path, kept, description)
     return read_stored(kept / "field.safetensors", path.name)

@@ -170,7 +170,9 @@ def test_a_detection_beside_the_image_is_refused(detection: ImageDetection, said
 def test_a_detection_without_depth_is_refused() -> None:
     frame, shown = ball_image()
     holes = Frame("0", np.where(shown, 0.0, frame.depth).astype(np.float32), CAMERA, np.eye(4))
-    with pytest.raises(InvalidDetectionError, match=r"frame 0: 0 of \d+ pixels of the detection") as found:
+    with pytest.raises(
+        InvalidDetectionError, match=r"frame 0: depth was measured in 0 of \d+ pixels of the detection"
+    ) as found:
         lift(holes, ImageDetection(mask=shown))
     assert found.value.reason == "DETECTION_WITHOUT_DEPTH"
 
