@@ -127,7 +127,8 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
     listed = values.get("frames")
     if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed) or not listed:
         raise DatasetError(f"{file.name} lists no frames", reason="DATASET_NO_FRAMES")
-    unit = given.depth_unit or float(values.get("depth_unit_scale_factor", 0.001))
+    stated = values.get("depth_unit_scale_factor", values.get("integer_depth_scale", 0.001))  # the latter: instant-ngp
+    unit = given.depth_unit or float(stated)
     named = [each for each in listed if each.get("depth_file_path") or each.get("depth_path")]
     if not named:
         raise DatasetError(

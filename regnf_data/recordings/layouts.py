@@ -13,7 +13,7 @@ import numpy as np
 from regnf_core.errors import DatasetError, RegnfError
 from regnf_data.posed_images import NO_TERMS, Terms
 from regnf_data.recordings import documents, folders
-from regnf_data.recordings.recording import Given, Recording
+from regnf_data.recordings.recording import DepthFile, Given, Recording
 from regnf_data.recordings.stored import is_stored, read_stored
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -49,6 +49,9 @@ class Layout:
             # Readers check what is often wrong; of the rest the reason is all that there is to say.
             said = f"{path.name} cannot be read as {self.words}: {type(error).__name__}: {error}"
             raise DatasetError(said[:400], reason="DATASET_METADATA_INVALID") from error
+        depth = found.frames[0].depth  # the notes of one file are those of all
+        if isinstance(depth, DepthFile):
+            found = replace(found, notes=(*found.notes, *depth.notes()))
         terms = self.terms if found.terms == NO_TERMS else found.terms  # a stored one knows those that it had
         if given.axes in (None, terms.axes):
             return replace(found, terms=terms)

@@ -22,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 from regnf_core.errors import DatasetError, atomic_path
 from regnf_data.posed_images import NO_TERMS, Terms
 from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, Lens, camera_of, lens_of
-from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
+from regnf_data.recordings.recording import Frame, Recording, StoredFrame, no_meters, pose_of
 
 _KEY = "recording"
 _STEPS = 32_767
@@ -184,9 +184,10 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
 
 def _lens_of(said: Any, name: str) -> tuple[Lens, tuple[float, ...]]:
     kind, coefficients = said
-    if kind not in ("none", "brown", "fisheye"):
+    if kind not in ("none", "brown", "fisheye", "inverse"):
         raise ValueError(f"a lens {str(kind)[:20]!r}")
-    return ("none", ()) if kind == "none" else lens_of(coefficients, kind == "fisheye", name)
+    found, numbers = ("none", ()) if kind == "none" else lens_of(coefficients, kind == "fisheye", name)
+    return "inverse" if (found, kind) == ("brown", "inverse") else found, numbers
 
 
 def _depth(path: Path, number: int, unit: float) -> NDArray[np.float32]:
@@ -239,6 +240,9 @@ def frame_of_arrays(
     whole = image.dtype.kind in "iu"
     meters = image.astype(np.float32) * np.float32((depth_unit or 0.001) if whole else (depth_unit or 1.0))
     limit = np.iinfo(image.dtype).max if whole else np.inf
+    if not whole and depth_unit is None and no_meters(meters):
+        message = f"{name}: the depths are {np.nanmedian(meters):.4g} in the median, no meters: say depth_unit"
+        raise DatasetError(message, reason="DATASET_IMAGE_INVALID")
     meters[~((meters > 0.0) & (image < limit))] = 0.0
     matrix: Array = np.array(K, np.float64)
     if matrix.shape == (4,):

@@ -25,7 +25,13 @@ CAMERA_BYTES = 64 * 1024
 _FORMATS = RUN_ARCHIVES | {"sqlite", "safetensors"}
 _WRITTEN = (1980, 1, 1, 0, 0, 0)
 _IMAGES: dict[str, dict[bytes, str]] = {
-    "depth": {b"\x89PNG": ".png", b"II*\0": ".tiff", b"MM\0*": ".tiff", b"\x93NUM": ".npy"},
+    "depth": {
+        b"\x89PNG": ".png",
+        b"II*\0": ".tiff",
+        b"MM\0*": ".tiff",
+        b"\x93NUM": ".npy",
+        b"\x76\x2f\x31\x01": ".exr",
+    },
     "color": {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"BM": ".bmp", b"RIFF": ".webp"},
 }
 """How images of each part begin, and the endings of their names in the zip."""
