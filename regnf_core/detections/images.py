@@ -137,28 +137,34 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
         raise InvalidDetectionError(
             f"{len(entries)} detections are listed: say which ({known})", hint="Give --detection-index."
         )
-    sizes = _sizes(values)
-    return tuple(_read(entry, sizes) for entry in entries)
+    images, categories = (_listed(values, name) for name in ("images", "categories"))
+    return tuple(_read(entry, images, categories) for entry in entries)
 
 
-def _sizes(values: Any) -> dict[Any, tuple[Any, Any]]:
-    """Height and width of COCO's images, by their numbers; polygons are of their size."""
-    images = values.get("images") if isinstance(values, Mapping) else None
-    known = (one for one in images or () if isinstance(one, Mapping))
-    return {one.get("id"): (one["height"], one["width"]) for one in known if "height" in one and "width" in one}
+def _listed(values: Any, name: str) -> dict[Any, Mapping[str, Any]]:
+    """COCO's images or categories, by their numbers."""
+    listed = values.get(name) if isinstance(values, Mapping) else None
+    return {one.get("id"): one for one in listed or () if isinstance(one, Mapping)}
 
 
 def _name(entry: Mapping[str, Any]) -> str:
     return str(next((entry[key] for key in ("label", "name", "category_id", "class") if key in entry), "no label"))[:40]
 
 
-def _read(entry: Mapping[str, Any], sizes: Mapping[Any, tuple[Any, Any]]) -> ImageDetection:
+def _read(
+    entry: Mapping[str, Any], images: Mapping[Any, Mapping[str, Any]], categories: Mapping[Any, Mapping[str, Any]]
+) -> ImageDetection:
+    image = images.get(entry.get("image_id"), {})
     frame = next((entry[key] for key in ("frame", "image_id", "file_name", "image") if key in entry), 0)
+    frame = image.get("file_name", frame)
     if isinstance(frame, bool) or not isinstance(frame, str | int):
         raise InvalidDetectionError("frame is neither a name nor a number", hint=HINT)
     score = next((entry[key] for key in ("score", "confidence") if key in entry), None)
     label = next((str(entry[key]) for key in ("label", "name", "category_id", "class") if key in entry), None)
-    size = entry.get("size") or entry.get("image_size") or sizes.get(entry.get("image_id"))
+    label = str(categories.get(entry.get("category_id"), {}).get("name", label)) if label else None
+    size = entry.get("size") or entry.get("image_size")
+    if not size and "height" in image and "width" in image:
+        size = image["height"], image["width"]
     common: dict[str, Any] = {
         "frame": frame,
         "label": label,
@@ -166,7 +172,7 @@ def _read(entry: Mapping[str, Any], sizes: Mapping[Any, tuple[Any, Any]]) -> Ima
         "size": None if size is None else tuple(int(side) for side in _numbers(size, 2, "size")),
     }
     for key in ("mask", "segmentation"):
-        if entry.get(key) is not None:
+        if entry.get(key) is not None and not (isinstance(entry[key], list) and not entry[key]):
             return ImageDetection(mask=entry[key], **common)
     segments = entry.get("segments")
     if isinstance(segments, Mapping) and segments.get("x"):

@@ -21,7 +21,7 @@ from regnf_data.recordings.folders import (
     _COLOR_FOLDERS,
     _COLORS,
     _DEPTH_FOLDERS,
-    _DEPTHS,
+    DEPTHS,
     _first_file,
     _lines,
     _subfolder,
@@ -87,7 +87,7 @@ def read_bop(folder: Path, given: Given) -> Recording:
             pose = pose_of(matrix, name, inverse=True, unit=0.001)
         else:
             unplaced += 1
-        depth = _first_file(depths, (name, key), _DEPTHS)
+        depth = _first_file(depths, (name, key), DEPTHS)
         color = _first_file(colors, (name, key), _COLORS) if colors else None
         frames.append(frame_of(name, camera, pose, depth, unit, color))
     notes = []
@@ -274,7 +274,7 @@ def read_colmap(folder: Path, given: Given) -> Recording:
             raise DatasetError(f"{name}: COLMAP's model has no camera {number}", reason=_INVALID)
         pose = np.linalg.inv(poses_of(place[None], quaternion[None], name)[0])
         path = PurePosixPath(name)
-        depth = _first_file(depths, (str(path.with_suffix("")), name), _DEPTHS)
+        depth = _first_file(depths, (str(path.with_suffix("")), name), DEPTHS)
         dense = (depths / f"{name}.{kind}.bin" for kind in ("geometric", "photometric"))
         depth = depth or next((path for path in dense if path.is_file()), None)
         color = None if colors is None or depth is None else _color_path(colors, name)

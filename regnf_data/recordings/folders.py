@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _INVALID = "DATASET_METADATA_INVALID"
 _MILLIMETER = 0.001
 _MOST_TEXT = 256 << 20
-_DEPTHS = (".png", ".tif", ".tiff", ".pgm", *ARRAYS)
+DEPTHS = (".png", ".tif", ".tiff", ".pgm", *ARRAYS)
 _COLORS = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".webp")
 _CAMERAS = (".json", ".txt", ".yaml", ".yml", ".csv", ".npy")
 _POSE_LISTS = (".txt", ".csv", ".npy")
@@ -181,7 +181,7 @@ def read_seven_scenes(folder: Path, given: Given) -> Recording:
     frames = []
     for pose_file in sorted(folder.glob("[!.]*.pose.txt")):
         name = pose_file.name.removesuffix(".pose.txt")
-        depth = _first_file(folder, (f"{name}.depth",), _DEPTHS)
+        depth = _first_file(folder, (f"{name}.depth",), DEPTHS)
         pose = pose_of(matrix_file(pose_file), name)
         color = _first_file(folder, (f"{name}.color", f"{name}.rgb"), _COLORS)
         frames.append(frame_of(name, camera, pose, depth, unit, color))
@@ -219,8 +219,8 @@ def read_redwood(folder: Path, given: Given) -> Recording:
         camera = replace(camera, size=(1440, 1920))
     colors = _subfolder(folder, _COLOR_FOLDERS)
     poses = _redwood_poses(path)
-    images = _in_order(depths, _DEPTHS)
-    pictures = _in_order(colors, _COLORS) if colors else []
+    images = in_order(depths, DEPTHS)
+    pictures = in_order(colors, _COLORS) if colors else []
     matched = len(pictures) == len(images)
     if len(poses) > len(images):
         raise DatasetError(
@@ -279,9 +279,9 @@ def read_scannet(folder: Path, given: Given) -> Recording:
     camera, unit, _ = _camera_of(folder.name, found, given, _MILLIMETER)
     of_color = _named_camera(folder, "intrinsic_color")
     frames = []
-    for pose_file in _in_order(_subfolder(folder, _POSE_FOLDERS) or folder, (".txt", ".npy")):
+    for pose_file in in_order(_subfolder(folder, _POSE_FOLDERS) or folder, (".txt", ".npy")):
         name = pose_file.stem
-        depth = _first_file(depths, (name,), _DEPTHS)
+        depth = _first_file(depths, (name,), DEPTHS)
         color = _first_file(colors, (name,), _COLORS) if colors else None
         pose = pose_of(matrix_file(pose_file), name)
         frames.append(frame_of(name, camera, pose, depth, unit, color, of_color.camera if of_color else None))
@@ -304,7 +304,7 @@ def read_replica(folder: Path, given: Given) -> Recording:
     """A line of traj.txt is a pose to the world, 16 numbers. The intrinsics lie in the folder or the one above it."""
     found = camera_beside(folder) or camera_beside(folder.resolve().parent)
     camera, unit, _ = _camera_of(folder.name, found, given, 1.0 / 6553.5)
-    images = _in_order(folder / "results", _DEPTHS, "depth")
+    images = in_order(folder / "results", DEPTHS, "depth")
     poses = matrix_file(folder / "traj.txt")
     if len(poses) != len(images):
         raise DatasetError(
@@ -328,9 +328,9 @@ def is_frame(path: Path) -> bool:
 def _frame_files(path: Path) -> tuple[Path, Path | None] | None:
     """The depth image and the color image; None where there is no one depth image."""
     if path.is_file():
-        return (path, None) if path.suffix.lower() in _DEPTHS else None
-    images = [p for p in sorted(path.glob("[!.]*")) if p.suffix.lower() in (*_DEPTHS, *_COLORS) and p.is_file()]
-    named = [p for p in images if "depth" in p.name.lower() and p.suffix.lower() in _DEPTHS]
+        return (path, None) if path.suffix.lower() in DEPTHS else None
+    images = [p for p in sorted(path.glob("[!.]*")) if p.suffix.lower() in (*DEPTHS, *_COLORS) and p.is_file()]
+    named = [p for p in images if "depth" in p.name.lower() and p.suffix.lower() in DEPTHS]
     depths = named or [p for p in images if p.suffix.lower() in ARRAYS or _has_16_bits(p)]
     if len(depths) != 1:
         return None
@@ -468,7 +468,7 @@ def _order(path: Path) -> tuple[list[int], str]:
     return [int(number[:18]) for number in _NUMBER.findall(path.stem)[:8]], path.name
 
 
-def _in_order(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
+def in_order(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
     found = [p for p in folder.glob(f"{prefix or '[!.]'}*") if p.suffix.lower() in suffixes and p.is_file()]
     return sorted(found, key=_order)
 

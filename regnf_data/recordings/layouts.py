@@ -12,7 +12,7 @@ import numpy as np
 
 from regnf_core.errors import DatasetError, RegnfError
 from regnf_data.posed_images import NO_TERMS, Terms
-from regnf_data.recordings import documents, folders
+from regnf_data.recordings import documents, folders, phones
 from regnf_data.recordings.recording import DepthFile, Given, Recording
 from regnf_data.recordings.stored import is_stored, read_stored
 
@@ -97,6 +97,8 @@ LAYOUTS = (
            _COLMAP),
     Layout("7scenes", "7-Scenes, 3DMatch", "*.pose.txt, *.depth.png", folders.is_seven_scenes,
            folders.read_seven_scenes, Terms("*.pose.txt", "camera-intrinsics.txt")),
+    Layout("phone", "Polycam, 3D Scanner App, Record3D", "keyframes/, frame_*.json, metadata.json and depth/",
+           phones.is_phone, phones.read_phone, Terms("the app's poses", "the app's intrinsics", axes="opengl")),
     Layout("frame", "one frame", "one depth image, intrinsics", folders.is_frame, folders.read_frame),
 )  # fmt: skip
 
@@ -129,9 +131,20 @@ def read_layout(path: str | os.PathLike[str], given: Given | None = None) -> Rec
             reason="DATASET_NOT_RECOGNIZED",
         )
     known = "; ".join(f"{layout.words}: {layout.looks_for}" for layout in LAYOUTS)
-    raise DatasetError(
-        f"{source.name} is no recording that is known. Looked for {known}", reason="DATASET_NOT_RECOGNIZED"
-    )
+    said = f"{source.name} is no recording that is known{_almost(source)}. Looked for {known}"
+    raise DatasetError(said, reason="DATASET_NOT_RECOGNIZED")
+
+
+def _almost(source: Path) -> str:
+    """What a folder has of a recording, in words."""
+    files = [p for pattern in ("[!.]*", "*/[!.]*") for p in sorted(source.glob(pattern)) if p.is_file()]
+    depths = [p for p in files if "depth" in str(p.relative_to(source)).lower()]
+    read = [p for p in depths if p.suffix.lower() in folders.DEPTHS]
+    if depths and not read:
+        return f": depth is not read from {depths[0].name}, but from {', '.join(folders.DEPTHS)}"
+    if not read:
+        return ""
+    return f": no poses were found for its {len(read)} depth images. Without poses give one of them, {read[0].name}"
 
 
 def has_layout(path: str | os.PathLike[str]) -> bool:

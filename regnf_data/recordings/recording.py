@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ _NOT_RIGID = 0.02
 _MILLIMETER, _EIGHT_BITS = 0.001, 255.5
 _FAR, _NO_DEPTH = 100.0, 1e6
 """Meters: what depth cameras see is nearer; numbers that renderers write for nothing are beyond."""
+_ENDING = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp|np[yz]|exr)$", re.IGNORECASE)
 _FEW = 4
 """Different depths of an image that shows but a wall."""
 
@@ -147,15 +149,16 @@ class Recording:
 
         Raises DatasetError (DATASET_FRAMES_INVALID).
         """
-        if isinstance(name, int) and 0 <= name < len(self):
-            return name
-        names = [frame.name for frame in self.frames]
-        wanted = str(name)
+        names, wanted = [frame.name for frame in self.frames], str(name)
+        bare = [_ENDING.sub("", Path(known).name) for known in names]
         for place, known in enumerate(names):
-            if wanted in (known, Path(known).name, Path(known).stem):
+            if wanted in (known, Path(known).name) or _ENDING.sub("", Path(wanted).name) == bare[place]:
                 return place
-        if wanted.isdigit() and int(wanted) < len(self):
-            return int(wanted)
+        if wanted.isdigit():  # numbers in names go before places
+            numbers = [int(one) if one.isdigit() else -1 for one in bare]
+            place = numbers.index(int(wanted)) if int(wanted) in numbers else int(wanted)
+            if place < len(self):
+                return place
         near = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         raise DatasetError(f"{self.name} has no frame {wanted[:80]!r}; it has {near}", reason="DATASET_FRAMES_INVALID")
 
