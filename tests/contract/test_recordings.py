@@ -334,7 +334,9 @@ def test_one_body_is_refused_whole(world: World) -> None:
     assert set(world.blobs.blobs) == before
 
 
-def test_a_large_recording_comes_in_pieces(world: World) -> None:
+def test_a_large_recording_comes_in_pieces(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, size in (("uploads._BLOCK_BYTES", 600), ("uploads.HEAD_BYTES", 500), ("piecewise.HEAD_BYTES", 500)):
+        monkeypatch.setattr(f"regnf_service.fields.{name}", size)  # a piece is written in several blocks
     data = b"\x89MCAP0\r\n" + bytes(3000)
     name = sha256(data)
     for first, last in ((0, 1999), (2000, len(data) - 1)):
