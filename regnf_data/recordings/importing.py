@@ -166,7 +166,7 @@ def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, byte
     from regnf_core.importing.run.tar_run import TarRun, require_modest
 
     if kind == "zip":
-        members = read_members(data, (STORED, DEFLATED), folders=True)
+        members = read_members(data, (STORED, DEFLATED), True, _MOST_FILES)
         require_modest(sum(one.size for one in members), len(data), most)
         for one in members:
             if not one.name.endswith("/"):
@@ -174,7 +174,7 @@ def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, byte
                 yield one.name, bytes(content)
                 del content
     else:
-        archive = TarRun(data, None if kind == "tar" else kind, most)
+        archive = TarRun(data, None if kind == "tar" else kind, most, _MOST_FILES)
         require_modest(sum(archive.sizes.values()), len(data), most)
         yield from archive.each()
 

@@ -154,8 +154,8 @@ class Recording:
         for place, known in enumerate(names):
             if wanted in (known, Path(known).name) or _ENDING.sub("", Path(wanted).name) == bare[place]:
                 return place
-        if wanted.isdigit():  # numbers in names go before places
-            numbers = [int(one) if one.isdigit() else -1 for one in bare]
+        if wanted.isdecimal():  # numbers in names go before places
+            numbers = [int(one) if one.isdecimal() else -1 for one in bare]
             place = numbers.index(int(wanted)) if int(wanted) in numbers else int(wanted)
             if place < len(self):
                 return place

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
 from regnf_service.problem import Problem
 
 _MOST_HEADER_BYTES = 32 << 20
+_ENDING = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp|np[yz]|exr)$", re.IGNORECASE)
 _FAST = 1
 """Compression of the PNG: a person waits for it."""
 
@@ -47,9 +49,13 @@ def frame_picture(file: BinaryIO, wanted: str) -> bytes:
 
 
 def _place(names: list[str], wanted: str) -> int:
+    bare = [_ENDING.sub("", PurePosixPath(name).name) for name in names]
     for place, name in enumerate(names):
-        if wanted in (name, PurePosixPath(name).name, PurePosixPath(name).stem):
+        if wanted in (name, PurePosixPath(name).name, bare[place]):
             return place
-    if wanted.isascii() and wanted.isdigit() and len(wanted) < 9 and int(wanted) < len(names):
-        return int(wanted)
+    if wanted.isascii() and wanted.isdigit() and len(wanted) < 9:  # numbers in names go before places
+        numbers = [int(one) if one.isdecimal() else -1 for one in bare]
+        place = numbers.index(int(wanted)) if int(wanted) in numbers else int(wanted)
+        if place < len(names):
+            return place
     raise Problem("RECORDING_FRAME_NOT_FOUND")
