@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from regnf_core.detections.bounds import Detection
@@ -26,6 +27,7 @@ HINT = (
     ' {"point_2d": [u, v]}, in pixels.'
 )
 _NAMES = ("mask", "box_2d", "point_2d", "segmentation", "segments", "annotations")
+_ENDING = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp|np[yz]|exr)$", re.IGNORECASE)
 _MOST_MASK_BYTES = 4 << 20
 """Of a mask's file that is put into a detection."""
 _MOST_DETECTIONS = 10_000
@@ -102,6 +104,21 @@ def read_detection(values: Any, index: int | None = None, folder: Path | None = 
     return found if folder is None else tuple(one.beside(folder) for one in found)
 
 
+def place_of_frame(names: Sequence[str], wanted: str) -> int | None:
+    """The place of the frame of a name, with or without the ending of an image; of the number in a name, else of a
+    place. None where there is none."""
+    bare = [_ENDING.sub("", PurePosixPath(name).name) for name in names]
+    for place, name in enumerate(names):
+        if wanted in (name, PurePosixPath(name).name) or _ENDING.sub("", wanted) == bare[place]:
+            return place
+    if not (wanted.isascii() and wanted.isdecimal()):
+        return None
+    numbers = [one.lstrip("0") for one in bare]
+    number = wanted.lstrip("0")
+    place = numbers.index(number) if number in numbers else int(number[:9] or 0)
+    return place if place < len(names) else None
+
+
 def image_detection_in_field(scene: object = "the scene") -> InvalidDetectionError:
     """The error for a mask, a box in pixels or a point where the scene has no images."""
     return InvalidDetectionError(
@@ -156,7 +173,7 @@ def _read(
 ) -> ImageDetection:
     image = images.get(entry.get("image_id"), {})
     frame = next((entry[key] for key in ("frame", "image_id", "file_name", "image") if key in entry), 0)
-    frame = image.get("file_name", frame)
+    frame = PurePosixPath(str(image["file_name"])).name if "file_name" in image else frame
     if isinstance(frame, bool) or not isinstance(frame, str | int):
         raise InvalidDetectionError("frame is neither a name nor a number", hint=HINT)
     score = next((entry[key] for key in ("score", "confidence") if key in entry), None)

@@ -403,8 +403,8 @@ def _camera_of(
         return camera, unit, []
     if published is None:
         raise DatasetError(
-            f"{name} has no intrinsics: put a camera_intrinsic.json beside the images, or give --intrinsics"
-            " fx,fy,cx,cy",
+            f"{name} has no intrinsics: no file called camera or intrinsics there holds fx, fy, cx, cy or a matrix K."
+            " Write one, or give --intrinsics fx,fy,cx,cy",
             reason="DATASET_INTRINSICS_INVALID",
         )
     return camera_of(*published, size=(480, 640), whole_centers=True), unit, [note]

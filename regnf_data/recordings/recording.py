@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from regnf_core.detections.images import place_of_frame
 from regnf_core.errors import DatasetError
 from regnf_core.importing.recording_description import RecordingDescription
 from regnf_data.agreement import check_views
@@ -28,7 +28,6 @@ _NOT_RIGID = 0.02
 _MILLIMETER, _EIGHT_BITS = 0.001, 255.5
 _FAR, _NO_DEPTH = 100.0, 1e6
 """Meters: what depth cameras see is nearer; numbers that renderers write for nothing are beyond."""
-_ENDING = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp|np[yz]|exr)$", re.IGNORECASE)
 _FEW = 4
 """Different depths of an image that shows but a wall."""
 
@@ -150,15 +149,8 @@ class Recording:
         Raises DatasetError (DATASET_FRAMES_INVALID).
         """
         names, wanted = [frame.name for frame in self.frames], str(name)
-        bare = [_ENDING.sub("", Path(known).name) for known in names]
-        for place, known in enumerate(names):
-            if wanted in (known, Path(known).name) or _ENDING.sub("", Path(wanted).name) == bare[place]:
-                return place
-        if wanted.isdecimal():  # numbers in names go before places
-            numbers = [int(one) if one.isdecimal() else -1 for one in bare]
-            place = numbers.index(int(wanted)) if int(wanted) in numbers else int(wanted)
-            if place < len(self):
-                return place
+        if (place := place_of_frame(names, wanted)) is not None:
+            return place
         near = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         raise DatasetError(f"{self.name} has no frame {wanted[:80]!r}; it has {near}", reason="DATASET_FRAMES_INVALID")
 

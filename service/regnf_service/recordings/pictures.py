@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import re
-from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
+from regnf_core.detections.images import place_of_frame
 from regnf_service.problem import Problem
 
 _MOST_HEADER_BYTES = 32 << 20
-_ENDING = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp|np[yz]|exr)$", re.IGNORECASE)
 _FAST = 1
 """Compression of the PNG: a person waits for it."""
 
@@ -27,7 +25,8 @@ def frame_picture(file: BinaryIO, wanted: str) -> bytes:
     length = int.from_bytes(file.read(8), "little")
     header = json.loads(file.read(min(length, _MOST_HEADER_BYTES)))
     names = json.loads(header["__metadata__"]["recording"])["names"]
-    number = _place(names, wanted)
+    if (number := place_of_frame(names, wanted)) is None:
+        raise Problem("RECORDING_FRAME_NOT_FOUND")
     for kind in ("color", "depth"):
         if kind in header:
             shape, (begin, end) = header[kind]["shape"], header[kind]["data_offsets"]
@@ -46,16 +45,3 @@ def frame_picture(file: BinaryIO, wanted: str) -> bytes:
     held = io.BytesIO()
     image.save(held, "PNG", compress_level=_FAST)
     return held.getvalue()
-
-
-def _place(names: list[str], wanted: str) -> int:
-    bare = [_ENDING.sub("", PurePosixPath(name).name) for name in names]
-    for place, name in enumerate(names):
-        if wanted in (name, PurePosixPath(name).name, bare[place]):
-            return place
-    if wanted.isascii() and wanted.isdigit() and len(wanted) < 9:  # numbers in names go before places
-        numbers = [int(one) if one.isdecimal() else -1 for one in bare]
-        place = numbers.index(int(wanted)) if int(wanted) in numbers else int(wanted)
-        if place < len(names):
-            return place
-    raise Problem("RECORDING_FRAME_NOT_FOUND")

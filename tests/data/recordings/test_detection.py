@@ -143,7 +143,7 @@ def test_annotations_of_coco_name_their_image_and_their_category() -> None:
         "annotations": [{"image_id": 7, "category_id": 3, "segmentation": [], "bbox": [10, 20, 20, 40]}],
     }
     (found,) = read_image_detections(listed)
-    assert (found.frame, found.label, found.size, found.box_2d) == ("rgb/000003.png", "cup", (12, 16), (10, 20, 30, 60))
+    assert (found.frame, found.label, found.size, found.box_2d) == ("000003.png", "cup", (12, 16), (10, 20, 30, 60))
     frames = [replace(ball_image()[0], name=name) for name in ("000001", "000003", "100.1000", "100.2000")]
     recording = recording_of_frames(frames)
     assert [recording.index(name) for name in (found.frame, 3, "3", 1, 0, "100.2000")] == [1, 1, 1, 0, 0, 3]
