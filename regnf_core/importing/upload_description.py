@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
@@ -205,7 +205,7 @@ _Described = TypeVar("_Described")
 def described(kind: type[_Described], values: Mapping[str, Any] | None) -> _Described:
     """A description of this kind from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
     try:
-        return _adapter(kind).validate_json(json.dumps(values or {}, allow_nan=False))  # type: ignore[no-any-return]
+        return cast(_Described, _adapter(cast(Any, kind)).validate_json(json.dumps(values or {}, allow_nan=False)))
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -216,5 +216,5 @@ def described(kind: type[_Described], values: Mapping[str, Any] | None) -> _Desc
 
 
 @cache
-def _adapter(kind: type) -> TypeAdapter[Any]:
+def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)

@@ -371,8 +371,8 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
     elif len(rows) == 1 and len(rows[0]) == 9:
         matrix = np.array(rows[0]).reshape(3, 3)
     elif len(rows) == 1 and len(rows[0]) == 6 and min(rows[0]) > _LEAST_PIXELS:  # no lens has such coefficients
-        width, height, *four = rows[0]
-        camera = camera_of(*four, size=(int(height), int(width)), whole_centers=True)
+        width, height, fx, fy, cx, cy = rows[0]
+        camera = camera_of(fx, fy, cx, cy, (int(height), int(width)), whole_centers=True)
         return CameraFile(camera.check(name))
     elif len(rows) == 1 and 4 <= len(rows[0]) <= 12:
         fx, fy, cx, cy = rows[0][:4]

@@ -54,9 +54,9 @@ def _shots(folder: Path) -> Iterator[_Shot]:
             yield str(number), camera, pose, depth, _first_file(folder / "rgb", (str(number),), _COLORS)
         return
     files = in_order(folder, (".json",), "frame_")
-    colors = {file: _first_file(folder, (file.stem,), _COLORS) for file in files}  # not every frame has one
-    size = next((checked_size(color) for color in colors.values() if color is not None), (1440, 1920))
-    for file, color in colors.items():
+    pictures = {file: _first_file(folder, (file.stem,), _COLORS) for file in files}  # not every frame has one
+    size = next((checked_size(color) for color in pictures.values() if color is not None), (1440, 1920))
+    for file, color in pictures.items():
         said = read_json(file) | {"height": size[0], "width": size[1]}
         depth = _first_file(folder, (file.stem.replace("frame_", "depth_"),), DEPTHS)
         yield file.stem, said, said["cameraPoseARFrame"], depth, color
@@ -67,7 +67,7 @@ def read_phone(folder: Path, given: Given) -> Recording:
     frames: list[StoredFrame | None] = []
     for name, said, matrix, depth, color in _shots(folder):
         found, pose = camera_of_values(said, name), pose_of(matrix, name)
-        camera = given.camera or (found and found.camera)
+        camera = given.camera or (found.camera if found else None)
         if camera is None:
             raise DatasetError(f"{name} has no intrinsics", reason="DATASET_INTRINSICS_INVALID")
         turned = None if pose is None else pose @ _OPENGL

@@ -151,6 +151,8 @@ class Recording:
         names, wanted = [frame.name for frame in self.frames], str(name)
         if (place := place_of_frame(names, wanted)) is not None:
             return place
+        if len(self) == 1 and (isinstance(name, int) or Path(wanted).suffix):  # as detectors number and name images
+            return 0
         near = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         raise DatasetError(f"{self.name} has no frame {wanted[:80]!r}; it has {near}", reason="DATASET_FRAMES_INVALID")
 

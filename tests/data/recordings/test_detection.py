@@ -147,6 +147,8 @@ def test_annotations_of_coco_name_their_image_and_their_category() -> None:
     frames = [replace(ball_image()[0], name=name) for name in ("000001", "000003", "100.1000", "100.2000")]
     recording = recording_of_frames(frames)
     assert [recording.index(name) for name in (found.frame, 3, "3", 1, 0, "100.2000")] == [1, 1, 1, 0, 0, 3]
+    alone = recording_of_frames(frames[:1])
+    assert [alone.index(name) for name in (7, "rgb/color.png")] == [0, 0]
 
 
 @pytest.mark.parametrize(
