@@ -155,6 +155,7 @@ def unpack(upload: Path, kind: str, folder: Path, most: int) -> None:
     with upload.open("rb") as file:
         # Closed with the last view of it: an error may hold one.
         data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    folder.mkdir()
     for name, content in _members(data, kind, most):
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
