@@ -131,7 +131,7 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
 
     source = upload
     if kind in ("zip", "tar", "gzip", "bzip2", "xz"):
-        source = folder / "unpacked"
+        source = folder / "archive"
         unpack(upload, kind, source, limits.file_bytes // 2)
         source = inner_folder(source)
     recording = read_layout(source, Given.of(RecordingDescription(**request["description"])))
@@ -140,7 +140,7 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
     warning = check_recording(recording)
     kept, bounds = _kept(recording)
     stored = write_recording(recording, kept, folder / "field.safetensors")
-    shutil.rmtree(folder / "unpacked", ignore_errors=True)
+    shutil.rmtree(folder / "archive", ignore_errors=True)
     return stored | {
         "layout": recording.layout,
         "left_out": len(recording) - len(stored["frames"]),
