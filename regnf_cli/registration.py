@@ -34,8 +34,16 @@ Objects = FieldSource | list[FieldSource]
 """One object to register, or several to search among."""
 
 
+@dataclass(frozen=True)
+class SentRecording:
+    """A recording that is sent to a service. description: what its files do not say of it."""
+
+    path: Path
+    description: dict[str, Any]
+
+
 def answer(
-    scene: FieldSource | Recording | Path,
+    scene: FieldSource | Recording | SentRecording,
     objects: Objects,
     request: dict[str, Any],
     files: Files,
@@ -47,14 +55,14 @@ def answer(
 ) -> None:
     """Register or search, print the result, write the files, and leave with the verdict's exit code.
 
-    scene: a path is that of a recording that is sent · client: None does the work here · tag, cancel: see
+    client: None does the work here · tag, cancel: see
     ``_register_remotely`` · top: how many candidates are shown.
     """
-    if isinstance(scene, Path) or client is not None:
-        assert client is not None
-        assert isinstance(scene, Path | FieldSource)
+    if client is not None:
+        assert isinstance(scene, SentRecording | FieldSource)
         document = _register_remotely(client, scene, objects, request, tag, files.output, cancel)
     else:
+        assert not isinstance(scene, SentRecording)
         document = register_here(scene, objects, request, files)
     show(document, as_json, top)
     files.tell()
@@ -98,7 +106,8 @@ class Files:
     def tell(self) -> None:
         """Say where the files are, on stderr: the document on stdout may be JSON."""
         if self.output is not None:
-            tell(f"wrote {self.output}: result.json, preview.png, point clouds")
+            picture = ", overlay.png" if (self.output / "overlay.png").is_file() else ""
+            tell(f"wrote {self.output}: result.json, preview.png{picture}, point clouds")
         if self.recording is not None:
             tell(f"wrote {self.recording}")
 
@@ -231,7 +240,7 @@ def _modeled(
 
 def _register_remotely(
     client: Client,
-    scene: FieldSource | Path,
+    scene: FieldSource | SentRecording,
     objects: Objects,
     request: dict[str, Any],
     tag: str | None,
@@ -251,7 +260,9 @@ def _register_remotely(
             hint = "`regnf library add NAME FIELD --server ...` adds one."
             raise InvalidInputError(f"the library has no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
         more = {name: value for name, value in request.items() if name != "detection"}
-        place: Any = client.recordings.upload(scene, progress=report) if isinstance(scene, Path) else scene
+        place: Any = scene
+        if isinstance(scene, SentRecording):
+            place = client.recordings.upload(scene.path, progress=report, description=scene.description)
         job = client.submit(place, searched, request["detection"], more=more, progress=report)
         page = f"{client.address}/jobs/{job.id}/view"
         tell(f"job          {job.id}\npage         {page}")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
@@ -187,17 +189,27 @@ class UploadDescription(_Said):
         return {name: value for name, value in values.items() if value not in (None, {})}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any] | None) -> UploadDescription:
+    def from_dict(cls, values: Mapping[str, Any] | None) -> UploadDescription:
         """The description from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
-        try:
-            return _ADAPTER.validate_json(json.dumps(values or {}, allow_nan=False))
-        except ValidationError as error:
-            first = error.errors(include_url=False, include_input=False)[0]
-            where = ".".join(str(part) for part in first["loc"])
-            message = first["msg"].removeprefix("Value error, ")
-            raise FieldFormatError(f"description.{where}: {message}", reason="INVALID_DESCRIPTION") from error
-        except (TypeError, ValueError, RecursionError) as error:
-            raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
+        return described(cls, values)
 
 
-_ADAPTER = TypeAdapter(UploadDescription)
+_Described = TypeVar("_Described")
+
+
+def described(kind: type[_Described], values: Mapping[str, Any] | None) -> _Described:
+    """A description of this kind from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
+    try:
+        return cast(_Described, _adapter(cast(Any, kind)).validate_json(json.dumps(values or {}, allow_nan=False)))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        raise FieldFormatError(f"description.{where}: {message}", reason="INVALID_DESCRIPTION") from error
+    except (TypeError, ValueError, RecursionError) as error:
+        raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)

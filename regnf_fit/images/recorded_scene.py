@@ -85,7 +85,7 @@ def recorded_scene(
         chosen = [recording.frames[index] for index in choose_frames(recording, _MOST_FRAMES, region).indices]
         others = [frame.read(color=not own) for frame in chosen if frame.name not in names]
     frames = [*own, *others][:_MOST_FRAMES]
-    disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)))) if len(frames) > 1 else None
+    disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)), recording.terms))
     aligned = align_frames(frames, region)
     frames = list(aligned.frames)
     field = focused_field(frames, region, spread=aligned.spread, things=[one.pixels for one in first])

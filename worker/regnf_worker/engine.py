@@ -225,9 +225,12 @@ def core_importer(limits: ImportLimits) -> Importer:
         if description.get("as") == RECORDING:
             from regnf_data.recordings.importing import import_recording
 
-            return import_recording(upload, folder, {"as": RECORDING}, limits)
-        said = description or None
-        report = import_field(upload, folder, said, limits, settings=settings, cameras=cameras, ask_by_picture=True)
+            of_record = ("as", "after", "frame")
+            said = {name: value for name, value in description.items() if name not in of_record}
+            return import_recording(upload, folder, said, limits)
+        report = import_field(
+            upload, folder, description or None, limits, settings=settings, cameras=cameras, ask_by_picture=True
+        )
         return report.to_dict()
 
     return run
