@@ -205,6 +205,8 @@ class SearchConstants:
     batch: int = 512  # poses at once: bounds memory, and stays in the processor's cache [by hand]
     grid_cells: int = 40  # along each edge of a distance grid [by hand]
     grid_margin: float = 0.2  # working units around the samples that a distance grid covers [by hand]
+    sheet_neighbors: int = 8  # samples among which the other face of a thin wall is looked for [by hand]
+    sheet_cosine: float = -0.5  # between the normals of its faces, below [by hand]
     tangent_spacings: float = 2.0  # sample spacings: closer, the tangent plane is the better distance [by hand]
 
 
@@ -331,6 +333,7 @@ class SamplingConstants:
     scene_base: int = 9  # the same for the scene [by hand]
     levels: int = 2  # how often a cell near the surface is divided by two along each axis [by hand]
     max_cell_distance: float = 0.6  # cell edges: cells farther off find their neighbors' points [by hand]
+    face_neighbors: int = 8  # nearest samples among which one faces as that of a farther cell does [by hand]
     max_sample_distance: float = 0.35  # cell edges: samples farther off after the Newton step are dropped [by hand]
     min_slope: float = 0.2  # of a gradient (true distances: 1); steps along shorter ones lead nowhere [by hand]
     cloud_margin: float = 0.05  # of the box's size: so far outside may points of a result's clouds lie [by hand]
@@ -340,6 +343,9 @@ class SamplingConstants:
 class SceneConstants:
     """What a detection shows of a scene (scene.py)."""
 
+    # Diagonals: so far in front of samples of a thing that images show is the object asked. The noise of depths is
+    # wider than thin walls: their other face would answer. [simulated frames]
+    ahead_of_thing: float = 0.02
     min_foreground: int = 30  # samples before the support planes; with fewer, these are kept [by hand]
     # Normal roughness. Up to here a field counts as smooth and has no surface offset: a box would else pass for a
     # larger one. Accurate fits have about 0.01. [early fits]
@@ -347,7 +353,7 @@ class SceneConstants:
     offset_per_normal_roughness: float = 2.0  # diameters of allowed offset for roughness beyond it [early fits]
     neighbors: int = 16  # nearest samples over which normals and heights are averaged [by hand]
     averaging_rounds: int = 2  # of normals: after the first, the roughest normals still pull [by hand]
-    min_same_sheet_cosine: float = 0.3  # between normals of neighbors on the same side of a thin part [by hand]
+    min_same_sheet_cosine: float = -0.5  # between normals of neighbors on the same side of a thin part [by hand]
 
 
 @dataclass(frozen=True)

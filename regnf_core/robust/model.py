@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -251,7 +251,8 @@ class ObjectModel(Bundle):
     """An object's surface and symmetries. Points in the working frame: the surface's centroid at 0, its diameter 1.
 
     spacing: between samples · extremal_points: (E, 3) outermost points, by which two placements are compared ·
-    signature: (310,), see :mod:`regnf_core.robust.model`.
+    signature: (310,), see :mod:`regnf_core.robust.model` · missed: further samples, of faces of thin walls that have
+    none among ``samples``.
     """
 
     frame: WorkingFrame
@@ -260,6 +261,15 @@ class ObjectModel(Bundle):
     extremal_points: Tensor
     symmetry: SelfSymmetry
     signature: Tensor
+    missed: Samples
+
+    @cached_property
+    def with_both_faces(self) -> ObjectModel:
+        """The same with the samples of both faces of thin walls, each of which answers on its own side. Images show one
+        of the two; a complete map shows both, and there one is enough."""
+        model = replace(self, samples=Samples.cat([self.samples, self.missed]))
+        model.__dict__["distance_grid"] = distance_grid(model.samples, model.spacing, thin=True)
+        return model
 
     @property
     def bounds(self) -> Tensor:
@@ -292,7 +302,8 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     options = options or RobustOptions()
     generator = fixed_generator()
     sampled = sample_object_surface(obj, options.object_samples, generator)
-    samples = sampled.samples
+    samples, missed = sampled.samples, sampled.missed
+    assert missed is not None  # an object's are looked for
     outermost = extremal_points(samples.on_surface(), MODEL.extremal_points)
     device = working_device(obj)
     there, rotations = samples.on(device), super_fibonacci(MODEL.rotations).to(device)
@@ -300,14 +311,14 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     proposed = propose_symmetries(grid, there, outermost, rotations, generator)
     symmetry = confirm_symmetries(proposed, sampled.field, there, outermost, generator).on("cpu")
     sampled.field.require_finite()
-    model = ObjectModel(sampled.frame, samples, sampled.spacing, outermost, symmetry, signature(samples))
+    model = ObjectModel(sampled.frame, samples, sampled.spacing, outermost, symmetry, signature(samples), missed)
     model.__dict__["distance_grid"] = grid.on("cpu")  # what the property would make again
     return model
 
 
 # An object's model as a safetensors file of about 50 kB, which saves sampling the object again.
 
-MODEL_VERSION = "2"
+MODEL_VERSION = "3"
 """Raised whenever models made by older code must be made again."""
 _SHAPES = {
     "center": "3",
@@ -322,6 +333,9 @@ _SHAPES = {
     "symmetry.deviation": "K",
     "symmetry.axis": "A 3",
     "signature": str(SIGNATURE_LENGTH),
+    "missed.points": "M 3",
+    "missed.values": "M",
+    "missed.normals": "M 3",
 }
 """By the tensors' names. A letter stands for the same count wherever it appears."""
 
@@ -336,6 +350,7 @@ def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None
         *(model.symmetry.T.scale, model.symmetry.T.rotation, model.symmetry.T.translation, model.symmetry.deviation),
         axis[None] if axis is not None else torch.zeros(0, 3),
         model.signature,
+        *(model.missed.points, model.missed.values, model.missed.normals),
     )
     tensors = {name: tensor.contiguous() for name, tensor in zip(_SHAPES, values, strict=True)}
     content = save(tensors, {"regnf_object_model": MODEL_VERSION})
@@ -367,6 +382,7 @@ def read_object_model(path: str | os.PathLike[str]) -> ObjectModel:
         tensors["extremes"].float(),
         SelfSymmetry(T, axes[0].double() if len(axes) else None, tensors["symmetry.deviation"].float()),
         tensors["signature"].float(),
+        Samples(*(tensors[f"missed.{name}"].float() for name in ("points", "values", "normals"))),
     )
 
 

@@ -152,7 +152,7 @@ def search_poses(
     seeds = bound.scale.limited_poses(seeds)
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds  # a wrong box must not end the search
-    grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
+    grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples, view.ahead)
     context = RefinementContext(
         model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
     )

@@ -49,13 +49,13 @@ def make_problem(
     An object's field on another device is evaluated there, with a copy of each point and each value.
     """
     device = working_device(scene)
-    view, model = view.on(device), model.on(device)
+    view, model = view.on(device), (model.with_both_faces if view.of_thing else model).on(device)
     generator = fixed_generator()
     A, A_held = split(view.foreground, options.held_out_share, generator)
     B, B_held = split(model.samples, options.held_out_share, generator)
     scene_field, object_field = view.field(scene), model.field(obj)
-    fit = SurfacePair(scene_field, object_field, A, B)
-    held_out = SurfacePair(scene_field, object_field, A_held, B_held)
+    fit = SurfacePair(scene_field, object_field, A, B, view.ahead)
+    held_out = SurfacePair(scene_field, object_field, A_held, B_held, view.ahead)
     return RegistrationProblem(view, model, fit, held_out, pose_bound(view, model, options))
 
 

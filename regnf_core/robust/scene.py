@@ -291,6 +291,11 @@ class SceneView(Bundle):
         :class:`regnf_core.fields.observation.Observation`; the box has that camera's axes then."""
         return self.observation is not None and self.observation.of_thing
 
+    @property
+    def ahead(self) -> float:
+        """How far in front of the foreground an object is asked, of the :class:`SurfacePair` that it is a part of."""
+        return SCENE.ahead_of_thing if self.of_thing else 0.0
+
     def field(self, scene: SdfField) -> WorkingField:
         """The scene's field, the one that this view is of, in the working frame."""
         return WorkingField(scene, self.frame)

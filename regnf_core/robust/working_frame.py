@@ -14,7 +14,7 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import Observation, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.bundle import Bundle, CopiedOnce
-from regnf_core.geometry.metrics import diameter
+from regnf_core.geometry.metrics import NearestNeighbors, diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE, OCCLUSION, SAMPLING
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
@@ -256,12 +256,14 @@ def _not_finite() -> InvalidInputError:
 
 @dataclass(frozen=True, eq=False)
 class SampledField:
-    """A field, its working frame, and its samples there. spacing: between samples, working units."""
+    """A field, its working frame, and its samples there. spacing: between samples, working units · missed: of faces of
+    thin walls that have none among the samples; None: it was not looked for."""
 
     field: WorkingField
     frame: WorkingFrame
     samples: Samples
     spacing: float
+    missed: Samples | None = None
 
 
 def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator) -> SampledField:
@@ -284,20 +286,24 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     inner = crop_to_surface(field.value, low, high, SAMPLING.object_base)
     cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels)
     found = _samples_near(field, cells, limit, generator)
-    found = found[space.faces_outside(found.points, found.normals)]
-    inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
-    found = found[inside]
+    missed = _of_missed_faces(field, cells, found)
+    found, missed = (
+        one[space.faces_outside(one.points, one.normals) & _within(one.points, low, high)] for one in (found, missed)
+    )
     if observation is not None:
         measured = observation.on_surface(found.points)
         measured &= ~observation.faces_unobserved(found.points, found.normals)
         found = found[measured] if int(measured.sum()) >= MIN_POINTS else found
+        missed = missed[:0]
     require_surface(len(found), of_object=True)
     surface = found.on_surface()
     size = diameter(surface)
     center = surface.double().mean(0)
     frame = WorkingFrame(rough.out_of(center[None])[0], rough.length * size)
-    samples = Samples((found.points - center.float()) / size, found.values / size, found.normals)
-    return SampledField(WorkingField(obj, frame), frame, samples, cells.edge / size)
+    samples, other = (
+        Samples((one.points - center.float()) / size, one.values / size, one.normals) for one in (found, missed)
+    )
+    return SampledField(WorkingField(obj, frame), frame, samples, cells.edge / size, other)
 
 
 def sample_scene_surface(
@@ -341,7 +347,30 @@ def _samples_near(field: WorkingField, cells: Cells, limit: int, generator: torc
     close = (cells.values.abs() <= SAMPLING.max_cell_distance * cells.edge).nonzero().squeeze(-1)
     if close.numel() > limit:
         close = close[torch.randperm(close.numel(), generator=generator)[:limit]]
-    start = cells.centers[close].float()
+    return _projected(field, cells[close])
+
+
+def _of_missed_faces(field: WorkingField, cells: Cells, found: Samples) -> Samples:
+    """Samples of the farther cells, where none of those ``found`` faces the same way nearby.
+
+    Of a wall thinner than a cell that lies along the grid, only the face that is nearer to the cells' centers has
+    close ones.
+    """
+    far = _projected(field, cells[(cells.values.abs() > SAMPLING.max_cell_distance * cells.edge).nonzero().squeeze(-1)])
+    if not len(far) or not len(found):
+        return far[:0]
+    apart, near = NearestNeighbors(found.points).query_several(far.points, SAMPLING.face_neighbors)
+    alike = (found.normals[near] * far.normals[:, None]).sum(-1) >= EVIDENCE.min_inlier_cosine
+    return far[~(alike & (apart <= cells.edge)).any(1)]
+
+
+def _within(points: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    return ((points >= low.float()) & (points <= high.float())).all(-1)
+
+
+def _projected(field: WorkingField, cells: Cells) -> Samples:
+    """One Newton step from the cells' centers to the surface; samples that do not end near it are left out."""
+    start = cells.centers.float()
     if start.shape[0] == 0:
         return Samples(start, start[:, 0], start)
     found = project_to_surface(field.value_and_gradient, start, 1, SAMPLING.min_slope)

@@ -154,24 +154,29 @@ def seed_poses(
 
 
 def seen_seeds(scene: Tensor, points: Tensor, normals: Tensor, axes: Tensor, rotations: Tensor, scale: float) -> Sim3:
-    """Poses T_object_scene (2K,), as those of ``seed_poses``, of an object of known scale that one image shows.
+    """Poses T_object_scene (6K,), as those of ``seed_poses``, of an object of known scale that one image shows.
 
     Its side that faces the camera is laid on what was seen: for every rotation by the middle of that side, and by its
-    nearest point and the middles across. scene: (N, 3) · points, normals: (M, 3) of the object · axes: (3, 3), columns,
-    the camera's, the last one away from it.
+    nearest point and, across, the middles or the ends to one of four sides: what hides a part of the object hides it on
+    one side. scene: (N, 3) · points, normals: (M, 3) of the object · axes: (3, 3), columns, the camera's, the last one
+    away from it.
     """
     scene, points, axes = scene.double(), points.double(), axes.double()
     turned = rotations @ axes  # (K, 3, 3): the camera's axes in the object's frame
     facing = (normals.double() @ turned[:, :, 2].mT < SEARCH.facing_cosine).double()  # (M, K)
     of_side = facing.mT @ points / facing.sum(0).clamp_min(1.0)[:, None]
-    by_side = of_side - scale * (rotations @ scene.mean(0))
+    found = [of_side - scale * (rotations @ scene.mean(0))]
     low, high = _object_extents(points, rotations, axes)
     seen = scene @ axes
-    object_end, scene_end = (low + high) / 2.0, (seen.amin(0) + seen.amax(0)) / 2.0
-    object_end[:, 2], scene_end[2] = low[:, 2], seen[:, 2].amin()
-    by_end = (turned @ (object_end - scale * scene_end)[..., None]).squeeze(-1)
-    s = scene.new_full((2 * len(rotations),), scale)
-    return Sim3(s, rotations.repeat(2, 1, 1), torch.cat([by_side, by_end]))
+    scene_low, scene_high = seen.amin(0), seen.amax(0)
+    longer = (high - low - scale * (scene_high - scene_low)).clamp_min(0.0) / 2.0
+    scene_end = torch.cat([(scene_low + scene_high)[:2] / 2.0, scene_low[2:]])
+    object_end = torch.cat([(low + high)[:, :2] / 2.0, low[:, 2:]], 1)
+    for aside in ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        end = object_end + longer * longer.new_tensor([*aside, 0.0])
+        found.append((turned @ (end - scale * scene_end)[..., None]).squeeze(-1))
+    s = scene.new_full((len(found) * len(rotations),), scale)
+    return Sim3(s, rotations.repeat(len(found), 1, 1), torch.cat(found))
 
 
 def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:

@@ -35,13 +35,14 @@ class DistanceGrid(Bundle):
     edge: Tensor
 
     @classmethod
-    def of(cls, points: Tensor, normals: Tensor, spacing: float, margin: float) -> DistanceGrid:
-        """Of oriented surface points (N, 3); it covers their box grown by ``margin`` on every side."""
+    def of(cls, points: Tensor, normals: Tensor, spacing: float, margin: float, thin: bool = False) -> DistanceGrid:
+        """Of oriented surface points (N, 3); it covers their box grown by ``margin`` on every side. thin: see
+        :func:`nearest_sample_distance`."""
         low, high = points.amin(0) - margin, points.amax(0) + margin
         edge = (high - low) / _CELLS
         axes = [low[k] + (torch.arange(_CELLS, device=points.device) + 0.5) * edge[k] for k in range(3)]
         centers = torch.cartesian_prod(*axes)
-        value, gradient = nearest_sample_distance(points, normals, spacing, centers)
+        value, gradient = nearest_sample_distance(points, normals, spacing, centers, thin)
         at_zero = value - (gradient * centers).sum(-1)
         planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)
         return cls(planes, *(corner[:, None] for corner in (low, high, edge)))
@@ -85,17 +86,22 @@ def _away(beyond: Tensor) -> tuple[Tensor, Tensor]:
     return distance, beyond / distance.clamp_min(1e-9)
 
 
-def distance_grid(samples: Samples, spacing: float) -> DistanceGrid:
-    """The grid around a surface's samples, ``spacing`` apart, in their working frame."""
-    return DistanceGrid.of(samples.on_surface(), samples.normals, spacing, SEARCH.grid_margin)
+def distance_grid(samples: Samples, spacing: float, thin: bool = False) -> DistanceGrid:
+    """The grid around a surface's samples, ``spacing`` apart, in their working frame. thin: see
+    :func:`nearest_sample_distance`."""
+    return DistanceGrid.of(samples.on_surface(), samples.normals, spacing, SEARCH.grid_margin, thin)
 
 
-def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, queries: Tensor) -> tuple[Tensor, Tensor]:
+def nearest_sample_distance(
+    points: Tensor, normals: Tensor, spacing: float, queries: Tensor, thin: bool = False
+) -> tuple[Tensor, Tensor]:
     """Signed distance (M,) and gradient (M, 3) at queries (M, 3), to the surface of oriented points (N, 3).
 
     Far away: the distance to the nearest point, signed by its normal. Close: the distance to its tangent plane.
+    thin: of a wall thinner than the spacing the face that the query is in front of counts; the nearest point may be the
+    other's.
     """
-    far, nearest = NearestNeighbors(points).query(queries)
+    far, nearest = (_of_the_face_in_front if thin else _nearest)(points, normals, queries)
     offset = queries - points[nearest]
     n = normals[nearest]
     height = (offset * n).sum(-1)
@@ -105,6 +111,29 @@ def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, que
     value = torch.where(close, height, sign * far)
     gradient = torch.where(close[:, None], n, sign[:, None] * offset / far.clamp_min(1e-9)[:, None])
     return value, gradient
+
+
+def _nearest(points: Tensor, _normals: Tensor, queries: Tensor) -> tuple[Tensor, Tensor]:
+    return NearestNeighbors(points).query(queries)
+
+
+def _of_the_face_in_front(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance (M,) and number (M,) of the point that is nearest to each query (M, 3), but for queries behind it: these
+    have the nearest of the next few that faces the other way, has the query in front of it, and lies between both."""
+    neighbors = NearestNeighbors(points)
+    far, nearest = neighbors.query(queries)
+    height = ((queries - points[nearest]) * normals[nearest]).sum(-1)
+    behind = (height < 0.0).nonzero().squeeze(-1)
+    apart, others = neighbors.query_several(queries[behind], SEARCH.sheet_neighbors)
+    heights = ((queries[behind, None] - points[others]) * normals[others]).sum(-1)
+    opposite = (normals[others] * normals[nearest[behind], None]).sum(-1) < SEARCH.sheet_cosine
+    in_front = opposite & (heights >= 0.0) & (heights <= -height[behind, None])
+    first = in_front.int().argmax(1, keepdim=True)
+    found = in_front.any(1)
+    chosen = behind[found]
+    far, nearest = far.clone(), nearest.clone()
+    far[chosen], nearest[chosen] = apart.gather(1, first)[found, 0], others.gather(1, first)[found, 0]
+    return far, nearest
 
 
 # Seeds from feature matches: FPFH descriptors on clouds of one size, RANSAC over similarity transforms.
