@@ -353,7 +353,7 @@ class SceneConstants:
     offset_per_normal_roughness: float = 2.0  # diameters of allowed offset for roughness beyond it [early fits]
     neighbors: int = 16  # nearest samples over which normals and heights are averaged [by hand]
     averaging_rounds: int = 2  # of normals: after the first, the roughest normals still pull [by hand]
-    min_same_sheet_cosine: float = -0.5  # between normals of neighbors on the same side of a thin part [by hand]
+    min_same_sheet_cosine: float = 0.3  # between normals of neighbors on the same side of a thin part [by hand]
 
 
 @dataclass(frozen=True)
