@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.composite import TransformedField
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import register
 from regnf_core.robust.model import (
     MODEL_VERSION,
@@ -20,6 +22,8 @@ from regnf_core.robust.model import (
     signature,
     write_object_model,
 )
+from regnf_core.robust.residuals import SurfacePair, residuals
+from regnf_core.robust.working_frame import Samples
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, table
 from tests.core.robust.shapes import ROBUST, alone, can, detection, random_pose, slab_table
 
@@ -122,3 +126,62 @@ def test_a_faulty_model_file_is_refused(tmp_path: Path, fault: str) -> None:
     with pytest.raises(FieldFormatError) as raised:
         read_object_model(path)
     assert raised.value.reason == "OBJECT_MODEL_INVALID"
+
+
+# Thin walls: boards along the axes, thinner than the sampling's cells.
+
+
+def boards() -> AnalyticField:
+    """Two boards, 4 thousandths of the whole thick, that stand along the axes and meet."""
+    return boxes([([-0.5, -0.4, 0.003], [0.5, 0.4, 0.008]), ([0.495, -0.4, 0.008], [0.5, 0.4, 0.5])])
+
+
+def on_boards(model: ObjectModel) -> tuple[Tensor, Tensor]:
+    """Places on the faces of the lying board, in the model's frame, and the faces' normals."""
+    x, y = torch.meshgrid(torch.linspace(-0.45, 0.4, 18), torch.linspace(-0.35, 0.35, 15), indexing="ij")
+    places = [torch.stack([x, y, torch.full_like(x, z)], -1).reshape(-1, 3) for z in (0.003, 0.008)]
+    normals = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]).repeat_interleave(len(places[0]), 0)
+    return model.frame.into(torch.cat(places)), normals
+
+
+def has_a_sample(model: ObjectModel) -> float:
+    """The share of those places that have a sample of their own face within two spacings."""
+    places, normals = on_boards(model)
+    samples = model.samples
+    near = (places[:, None] - samples.on_surface()).norm(dim=-1) < 2.0 * model.spacing
+    return float((near & (normals @ samples.normals.T > 0.9)).any(1).float().mean())
+
+
+def test_both_faces_of_a_thin_wall_have_samples_and_each_answers_on_its_own_side() -> None:
+    model = model_object(boards())
+    both = model.with_both_faces
+    assert has_a_sample(model) < 0.9  # what this is about: the grid's cells see one face
+    assert has_a_sample(both) > 0.99
+    places, normals = on_boards(both)
+    for ahead in (0.01, 0.02):
+        value, gradient = both.distance_grid.value_and_gradient(places + ahead * normals)
+        assert float(((gradient * normals).sum(-1) > 0.9).float().mean()) > 0.95
+        assert float((value - ahead).abs().median()) < 0.002
+
+
+def test_a_measured_point_meets_the_face_that_it_shows_however_noisy_it_is() -> None:
+    model = model_object(boards()).with_both_faces
+    places, normals = on_boards(model)
+    noise = (0.015 * torch.randn(len(places), generator=torch.Generator().manual_seed(0))).clamp(-0.04, 0.04)
+    samples = Samples(places + noise[:, None] * normals, torch.zeros(len(places)), normals)
+    field = model.field(boards())
+    still = Sim3.identity()[None]
+    alone = residuals(SurfacePair(field, field, samples, samples), still)
+    ahead = residuals(SurfacePair(field, field, samples, samples, 0.05), still)
+    n = len(places)
+    assert float((alone.cosines[:, :n] < 0.0).float().mean()) > 0.2
+    assert float(ahead.cosines[:, :n].min()) > 0.99
+    torch.testing.assert_close(ahead.values[0, :n], noise, rtol=0.0, atol=1e-4)
+    pair = SurfacePair(field, field, samples, samples, 0.05)
+    steps = 1e-3 * torch.eye(7).double()
+    moved = torch.cat([residuals(pair, still.perturb(step[None])).values for step in steps])
+    slopes = (moved[:, :n] - ahead.values[:, :n]).T / 1e-3
+    # At fixed units of the scene: without the part that the growth of the units alone makes.
+    slopes[:, 6] -= ahead.values[0, :n]
+    inside = (places[:, :2].abs() < 0.3).all(-1)
+    torch.testing.assert_close(ahead.jacobian[0, :n][inside], slopes[inside], rtol=0.0, atol=5e-3)

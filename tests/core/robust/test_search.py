@@ -193,8 +193,16 @@ def test_the_side_that_the_camera_sees_is_laid_on_what_was_seen() -> None:
     scene = truth.inverse().apply(0.5 * normals[seen].double())
     seeds = bounds.seen_seeds(scene, 0.5 * normals, normals, axes, super_fibonacci(24), 1.5)
     middle = seeds.inverse().apply(torch.zeros(1, 3).double())[:, 0]
-    assert len(seeds) == 48
+    assert len(seeds) == 6 * 24
     assert torch.allclose(middle, truth.inverse().translation.expand_as(middle), atol=0.02)
+    # Of the left half of that side the middle is half a radius off, as of its ends; by the end at one of four sides the
+    # ball's own middle is found.
+    across = normals.double() @ truth.rotation @ axes[:, 0]
+    half = truth.inverse().apply(0.5 * normals[seen & (across < 0.0)].double())
+    seeds = bounds.seen_seeds(half, 0.5 * normals, normals, axes, super_fibonacci(24), 1.5)
+    off = (seeds.inverse().apply(torch.zeros(1, 3).double())[:, 0] - truth.inverse().translation).norm(dim=-1)
+    nearest = off.reshape(6, 24).amax(1)
+    assert float(nearest.min()) < 0.03 < 0.1 < float(nearest[:2].min())
 
 
 def test_too_small_a_cloud_gives_no_seed() -> None:
