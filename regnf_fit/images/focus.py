@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 Masks = Sequence[NDArray[np.bool_]]
 
 _MOST_NODES = 1_000_000
+_AT_ONCE = 1 << 15
+"""Nodes: what is in use of them stays in the processor's cache."""
 _SHARP = 0.25
 """The share of the measured pixels that are no wider at their surface than a voxel is."""
 _PLANAR, _BESIDE = 3.0, 1.5
@@ -82,12 +84,19 @@ def focused_field(
     edge = max(voxel or _pixel_width(views), float(np.prod(2.0 * half) / _MOST_NODES) ** (1.0 / 3.0))
     shape = tuple(int(n) for n in np.ceil(2.0 * half / edge) + 1)
     low = -half
-    axes = (low[k] + edge * np.arange(shape[k]) for k in range(3))
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    free, behind = _carved(nodes, views, edge, spread)
-    values = _distances(nodes, points, normals, behind, low, edge, shape)
+    places, planes, nearest = _nearest(points, normals, low, edge, shape)
+    axes = [(low[k] + edge * np.arange(shape[k])).astype(np.float32) for k in range(3)]
+    values, free = np.empty(shape, np.float32), np.empty(shape, np.bool_)
+    several = max(1, _AT_ONCE // (shape[1] * shape[2]))
+    for start in range(0, shape[0], several):
+        slab = slice(start, start + several)
+        voxels = nearest[slab].ravel()
+        nodes = np.stack(np.meshgrid(axes[0][slab], *axes[1:], indexing="ij"), axis=-1).reshape(-1, 3)
+        through, behind = _carved(nodes, views, edge, spread)
+        found = _distances(nodes, places.take(voxels, axis=0), planes.take(voxels, axis=0), behind, edge)
+        values[slab], free[slab] = (each.reshape(-1, *shape[1:]) for each in (found, through))
     told = np.where((told == 0) & _on_planes(points, normals, told, 2.0 * edge), np.int8(-1), told)
-    observation = _observation(points, told, free.reshape(shape), low, edge, shape)
+    observation = _observation(points, told, free, low, edge, shape)
     high = low + edge * (np.array(shape) - 1)
     origin, top, step = (torch.from_numpy(v.astype(np.float32)) for v in (low, high, np.full(3, edge)))
     function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step), origin, top, 1.0)
@@ -174,16 +183,11 @@ def _carved(
     return free, behind & ~free
 
 
-def _distances(
-    nodes: NDArray[np.float32],
-    points: Floats,
-    normals: Floats,
-    behind: NDArray[np.bool_],
-    low: Floats,
-    edge: float,
-    shape: tuple[int, ...],
-) -> NDArray[np.float32]:
-    """(X, Y, Z): from the nearest voxel's mean point and plane near the surface, from the point beyond."""
+def _nearest(
+    points: Floats, normals: Floats, low: Floats, edge: float, shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
+    """Means (C, 3) of the points and of the normals in each voxel that holds some, and the voxel nearest to each node:
+    (X, Y, Z)."""
     cells = np.clip(np.round((points - low) / edge).astype(np.int64), 0, np.array(shape) - 1)
     held, of, count = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True, return_counts=True)
 
@@ -193,19 +197,33 @@ def _distances(
 
     places, planes = means(points), means(normals)
     planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
-    number = np.full(len(nodes), -1)
+    number = np.full(np.prod(shape), -1)
     number[held] = np.arange(len(held))
     empty = (number < 0).reshape(shape)
-    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    index = number[np.ravel_multi_index(tuple(nearest.reshape(3, -1)), shape)]
-    offset = nodes - places[index]
-    apart = np.sqrt(np.einsum("nc,nc->n", offset, offset))
-    across = np.einsum("nc,nc->n", offset, planes[index])
+    x, y, z = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return places, planes, number[(x * shape[1] + y) * shape[2] + z]
+
+
+def _distances(
+    nodes: NDArray[np.float32],
+    places: NDArray[np.float32],
+    planes: NDArray[np.float32],
+    behind: NDArray[np.bool_],
+    edge: float,
+) -> NDArray[np.float32]:
+    """(N,): from the nearest voxel's mean point (N, 3) and plane near the surface, from the point beyond."""
+    offset = nodes - places
+    apart, across = np.sqrt(_dot(offset, offset)), _dot(offset, planes)
     sign = np.where(behind & (apart <= _BEHIND * edge), np.float32(-1.0), np.float32(1.0))
     # Straight above a pixel's patch its plane tells the distance; beside the patch the point does.
     straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
     far = sign * np.where(straight, np.abs(across), apart)
-    return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32).reshape(shape)
+    return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32)
+
+
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N,): of vectors (N, 3)."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:
