@@ -132,10 +132,12 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.
     # A plane's own depth would cut the tops of curved surfaces: voxels average the noise.
     kept = np.where(planes.known, depth, np.float32(0.0))
     row, column = np.nonzero(kept > 0.0)
-    slopes = (np.stack([column, row], axis=1) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * kept[row, column][:, None]
+    local = np.empty((len(row), 3))
+    local[:, 2] = kept[row, column]
+    for axis, place in enumerate((column, row)):
+        local[:, axis] = (place + 0.5 - K[axis, 2]) / K[axis, axis] * local[:, 2]
     points = local @ T_region_camera[:3, :3].T + T_region_camera[:3, 3]
-    inside = (np.abs(points) <= half).all(axis=1)
+    inside = _all(np.abs(points) <= half)
     if not inside.any():
         return None
     normals = planes.normals[row[inside], column[inside]].astype(np.float64) @ T_region_camera[:3, :3].T
@@ -185,11 +187,16 @@ def _carved(
 
 def _nearest(
     points: Floats, normals: Floats, low: Floats, edge: float, shape: tuple[int, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
     """Means (C, 3) of the points and of the normals in each voxel that holds some, and the voxel nearest to each node:
     (X, Y, Z)."""
     cells = np.clip(np.round((points - low) / edge).astype(np.int64), 0, np.array(shape) - 1)
-    held, of, count = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True, return_counts=True)
+    cell = np.ravel_multi_index(tuple(cells.T), shape)
+    counts = np.bincount(cell, minlength=np.prod(shape))
+    held = np.flatnonzero(counts)
+    number = np.full(len(counts), -1, np.int32)
+    number[held] = np.arange(len(held))
+    of, count = number[cell], counts[held]
 
     def means(values: Floats) -> NDArray[np.float32]:
         sums = [np.bincount(of, values[:, axis], minlength=len(held)) for axis in range(3)]
@@ -197,9 +204,7 @@ def _nearest(
 
     places, planes = means(points), means(normals)
     planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
-    number = np.full(np.prod(shape), -1)
-    number[held] = np.arange(len(held))
-    empty = (number < 0).reshape(shape)
+    empty = (counts == 0).reshape(shape)
     x, y, z = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     return places, planes, number[(x * shape[1] + y) * shape[2] + z]
 
@@ -219,6 +224,11 @@ def _distances(
     straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
     far = sign * np.where(straight, np.abs(across), apart)
     return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32)
+
+
+def _all(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,): the rows (N, 3) that are all true."""
+    return mask[:, 0] & mask[:, 1] & mask[:, 2]
 
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -262,10 +272,11 @@ def _observation(
     padded[tuple(slice(0, min(s, 2 * n)) for s, n in zip(shape, counts, strict=True))] = free[
         tuple(slice(0, 2 * n) for n in counts)
     ]
-    blocks = padded.reshape(counts[0], 2, counts[1], 2, counts[2], 2)
-    states[blocks.all(axis=(1, 3, 5))] = FREE
+    padded = padded[::2] & padded[1::2]
+    padded = padded[:, ::2] & padded[:, 1::2]
+    states[padded[..., ::2] & padded[..., 1::2]] = FREE
     cells = np.floor((points - low) / (2.0 * edge)).astype(np.int64)
-    within = ((cells >= 0) & (cells < np.array(counts))).all(axis=1)
+    within = _all((cells >= 0) & (cells < np.array(counts)))
     surfaces = np.zeros((3, *counts), np.bool_)
     for layer, which in enumerate((0, -1, 1)):
         surfaces[layer][tuple(cells[within & (told == which)].T)] = True
