@@ -32,6 +32,21 @@ def die_with_parent(parent_pid: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_KEPT_BYTES, _OWN_BYTES = 1 << 26, 1 << 24
+
+
+def keep_freed_memory() -> None:
+    """Have the C library keep some freed memory for what is allocated next (glibc; nothing elsewhere).
+
+    Else each larger array is given back to the system, and the next one's pages are made anew, one by one.
+    """
+    with suppress(OSError, AttributeError):
+        libc = ctypes.CDLL(None)
+        libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+        libc.mallopt(_M_MMAP_THRESHOLD, _OWN_BYTES)
+
+
 def memory_of_the_machine() -> int:
     """All of it, bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

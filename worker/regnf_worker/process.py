@@ -27,6 +27,7 @@ from rq.timeouts import JobTimeoutException
 from rq.worker import WorkerStatus
 
 from regnf_core.importing.gate.child import LONGEST
+from regnf_core.processes import keep_freed_memory
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis.client import WORKER_RETRIES, connect, redis_address
@@ -210,6 +211,7 @@ class RegnfWorker(ResilientWorker):
             os.close(ended)
             pictures.hold(held_by_child)
             if limited:
+                keep_freed_memory()
                 self._job_limits.hold_here()
             self._scratch.use(folder)
             random.seed()
