@@ -32,8 +32,8 @@ def die_with_parent(parent_pid: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-_KEPT_BYTES, _OWN_BYTES = 1 << 26, 1 << 24
+_MALLOPT = (-1, 1 << 26), (-3, 1 << 24)
+"""M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt, bytes."""
 
 
 def keep_freed_memory() -> None:
@@ -42,9 +42,8 @@ def keep_freed_memory() -> None:
     Else each larger array is given back to the system, and the next one's pages are made anew, one by one.
     """
     with suppress(OSError, AttributeError):
-        libc = ctypes.CDLL(None)
-        libc.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
-        libc.mallopt(_M_MMAP_THRESHOLD, _OWN_BYTES)
+        for parameter, size in _MALLOPT:
+            ctypes.CDLL(None).mallopt(parameter, size)
 
 
 def memory_of_the_machine() -> int:

@@ -26,6 +26,7 @@ from regnf_data.recordings.recording import Frame
 from regnf_fit.images.observing import pixel_planes
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Masks = Sequence[NDArray[np.bool_]]
 
 _MOST_NODES = 1_000_000
@@ -90,10 +91,10 @@ def focused_field(
     several = max(1, _AT_ONCE // (shape[1] * shape[2]))
     for start in range(0, shape[0], several):
         slab = slice(start, start + several)
-        voxels = nearest[slab].ravel()
         nodes = np.stack(np.meshgrid(axes[0][slab], *axes[1:], indexing="ij"), axis=-1).reshape(-1, 3)
         through, behind = _carved(nodes, views, edge, spread)
-        found = _distances(nodes, places.take(voxels, axis=0), planes.take(voxels, axis=0), behind, edge)
+        place, plane = (each.take(nearest[slab].ravel(), axis=0) for each in (places, planes))
+        found = _distances(nodes - place, plane, behind, edge)
         values[slab], free[slab] = (each.reshape(-1, *shape[1:]) for each in (found, through))
     told = np.where((told == 0) & _on_planes(points, normals, told, 2.0 * edge), np.int8(-1), told)
     observation = _observation(points, told, free, low, edge, shape)
@@ -137,7 +138,8 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.
     for axis, place in enumerate((column, row)):
         local[:, axis] = (place + 0.5 - K[axis, 2]) / K[axis, axis] * local[:, 2]
     points = local @ T_region_camera[:3, :3].T + T_region_camera[:3, 3]
-    inside = _all(np.abs(points) <= half)
+    x, y, z = np.abs(points).T
+    inside = (x <= half[0]) & (y <= half[1]) & (z <= half[2])
     if not inside.any():
         return None
     normals = planes.normals[row[inside], column[inside]].astype(np.float64) @ T_region_camera[:3, :3].T
@@ -187,19 +189,16 @@ def _carved(
 
 def _nearest(
     points: Floats, normals: Floats, low: Floats, edge: float, shape: tuple[int, ...]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Means (C, 3) of the points and of the normals in each voxel that holds some, and the voxel nearest to each node:
-    (X, Y, Z)."""
+) -> tuple[Singles, Singles, NDArray[np.int32]]:
+    """Means (C, 3) of points and normals in voxels that hold some; which of these is nearest to nodes: (X, Y, Z)."""
     cells = np.clip(np.round((points - low) / edge).astype(np.int64), 0, np.array(shape) - 1)
     cell = np.ravel_multi_index(tuple(cells.T), shape)
     counts = np.bincount(cell, minlength=np.prod(shape))
-    held = np.flatnonzero(counts)
-    number = np.full(len(counts), -1, np.int32)
-    number[held] = np.arange(len(held))
-    of, count = number[cell], counts[held]
+    number = np.cumsum(counts > 0, dtype=np.int32) - np.int32(1)  # of the voxels that hold points
+    of, count = number[cell], counts[counts > 0]
 
-    def means(values: Floats) -> NDArray[np.float32]:
-        sums = [np.bincount(of, values[:, axis], minlength=len(held)) for axis in range(3)]
+    def means(values: Floats) -> Singles:
+        sums = [np.bincount(of, values[:, axis], minlength=len(count)) for axis in range(3)]
         return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
 
     places, planes = means(points), means(normals)
@@ -209,31 +208,16 @@ def _nearest(
     return places, planes, number[(x * shape[1] + y) * shape[2] + z]
 
 
-def _distances(
-    nodes: NDArray[np.float32],
-    places: NDArray[np.float32],
-    planes: NDArray[np.float32],
-    behind: NDArray[np.bool_],
-    edge: float,
-) -> NDArray[np.float32]:
-    """(N,): from the nearest voxel's mean point (N, 3) and plane near the surface, from the point beyond."""
-    offset = nodes - places
-    apart, across = np.sqrt(_dot(offset, offset)), _dot(offset, planes)
+def _distances(offset: Singles, planes: Singles, behind: NDArray[np.bool_], edge: float) -> Singles:
+    """(N,): from the plane of the nearest voxel's mean point near the surface, from the point beyond. offset: from it;
+    planes: their normals; (N, 3)."""
+    (x, y, z), (a, b, c) = offset.T, planes.T
+    apart, across = np.sqrt(x * x + y * y + z * z), x * a + y * b + z * c
     sign = np.where(behind & (apart <= _BEHIND * edge), np.float32(-1.0), np.float32(1.0))
     # Straight above a pixel's patch its plane tells the distance; beside the patch the point does.
     straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
     far = sign * np.where(straight, np.abs(across), apart)
     return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32)
-
-
-def _all(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(N,): the rows (N, 3) that are all true."""
-    return mask[:, 0] & mask[:, 1] & mask[:, 2]
-
-
-def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N,): of vectors (N, 3)."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
 def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:
@@ -276,7 +260,7 @@ def _observation(
     padded = padded[:, ::2] & padded[:, 1::2]
     states[padded[..., ::2] & padded[..., 1::2]] = FREE
     cells = np.floor((points - low) / (2.0 * edge)).astype(np.int64)
-    within = _all((cells >= 0) & (cells < np.array(counts)))
+    within = ((cells >= 0) & (cells < np.array(counts))).all(axis=1)
     surfaces = np.zeros((3, *counts), np.bool_)
     for layer, which in enumerate((0, -1, 1)):
         surfaces[layer][tuple(cells[within & (told == which)].T)] = True

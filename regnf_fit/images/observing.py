@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, replace
 from itertools import product
 from math import sqrt
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -180,45 +179,37 @@ _ROWS = 24
 
 def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
     """The planes of :func:`local_planes` for one image. depth: (H, W) · camera: (3, 3)."""
-    valid = depth > 0.0
-    inverse = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=valid)
-    padded = np.pad(np.where(valid, inverse, np.inf), _NORMAL_REACH, constant_values=np.inf)
+    K_inverse = np.asarray(np.linalg.inv(camera))
+    inverses = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=depth > 0.0)
+    around = np.pad(np.where(depth > 0.0, inverses, np.inf), _NORMAL_REACH, constant_values=np.inf)
     parts = []
     for top in range(0, len(depth), _ROWS):
-        here = slice(top, top + _ROWS)
-        around = padded[top : top + len(depth[here]) + 2 * _NORMAL_REACH]
-        parts.append(_planes_of_rows(top, depth[here], inverse[here], around, np.asarray(np.linalg.inv(camera))))
-    return PixelPlanes(*(np.concatenate(each) for each in zip(*parts, strict=True)))
-
-
-def _planes_of_rows(
-    top: int, depth: NDArray[np.float32], inverse: Floats, around: Floats, K_inverse: Floats
-) -> tuple[NDArray[Any], ...]:
-    """The members of PixelPlanes for rows from ``top`` on. around: 1/z of the rows and of those that windows reach."""
-    rows, columns = np.indices(depth.shape) + 0.5
-    rays = np.stack([columns, rows + top, np.ones_like(rows)], axis=-1) @ K_inverse.T
-    x, y, z = np.ascontiguousarray(np.moveaxis(rays, 2, 0))  # of the rays, (H, W) each
-    count, sums = _moments(K_inverse[:2, :2], inverse, around)
-    known = (depth > 0.0) & (count >= _MIN_PIXELS)
-    mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
-    # all relative to the pixel itself, see _moments
-    xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
-    xi, yi, ii = xi - mx * mi, yi - my * mi, ii - mi * mi
-    determinant = xx * yy - xy * xy
-    known &= determinant > 1e-2 * (xx + yy) ** 2
-    determinant = np.where(known, determinant, 1.0)
-    a, b = (yy * xi - xy * yi) / determinant, (xx * yi - xy * xi) / determinant
-    # 1/z = a x + b y + c: the plane's normal is (a, b, c), and its product with the ray (x, y, 1) is 1/z
-    here = inverse + mi - a * mx - b * my
-    c = here - a * x - b * y
-    length = np.sqrt(a * a + b * b + c * c)
-    cosine = here / np.maximum(length * np.sqrt(x * x + y * y + z * z), 1e-12)
-    # three numbers were fitted to each window; a deviation of 1/z is one of z by z squared
-    variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
-    deviation = np.where(known, np.sqrt(variance) * depth.astype(np.float64) ** 2, 0.0)
-    cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
-    normals = np.stack([(each / -np.maximum(length, 1e-12)).astype(np.float32) for each in (a, b, c)], axis=-1)
-    return known, normals, cosine.astype(np.float32), deviation.astype(np.float32)
+        inverse, measured = inverses[top : top + _ROWS], depth[top : top + _ROWS].astype(np.float64)
+        rows, columns = np.indices(inverse.shape) + 0.5
+        rays = np.stack([columns, rows + top, np.ones_like(rows)], axis=-1) @ K_inverse.T
+        x, y, z = np.ascontiguousarray(np.moveaxis(rays, 2, 0))  # of the rays, (h, W) each
+        count, sums = _moments(K_inverse[:2, :2], inverse, around[top : top + len(inverse) + 2 * _NORMAL_REACH])
+        known = (measured > 0.0) & (count >= _MIN_PIXELS)
+        mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
+        # all relative to the pixel itself, see _moments
+        xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
+        xi, yi, ii = xi - mx * mi, yi - my * mi, ii - mi * mi
+        determinant = xx * yy - xy * xy
+        known &= determinant > 1e-2 * (xx + yy) ** 2
+        determinant = np.where(known, determinant, 1.0)
+        a, b = (yy * xi - xy * yi) / determinant, (xx * yi - xy * xi) / determinant
+        # 1/z = a x + b y + c: the plane's normal is (a, b, c), and its product with the ray (x, y, 1) is 1/z
+        here = inverse + mi - a * mx - b * my
+        c = here - a * x - b * y
+        length = np.sqrt(a * a + b * b + c * c)
+        cosine = here / np.maximum(length * np.sqrt(x * x + y * y + z * z), 1e-12)
+        # three numbers were fitted to each window; a deviation of 1/z is one of z by z squared
+        variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
+        deviation = np.where(known, np.sqrt(variance) * measured**2, 0.0)
+        cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
+        normals = np.stack([a, b, c], axis=-1) / -np.maximum(length, 1e-12)[..., None]
+        parts.append((known, *(each.astype(np.float32) for each in (normals, cosine, deviation))))
+    return PixelPlanes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _moments(step: Floats, inverse: Floats, around: Floats) -> tuple[Floats, Floats]:
