@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.robust.cases import Pair, load_pairs
+from benchmarks.symmetric_errors import errors_against_truth
 from regnf_core import RegistrationResult, Sim3, register
 from regnf_core.fields.observation import observation_of
-from regnf_core.geometry.metrics import errors_against_truth, gaps
+from regnf_core.geometry.metrics import gaps
 from regnf_core.robust.working_frame import WorkingFrame, sample_scene_surface
 from regnf_core.schema.description import SURFACE
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR

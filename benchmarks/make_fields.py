@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.simple_meshes import box, together
+from benchmarks.solids import BoxField, UnionField
 from regnf_core.editing.storing import write_field
-from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.options import FitOptions

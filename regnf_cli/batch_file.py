@@ -243,7 +243,6 @@ class ResultsFile:
         return self._last.get(pair.id, {}).get("status") == "successful"
 
     def add(self, pair: FilePair, told: Mapping[str, Any]) -> None:
-        """Append the result of a pair."""
         line = {"id": pair.id, "line": pair.line, "key": pair.key, **told}
         self._last[pair.id] = line
         with self._path.open("a", encoding="utf-8") as file:

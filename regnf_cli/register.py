@@ -13,7 +13,7 @@ import typer
 
 import regnf_cli.options as cli
 from regnf_cli.guard import require
-from regnf_cli.registration import Files, answer, check_box
+from regnf_cli.registration import Files, SentRecording, answer, check_box
 from regnf_cli.report import tell
 from regnf_core.detections import Detection
 from regnf_core.detections.images import AnyDetection, image_detection_in_field, plain_values
@@ -118,20 +118,20 @@ def _place(
     thing: FieldSource | None,
     said: tuple[Any, ...],
     remote: bool,
-) -> FieldSource | Recording | Path:
-    """The scene's field, or a recording (its path, where it is sent elsewhere); a box outside of it is refused.
+) -> FieldSource | Recording | SentRecording:
+    """The scene's field, or a recording; a box outside of it is refused.
 
     thing: the only object · said: of the recording, as ``cli.given_of`` takes it.
     """
     if any(said) or cli.is_recording(scene):
-        if remote and any(said):
-            hint = "Write it into the recording's files: docs/datasets.md says where."
-            raise InvalidOptionsError("options of recordings are for registrations that are done here", hint=hint)
+        if any(said):
+            require("engine")
+        given = cli.given_of(*said) if any(said) or not remote else None
         if remote:
-            return scene
+            return SentRecording(scene, {} if given is None else given.described().non_default())
         from regnf_data.recordings.opening import open_recording
 
-        return open_recording(scene, cli.given_of(*said))
+        return open_recording(scene, given)
     place = cli.source_of(scene, description, settings, "scene")
     if not isinstance(detection, Detection):
         raise image_detection_in_field(scene)

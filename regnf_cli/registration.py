@@ -34,8 +34,16 @@ Objects = FieldSource | list[FieldSource]
 """One object to register, or several to search among."""
 
 
+@dataclass(frozen=True)
+class SentRecording:
+    """A recording that is sent to a service. description: what its files do not say of it."""
+
+    path: Path
+    description: dict[str, Any]
+
+
 def answer(
-    scene: FieldSource | Recording | Path,
+    scene: FieldSource | Recording | SentRecording,
     objects: Objects,
     request: dict[str, Any],
     files: Files,
@@ -47,14 +55,14 @@ def answer(
 ) -> None:
     """Register or search, print the result, write the files, and leave with the verdict's exit code.
 
-    scene: a path is that of a recording that is sent · client: None does the work here · tag, cancel: see
+    client: None does the work here · tag, cancel: see
     ``_register_remotely`` · top: how many candidates are shown.
     """
-    if isinstance(scene, Path) or client is not None:
-        assert client is not None
-        assert isinstance(scene, Path | FieldSource)
+    if client is not None:
+        assert isinstance(scene, SentRecording | FieldSource)
         document = _register_remotely(client, scene, objects, request, tag, files.output, cancel)
     else:
+        assert not isinstance(scene, SentRecording)
         document = register_here(scene, objects, request, files)
     show(document, as_json, top)
     files.tell()
@@ -98,7 +106,8 @@ class Files:
     def tell(self) -> None:
         """Say where the files are, on stderr: the document on stdout may be JSON."""
         if self.output is not None:
-            tell(f"wrote {self.output}: result.json, preview.png, point clouds")
+            picture = ", overlay.png" if (self.output / "overlay.png").is_file() else ""
+            tell(f"wrote {self.output}: result.json, preview.png{picture}, point clouds")
         if self.recording is not None:
             tell(f"wrote {self.recording}")
 
@@ -128,17 +137,17 @@ def register_here(
         seen: SdfField | Recording
         if isinstance(scene, FieldSource):
             opened = load_field(scene)
-            seen, notes["scene"] = opened.field, opened.notes
+            seen, name, notes["scene"] = opened.field, scene.named, opened.notes
         else:
-            seen = scene
-        where = partial(place_of, seen, detection, options, scene_name(scene))
+            seen, name = scene, Path(scene.name)
+        where = partial(place_of, seen, detection, options, name)
         if isinstance(objects, list):
             place = where()
             library, unusable = _modeled(objects, options.robust, partial(report, "library"))
             found = search_library(place.field, place.box, library, place.options, seed, report, clouds=wanted)
-            result, name = found.result, found.ranking[0].name
+            result, said["object_name"] = found.result, found.ranking[0].name
             said["candidates"] = ranking_document(found.ranking, unusable)
-            obj = load_field(next(one for one in objects if str(one.named) == name))
+            obj = load_field(next(one for one in objects if str(one.named) == said["object_name"]))
         else:
             obj = load_field(objects)
             model = None if notes else object_model(objects, options.robust)
@@ -149,12 +158,12 @@ def register_here(
             result = register(
                 place.field, obj.field, place.box, place.options, seed, report, initial, model, clouds=wanted
             )
-            name = str(objects.named)
+            said["object_name"] = str(objects.named)
         result = place.seen(result)
         report("exporting", 1.0)
     for note in place.notes:
         tell(f"note: {note}")
-    said |= {"object_name": name, "fields": notes | {"object": obj.notes}}
+    said["fields"] = notes | {"object": obj.notes}
     files.write(result, place.box, partial(place.draw, result, obj.field), **said)
     document: dict[str, Any] = result_document(result, **said)
     return document
@@ -180,11 +189,6 @@ def place_of(
             raise image_detection_in_field(named)
         check_box(named, detection, _bounds_of(scene), None if obj is None else _bounds_of(obj))
     return place_in(scene, detection, None if model is None else model.bounds, options)
-
-
-def scene_name(scene: FieldSource | Recording) -> Path:
-    """As the user named it."""
-    return scene.named if isinstance(scene, FieldSource) else Path(scene.name)
 
 
 def check_box(scene: Path, box: Detection, bounds: Bounds | None, obj: Bounds | None = None) -> None:
@@ -236,7 +240,7 @@ def _modeled(
 
 def _register_remotely(
     client: Client,
-    scene: FieldSource | Path,
+    scene: FieldSource | SentRecording,
     objects: Objects,
     request: dict[str, Any],
     tag: str | None,
@@ -256,7 +260,9 @@ def _register_remotely(
             hint = "`regnf library add NAME FIELD --server ...` adds one."
             raise InvalidInputError(f"the library has no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
         more = {name: value for name, value in request.items() if name != "detection"}
-        place: Any = client.recordings.upload(scene, progress=report) if isinstance(scene, Path) else scene
+        place: Any = scene
+        if isinstance(scene, SentRecording):
+            place = client.recordings.upload(scene.path, progress=report, description=scene.description)
         job = client.submit(place, searched, request["detection"], more=more, progress=report)
         page = f"{client.address}/jobs/{job.id}/view"
         tell(f"job          {job.id}\npage         {page}")

@@ -239,10 +239,13 @@ class RecordingCalls:
         progress: Report | None = None,
         timeout_s: float | None = None,
         wait: bool = True,
+        description: Mapping[str, Any] | None = None,
     ) -> Flow[Field]:
         """A folder, an archive of one, a bag or a stored recording; once its import has ended, unless ``wait`` is
-        False. Raises ServiceError with the import's reason."""
-        return recordings.upload(self._connection.asking(progress, timeout_s), Path(path), label, wait)
+        False. description: what no file says: ``depth_unit``, ``layout``, ``camera_axes``, ``intrinsics``. Raises
+        ServiceError with the import's reason."""
+        asking = self._connection.asking(progress, timeout_s)
+        return recordings.upload(asking, Path(path), label, description, wait)
 
     def frame(
         self,

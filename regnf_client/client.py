@@ -30,11 +30,9 @@ class SyncDriver:
         self._http = http
 
     def sleep(self, seconds: float) -> None:
-        """Wait."""
         time.sleep(seconds)
 
     def run(self, flow: Flow[_T]) -> _T:
-        """What the flow returns."""
         answer: Any = None
         try:
             while True:
@@ -75,7 +73,6 @@ class AsyncDriver:
         self._http = http
 
     async def run(self, flow: Flow[_T]) -> _T:
-        """What the flow returns."""
         answer: Any = None
         try:
             while True:
@@ -141,7 +138,9 @@ class _Method(Generic[_P, _T]):
         return client._driver.run(self._flow(client._calls, *args, **kwargs))
 
 
-class _Library(_Performing[_Driver]):
+class Library(_Performing[_Driver]):
+    """Objects by name. An ``Entry`` may be given wherever a field may."""
+
     add = _Method(LibraryCalls.add)
     entries = _Method(LibraryCalls.entries)
     get = _Method(LibraryCalls.get)
@@ -150,28 +149,14 @@ class _Library(_Performing[_Driver]):
     download = _Method(LibraryCalls.download)
 
 
-class Library(_Library[SyncDriver]):
-    """Objects by name. An ``Entry`` may be given wherever a field may."""
+class Recordings(_Performing[_Driver]):
+    """Depth images with their camera. What comes of them may be given as a scene."""
 
-
-class AsyncLibrary(_Library[AsyncDriver]):
-    """The same, to be awaited."""
-
-
-class _Recordings(_Performing[_Driver]):
     upload = _Method(RecordingCalls.upload)
     frame = _Method(RecordingCalls.frame)
     entries = _Method(RecordingCalls.entries)
     picture = _Method(RecordingCalls.picture)
     delete = _Method(RecordingCalls.delete)
-
-
-class Recordings(_Recordings[SyncDriver]):
-    """Depth images with their camera. What comes of them may be given as a scene."""
-
-
-class AsyncRecordings(_Recordings[AsyncDriver]):
-    """The same, to be awaited."""
 
 
 class _Client(_Performing[_Driver]):
@@ -185,6 +170,16 @@ class _Client(_Performing[_Driver]):
     def address(self) -> str:
         """Of the service."""
         return self._connection.address.rstrip("/")
+
+    @property
+    def library(self) -> Library[_Driver]:
+        """Objects by name, with tags."""
+        return Library(LibraryCalls(self._connection), self._driver)
+
+    @property
+    def recordings(self) -> Recordings[_Driver]:
+        """Depth images with their camera."""
+        return Recordings(RecordingCalls(self._connection), self._driver)
 
     upload = _Method(Calls.upload)
     field = _Method(Calls.field)
@@ -240,16 +235,6 @@ class Client(_Client[SyncDriver]):
     def close(self) -> None:
         """Close all connections."""
         self._http.close()
-
-    @property
-    def library(self) -> Library:
-        """Objects by name, with tags."""
-        return Library(LibraryCalls(self._connection), self._driver)
-
-    @property
-    def recordings(self) -> Recordings:
-        """Depth images with their camera."""
-        return Recordings(RecordingCalls(self._connection), self._driver)
 
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
@@ -312,16 +297,6 @@ class AsyncClient(_Client[AsyncDriver]):
     async def close(self) -> None:
         """Close all connections."""
         await self._http.aclose()
-
-    @property
-    def library(self) -> AsyncLibrary:
-        """Objects by name, with tags."""
-        return AsyncLibrary(LibraryCalls(self._connection), self._driver)
-
-    @property
-    def recordings(self) -> AsyncRecordings:
-        """Depth images with their camera."""
-        return AsyncRecordings(RecordingCalls(self._connection), self._driver)
 
     async def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None

@@ -24,6 +24,8 @@ from regnf_client.models import Field
 from regnf_client.steps import Asking, Flow, work
 from regnf_core.detections.images import is_image_detection, plain_values, read_detection
 from regnf_core.detections.parsing import detection_of
+from regnf_core.importing.recording_description import RecordingDescription
+from regnf_core.importing.upload_description import described
 from regnf_core.library_folder import digest_of
 from regnf_core.texts import json_value
 
@@ -32,20 +34,24 @@ Image = Any
 """The path of an image file, its bytes, or an array."""
 
 
-def upload(asking: Asking, path: Path, label: str | None, wait: bool) -> Flow[Field]:
-    """The recording at the service; nothing is sent of one that it has. Raises ServiceError."""
+def upload(
+    asking: Asking, path: Path, label: str | None, description: Mapping[str, Any] | None, wait: bool
+) -> Flow[Field]:
+    """The recording at the service; nothing is sent of one that it has. Raises ServiceError, FieldFormatError."""
     params = {} if label is None else {"label": label}
+    said = described(RecordingDescription, description).non_default()
     with _as_file(path) as file:
         sha256, size = (yield from work(partial(digest_of, file))), file.stat().st_size
         answer = yield from asking.call("GET", f"/recordings/{sha256}")
-        if answer.status_code == 404 or parsed(Field, checked(answer)).state == "rejected":
-            how: dict[str, Any] = {"files": {"upload": (None, sha256)}}
-            if size <= PIECE_BYTES:
-                data = yield from work(file.read_bytes)
-                how = {"content": data, "headers": {"Content-Type": "application/octet-stream"}}
-            else:
-                yield from send_pieces(asking, file, f"/fields/{sha256}", size)
-            answer = yield from asking.call("POST", "/recordings", params=params, **how)
+        is_held = answer.status_code != 404 and parsed(Field, checked(answer)).state != "rejected"
+        form: dict[str, Any] = {"upload": (None, sha256)}
+        if not is_held and size <= PIECE_BYTES:
+            form = {"file": (path.name, (yield from work(file.read_bytes)))}
+        elif not is_held:
+            yield from send_pieces(asking, file, f"/fields/{sha256}", size)
+        if said or not is_held:
+            form |= {"description": (None, json.dumps(said))} if said else {}
+            answer = yield from asking.call("POST", "/recordings", params=params, files=form)
     found = parsed(Field, checked(answer))
     return (yield from ready(asking, found)) if wait else found
 

@@ -67,7 +67,6 @@ class Cost:
         return _BASE_S + sum(term.seconds for term in self.terms)
 
     def largest(self, of: Literal["memory_bytes", "seconds"]) -> Term:
-        """The term that costs most of it."""
         return max(self.terms, key=lambda term: float(getattr(term, of)))
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from regnf_core.geometry.metrics import Symmetries
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.geometry.surface_samples import SurfaceSamples
 
@@ -379,7 +378,6 @@ COVARIANCE_ORDERING = ("omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "lo
 def result_document(
     result: RegistrationResult,
     truth: Sim3 | None = None,
-    symmetries: Symmetries | None = None,
     device: torch.device | str = "cpu",
     *,
     object_name: str | None = None,
@@ -388,7 +386,7 @@ def result_document(
 ) -> dict[str, Any]:
     """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
 
-    ``symmetries`` are the object's: rotation error and MSSD are the smallest over them. ``device``: of the computation.
+    ``device``: of the computation.
     ``object_name``: the object that was registered. ``candidates``: of :func:`ranking_document`, after a search.
     ``fields``: what is known of the imports of scene and object, by these names.
     """
@@ -398,7 +396,7 @@ def result_document(
 
     metrics, center, T = dict(result.metrics), result.center_object, result.T_object_scene
     if truth is not None:
-        metrics |= errors_against_truth(T, truth, result.object_samples.points, symmetries, center)
+        metrics |= errors_against_truth(T, truth, result.object_samples.points, center)
         if result.options.get("preset") == "paper":
             metrics |= paper_errors(T, truth)
     document = ResultDocument(

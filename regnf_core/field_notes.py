@@ -74,6 +74,5 @@ class FieldViews:
     picture: bytes | None = None
 
     def files(self) -> dict[str, bytes]:
-        """What there is, by name."""
         found = zip((*MESH_NAMES, PICTURE_NAME), (self.fine, self.coarse, self.picture), strict=True)
         return {name: data for name, data in found if data is not None}

@@ -92,7 +92,6 @@ class LibraryFolder:
 
     @staticmethod
     def is_one(folder: Path) -> bool:
-        """Whether a folder is a library."""
         return (folder / INDEX).is_file()
 
     def entries(self, tag: str | None = None, part: str | None = None) -> list[FolderEntry]:
@@ -118,7 +117,6 @@ class LibraryFolder:
         return self.folder / f"{entry.field}.safetensors"
 
     def picture(self, entry: FolderEntry) -> Path:
-        """Where its picture lies, if it has one."""
         return self.folder / f"{entry.field}.png"
 
     def add(self, source: FieldSource, notes: EntryNotes) -> FolderEntry:

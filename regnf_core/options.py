@@ -22,17 +22,20 @@ _UNIT_TOLERANCE = 0.01
 """How far a scale that follows from a unit may be off: sensors' errors of scale are within."""
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
-_FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 _Ratio = Annotated[float, Gt(0), Le(1)]
 _Share = Annotated[float, Ge(0), Le(1)]
 _Scale = Annotated[float, Ge(1e-6), Le(1e6)] | None
 
 
-@dataclass(frozen=True)
-class SamplingOptions:
-    """Multi-view surface sampling (paper, section III-C.1)."""
+class _Group:
+    """Base of a group of options: no others are taken, and the texts below them are their descriptions."""
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "use_attribute_docstrings": True}
+
+
+@dataclass(frozen=True)
+class SamplingOptions(_Group):
+    """Multi-view surface sampling (paper, section III-C.1)."""
 
     views: Annotated[int, Ge(1), Le(64)] = 5
     """Cameras round the box, all looking at its center. More views cover hollow shapes better."""
@@ -49,10 +52,8 @@ class SamplingOptions:
 
 
 @dataclass(frozen=True)
-class InitializationOptions:
+class InitializationOptions(_Group):
     """FPFH features, RANSAC and ICP (paper, section III-C.2)."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     voxel_size: Annotated[float, Gt(0), Le(10)] = 0.025
     """Voxel edge of the downsampling before the features, field units."""
@@ -69,10 +70,8 @@ class InitializationOptions:
 
 
 @dataclass(frozen=True)
-class OptimizationOptions:
+class OptimizationOptions(_Group):
     """The bidirectional loss and its minimization (paper, sections III-D and III-E)."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     iterations: Annotated[int, Ge(1), Le(10_000)] = 200
     translation_rate: Annotated[float, Gt(0), Le(1)] = 0.01
@@ -89,10 +88,8 @@ class OptimizationOptions:
 
 
 @dataclass(frozen=True)
-class ResamplingOptions:
+class ResamplingOptions(_Group):
     """Algorithm 1: new samples near both surfaces."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     every: Annotated[int, Ge(1), Le(10_000)] = 10
     """Iterations between resamplings."""
@@ -108,13 +105,11 @@ class ResamplingOptions:
 
 
 @dataclass(frozen=True)
-class RobustOptions:
+class RobustOptions(_Group):
     """The preset `robust`: a search over all of Sim(3), refinement on the fields, and a verdict.
 
     Lengths are in object diameters, shares within 0 and 1: nothing depends on the fields' units.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600
     """Rotations that the search starts from, evenly spread over all orientations; with ``up_axis`` a tenth of them,
@@ -185,14 +180,12 @@ class RobustOptions:
 
 
 @dataclass(frozen=True)
-class RegistrationOptions:
+class RegistrationOptions(_Group):
     """All options of one registration, grouped by stage.
 
     The group ``robust`` is for the preset `robust`; the other groups are for the preset `paper`, with the published
     values. Options of the other preset are ignored.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     preset: Preset = "robust"
     """The engine: `robust` needs no initial guess, `paper` is the published method."""

@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from torch import Tensor
 
 
-Number = TypeVar("Number", float, "Tensor")
+Number = TypeVar("Number", float, "NDArray[np.float64]", "Tensor")
 Row = tuple[Number, Number, Number]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -21,7 +23,7 @@ _DIGITS = 12
 def rotation_rows(x: Number, y: Number, z: Number, w: Number) -> tuple[Row[Number], Row[Number], Row[Number]]:
     """The three rows of the rotation matrix of the unit quaternion x, y, z (vector part), w (real part).
 
-    The numbers may be tensors of one shape; each entry then is such a tensor.
+    The numbers may be arrays or tensors of one shape; each entry then is one too.
     """
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
 from regnf_core.importing.observing.trajectory import rolled_quaternions
-from regnf_data.posed_images import PosedImages
+from regnf_data.posed_images import NO_TERMS, PosedImages, Terms
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.int64]
@@ -54,24 +54,6 @@ _STEPS = {0.2: "steps of 1/5000 that were read as 1/1000", 5.0: "steps of 1/1000
 _NAMED = 0.04
 _OPENGL = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 _BODY = ((0, -1, 0), (0, 0, -1), (1, 0, 0))
-
-
-@dataclass(frozen=True)
-class Terms:
-    """What the files of a layout call the things that a convention is about.
-
-    poses, intrinsics, unit: where they are stated · to_camera: whether poses lead from the world to the camera ·
-    axes: of the cameras, by --camera-axes.
-    """
-
-    poses: str = "the poses"
-    intrinsics: str = "the intrinsics"
-    unit: str = ""
-    to_camera: bool = False
-    axes: str = "opencv"
-
-
-NO_TERMS = Terms()
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +130,7 @@ def check_agreement(images: PosedImages) -> str | None:
     if images.depths is None or len(images) < 2:
         return None
     depths = np.where(images.measured, images.depths, np.float32(0.0))
-    return _checked(_Views(depths, images.intrinsics, images.T_world_camera))
+    return _checked(_Views(depths, images.intrinsics, images.T_world_camera, terms=images.terms))
 
 
 def _checked(stated: _Views) -> str | None:

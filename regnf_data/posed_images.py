@@ -29,6 +29,24 @@ class Instance:
 
 
 @dataclass(frozen=True)
+class Terms:
+    """What the files of a layout call the things that a convention is about.
+
+    poses, intrinsics, unit: where they are stated · to_camera: whether poses lead from the world to the camera ·
+    axes: of the cameras, by --camera-axes.
+    """
+
+    poses: str = "the poses"
+    intrinsics: str = "the intrinsics"
+    unit: str = ""
+    to_camera: bool = False
+    axes: str = "opencv"
+
+
+NO_TERMS = Terms()
+
+
+@dataclass(frozen=True)
 class PosedImages:
     """N images of H x W pixels of one scene that stands still.
 
@@ -51,6 +69,7 @@ class PosedImages:
     instances: tuple[Instance, ...] = ()
     T_metric_world: NDArray[np.float64] | None = None
     """(4, 4): world to the metric frame (sdfstudio's ``worldtogt``), if known."""
+    terms: Terms = NO_TERMS
 
     @property
     def size(self) -> tuple[int, int]:

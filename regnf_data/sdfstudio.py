@@ -6,6 +6,7 @@ import json
 import os
 import struct
 import tokenize
+import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from regnf_core.errors import DatasetError, InvalidDetectionError
+from regnf_data.exr import read_exr
 from regnf_data.posed_images import Instance, PosedImages
 
 if TYPE_CHECKING:
@@ -74,7 +76,6 @@ def similarity(value: Any, what: str, reason: str) -> NDArray[np.float64]:
 
 
 def whole_number(value: Any, what: str, reason: str) -> int:
-    """A positive whole number."""
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
     if isinstance(value, bool) or not whole or value < 1:
         raise DatasetError(f"{what} is not a positive whole number", reason=reason)
@@ -130,8 +131,11 @@ def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32
     ``.npy`` holds world units; an image holds whole numbers of ``unit`` world units each.
     Raises DatasetError (DATASET_DEPTH_UNIT_MISSING, DATASET_SIZES_DIFFER, DATASET_IMAGE_INVALID).
     """
-    if path.suffix.lower() == ".npy":
-        stored, factor = _array_file(path, size), 1.0
+    if path.suffix.lower() in ARRAYS:
+        stored, factor = array_file(path), 1.0
+        if stored.shape not in (size, (*size, 1), (1, *size)):
+            raise _differs(path, stored.shape, size)
+        stored = np.array(stored).reshape(size)
     elif unit is None:
         message = f"{path.name}: a depth image needs depth_unit_scale_factor in the metadata"
         raise DatasetError(message, reason="DATASET_DEPTH_UNIT_MISSING")
@@ -144,17 +148,27 @@ def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32
     return np.where(measured, depth, np.float32(0.0))
 
 
-def _array_file(path: Path, size: Size) -> NDArray[Any]:
+ARRAYS = (".npy", ".npz", ".exr")
+
+
+def array_file(path: Path) -> NDArray[Any]:
+    """The numbers of one of ``ARRAYS``; of several arrays the one that is called depth. Of .npy nothing is read yet."""
     try:
+        if path.suffix.lower() == ".exr":
+            return read_exr(path)
         stored = np.load(path, mmap_mode="r", allow_pickle=False)
-        shape, kind = stored.shape, stored.dtype.kind
-    except _FAULTS_OF_CONTENT as error:
+        if path.suffix.lower() == ".npz":
+            with stored:
+                named = [name for name in stored.files if name.startswith("depth")] or stored.files
+                if len(named) != 1:
+                    raise ValueError(f"which of its arrays is the depth: {', '.join(stored.files)[:80]}?")
+                stored = stored[named[0]]
+        kind = stored.dtype.kind
+    except (*_FAULTS_OF_CONTENT, LookupError, zipfile.BadZipFile) as error:
         raise _invalid(path, error) from error
     if kind not in "fiu":
         raise DatasetError(f"{path.name} holds no numbers", reason="DATASET_IMAGE_INVALID")
-    if shape not in (size, (*size, 1), (1, *size)):
-        raise _differs(path, shape, size)
-    return np.array(stored).reshape(size)
+    return stored  # type: ignore[no-any-return]
 
 
 def decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:

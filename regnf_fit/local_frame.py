@@ -55,7 +55,6 @@ class LocalFrame:
         return T
 
     def enter(self, images: PosedImages) -> PosedImages:
-        """The images in this frame."""
         return images if self.same else images.moved(self.origin, self.scale)
 
     def leave(self, description: dict[str, Any]) -> dict[str, Any]:

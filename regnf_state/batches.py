@@ -50,7 +50,6 @@ class Batch:
         return list(dict.fromkeys(pair.job for pair in self.pairs if pair.job is not None))
 
     def text(self) -> bytes:
-        """As it is stored."""
         head = {"format": FORMAT, "created": self.created, "pairs": len(self.pairs)}
         lines = [[pair.line, pair.key, pair.job, _short(pair.error)] for pair in self.pairs]
         return b"".join(_line(one) for one in (head, *lines))

@@ -67,10 +67,8 @@ class Pieces:
         """Forget an upload."""
         self._blobs.delete_prefix(_folder(caller, sha256))
 
-    def bytes_of(self, caller: str, but: str = "") -> int:
-        """What the pieces of a caller hold, those of the field ``but`` left out."""
-        other = _folder(caller, but)
-        return sum(one.bytes for one in self._uploads(f"{_TOP}/{caller}") if one.folder != other)
+    def bytes_of(self, caller: str) -> int:
+        return sum(one.bytes for one in self._uploads(f"{_TOP}/{caller}"))
 
     def make_room(self, caller: str, sha256: str, coming: int) -> None:
         """The oldest other uploads of a caller go until it is within its bounds, with ``coming`` bytes of this one."""

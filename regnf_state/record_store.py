@@ -28,7 +28,6 @@ class LibraryEntry:
 
     @classmethod
     def of(cls, field: FieldRecord) -> LibraryEntry | None:
-        """The entry of a field; None where it has none."""
         said = field.library
         return None if said is None else cls(field, EntryNotes.from_dict(said), float(said["added"]))
 

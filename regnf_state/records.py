@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.library_entries import EntryNotes
+from regnf_core.schema.closed import Closed
 from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.settings import Settings
 
@@ -81,10 +82,8 @@ NO_QUOTA = Quota()
 
 
 @dataclass(frozen=True)
-class JobRecord:
+class JobRecord(Closed):
     """One job. Times are seconds since the epoch; ``error`` is a problem object; ``version`` grows with each change."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     id: str
     kind: str
@@ -157,10 +156,8 @@ class SettingsFile(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FieldRecord:
+class FieldRecord(Closed):
     """One field. ``sha256`` is its reference: the SHA-256 of the bytes that were uploaded, and its owner's name."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     sha256: str
     state: FieldState
@@ -300,7 +297,6 @@ def document_of(record: JobRecord | FieldRecord) -> dict[str, Any]:
 
 
 def encoded(record: JobRecord | FieldRecord) -> str:
-    """The record as JSON."""
     return json.dumps(document_of(record), separators=(",", ":"))
 
 

@@ -183,7 +183,6 @@ JobRequest = RegistrationRequest | RenderingRequest
 
 
 def kind_of(request: JobRequest) -> str:
-    """The kind of job that a request is for."""
     return RENDERING if isinstance(request, RenderingRequest) else REGISTRATION
 
 

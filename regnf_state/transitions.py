@@ -210,11 +210,6 @@ def fields_of(record: JobRecord) -> list[str]:
     return [name for name in named if name]
 
 
-def uses_field(record: JobRecord, sha256: str) -> bool:
-    """Whether the job reads this field."""
-    return sha256 in fields_of(record) or sha256 in record.inputs.values()
-
-
 def event_of(before: JobRecord | None, after: JobRecord) -> tuple[str, dict[str, object]] | None:
     """Name and data of the event that this change deserves, if it deserves one."""
     if before is not None and (before.status, before.attempt) == (after.status, after.attempt):

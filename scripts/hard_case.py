@@ -19,8 +19,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.robust.depth_camera import looking
 from benchmarks.robust.one_view_field import DepthImage, OneViewField, directions
+from benchmarks.solids import BoxField, UnionField
 from regnf_core import OrientedBox, RegistrationResult, Sim3, open_field, register
-from regnf_core.fields.composite import BoxField, TransformedField, UnionField
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.metrics import errors_against_truth, gaps
 from regnf_core.surface.sphere_tracing import Rays, clip_to_region, first_hits

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from regnf_core.fields.composite import BoxField, UnionField
+from benchmarks.solids import BoxField, UnionField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_mesh

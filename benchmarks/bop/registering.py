@@ -14,10 +14,10 @@ from benchmarks.bop.dataset import Dataset, Detections, Target
 from benchmarks.bop.errors import Array
 from benchmarks.peers.interface import PeerCase
 from benchmarks.peers.open3d_peers import RansacIcp
+from benchmarks.symmetric_errors import Symmetries
 from regnf_core import RegistrationOptions, RegistrationResult, SdfField, Sim3, open_field, register
 from regnf_core.detections.images import ImageDetection
 from regnf_core.errors import InitializationError, RegnfError
-from regnf_core.geometry.metrics import Symmetries
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.library import model_object
 from regnf_core.options import RobustOptions

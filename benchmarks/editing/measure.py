@@ -22,11 +22,11 @@ from benchmarks.editing.scenes import Found, found, overview, pairs_of
 from benchmarks.random_worlds.mesh import ExactScene, ExactView, Mesh
 from benchmarks.robust.cases import Pair
 from benchmarks.robust.symmetries import declared
+from benchmarks.symmetric_errors import mssd
 from regnf_core import Insertion, Removal, RenderOptions, SdfField, Sim3, Substitution, compose, open_field
 from regnf_core.editing.edited_scene import without_unseen
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import CountingField
-from regnf_core.geometry.metrics import mssd
 from regnf_core.rendering.camera import Camera, orbit_cameras
 from regnf_core.rendering.render import render, render_frames
 from regnf_core.rendering.request import OrbitRequest

@@ -18,11 +18,11 @@ from benchmarks.frames.sensors import KINDS, Kind, Surfaces, measure
 from benchmarks.random_worlds.mesh import Array, Mesh, box, ray_scene, standing
 from benchmarks.random_worlds.models import Model, Part, families, parametric_small, part_of
 from benchmarks.random_worlds.symmetries import measure_symmetries
+from benchmarks.symmetric_errors import Symmetries
 from benchmarks.worlds.rendering import camera_rays
 from benchmarks.worlds.trajectories import look_at
 from regnf_core.detections.images import ImageDetection
 from regnf_core.fields.observation import SdfField
-from regnf_core.geometry.metrics import Symmetries
 from regnf_core.importing.mesh_file import load_solid
 from regnf_core.in_memory import from_mesh
 from regnf_core.robust.model import ObjectModel, model_object

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from benchmarks.robust.cases import Case
+from benchmarks.symmetric_errors import Symmetries
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core.fields.observation import CountingField
-from regnf_core.geometry.metrics import Symmetries
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene

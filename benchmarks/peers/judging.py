@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from benchmarks.peers.interface import MissingPackageError, Peer, PeerCase, PeerResult
+from benchmarks.symmetric_errors import errors_against_truth
 from regnf_core import RegnfError
-from regnf_core.geometry.metrics import errors_against_truth, paper_errors
+from regnf_core.geometry.metrics import paper_errors
 
 SUCCESS = 0.05
 """Largest MSSD of a right pose, object diameters."""

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.robust.symmetries import declared, in_frame
+from benchmarks.symmetric_errors import Symmetries
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core import open_field as open_safe_field
 from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import ObservedField
-from regnf_core.geometry.metrics import Symmetries
 
 MAIN, HELD_OUT, FULL_SIZE = "pairs.json", "pairs-held-out.json", "pairs-full-size.json"
 KINDS = {"main": MAIN, "held out": HELD_OUT}

@@ -8,8 +8,8 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
+from benchmarks.symmetric_errors import Symmetries, mssd
 from regnf_core import Sim3
-from regnf_core.geometry.metrics import Symmetries, mssd
 
 FREEDOM = 7
 LIMIT = float(chi2.ppf(0.95, FREEDOM))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from benchmarks.symmetric_errors import Symmetries, errors_against_truth
 from regnf_core import RegistrationResult, RegnfError, Sim3
-from regnf_core.geometry.metrics import Symmetries, errors_against_truth
 
 SUCCESS = 0.05
 """Largest MSSD of a right pose, object diameters."""

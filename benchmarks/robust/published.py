@@ -10,9 +10,9 @@ import torch
 
 from benchmarks.robust.cases import Case
 from benchmarks.robust.runs import Run
+from benchmarks.symmetric_errors import Symmetries, surface_displacement
 from regnf_core import RegistrationResult, Sim3
 from regnf_core.geometry import metrics
-from regnf_core.geometry.metrics import Symmetries, surface_displacement
 
 _POINTS = 500
 """Surface points, about, by which the nearest of the equal poses is chosen."""

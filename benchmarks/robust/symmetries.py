@@ -10,8 +10,8 @@ import math
 
 import torch
 
+from benchmarks.symmetric_errors import ContinuousSymmetry, Symmetries
 from regnf_core import Sim3
-from regnf_core.geometry.metrics import ContinuousSymmetry, Symmetries
 
 TURNS = {"et": 4, "t": 2, "wt": 2, "round_wooden_table_02": 2}
 """Turns about z that carry the object onto itself, the identity counted."""

@@ -14,8 +14,8 @@ from benchmarks.robust.judging import SUCCESS
 from benchmarks.robust.report import Bar, Section, Table, by_group, failures_of
 from benchmarks.robust.runs import Context, Job, Run, run_all
 from benchmarks.robust.symmetries import ANY_TURN, TURNS, nearly
+from benchmarks.symmetric_errors import Symmetries, mssd
 from regnf_core import RegistrationResult, Sim3
-from regnf_core.geometry.metrics import Symmetries, mssd
 
 NAME = "symmetry"
 SEEDS = 3

@@ -15,6 +15,7 @@ from torch import Tensor
 from benchmarks.robust.bent_field import BentField
 from benchmarks.robust.cases import Case
 from benchmarks.robust.symmetries import in_frame
+from benchmarks.symmetric_errors import Symmetries
 from benchmarks.worlds.making import SCENE, WORLD, read_cameras, read_observation_grid
 from benchmarks.worlds.observing import observation_of_cameras
 from regnf_core import OrientedBox, SdfField, Sim3
@@ -22,7 +23,6 @@ from regnf_core.fields.build import open_field
 from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import ObservedField, observation_of, stored_observation
-from regnf_core.geometry.metrics import Symmetries
 
 ObservedBy = Literal["images", "cameras", "map", "nothing"]
 """What tells what was seen of a scene: the walk's images, where its cameras stood alone, the map's own file, or

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from regnf_core.fields.composite import BoxField, UnionField
+from benchmarks.solids import BoxField, UnionField
 from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_solid
 

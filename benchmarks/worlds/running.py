@@ -11,11 +11,11 @@ from torch import Tensor
 
 from benchmarks.robust.ellipsoid import mahalanobis_squared, nearest_truth, pose_error
 from benchmarks.robust.judging import SUCCESS, judge_error
+from benchmarks.symmetric_errors import Symmetries, errors_against_truth
 from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.covariance import diagonal_parts
 from benchmarks.worlds.stages import from_truth, recorded, stage_errors
 from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, Sim3, register
-from regnf_core.geometry.metrics import Symmetries, errors_against_truth
 from regnf_core.options import RobustOptions
 
 Run = dict[str, Any]

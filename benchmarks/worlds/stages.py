@@ -11,8 +11,8 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
+from benchmarks.symmetric_errors import Symmetries
 from regnf_core import RegistrationOptions, Sim3
-from regnf_core.geometry.metrics import Symmetries
 from regnf_core.robust import pipeline
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from regnf_core.detections.bounds import Detection
@@ -26,6 +27,7 @@ HINT = (
     ' {"point_2d": [u, v]}, in pixels.'
 )
 _NAMES = ("mask", "box_2d", "point_2d", "segmentation", "segments", "annotations")
+_ENDING = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp|np[yz]|exr)$", re.IGNORECASE)
 _MOST_MASK_BYTES = 4 << 20
 """Of a mask's file that is put into a detection."""
 _MOST_DETECTIONS = 10_000
@@ -102,6 +104,21 @@ def read_detection(values: Any, index: int | None = None, folder: Path | None = 
     return found if folder is None else tuple(one.beside(folder) for one in found)
 
 
+def place_of_frame(names: Sequence[str], wanted: str) -> int | None:
+    """The place of the frame of a name, with or without the ending of an image; of the number in a name, else of a
+    place. None where there is none."""
+    bare = [_ENDING.sub("", PurePosixPath(name).name) for name in names]
+    for place, name in enumerate(names):
+        if wanted in (name, PurePosixPath(name).name) or _ENDING.sub("", wanted) == bare[place]:
+            return place
+    if not (wanted.isascii() and wanted.isdecimal()):
+        return None
+    numbers = [one.lstrip("0") for one in bare]
+    number = wanted.lstrip("0")
+    place = numbers.index(number) if number in numbers else int(number[:9] or 0)
+    return place if place < len(names) else None
+
+
 def image_detection_in_field(scene: object = "the scene") -> InvalidDetectionError:
     """The error for a mask, a box in pixels or a point where the scene has no images."""
     return InvalidDetectionError(
@@ -137,28 +154,34 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
         raise InvalidDetectionError(
             f"{len(entries)} detections are listed: say which ({known})", hint="Give --detection-index."
         )
-    sizes = _sizes(values)
-    return tuple(_read(entry, sizes) for entry in entries)
+    images, categories = (_listed(values, name) for name in ("images", "categories"))
+    return tuple(_read(entry, images, categories) for entry in entries)
 
 
-def _sizes(values: Any) -> dict[Any, tuple[Any, Any]]:
-    """Height and width of COCO's images, by their numbers; polygons are of their size."""
-    images = values.get("images") if isinstance(values, Mapping) else None
-    known = (one for one in images or () if isinstance(one, Mapping))
-    return {one.get("id"): (one["height"], one["width"]) for one in known if "height" in one and "width" in one}
+def _listed(values: Any, name: str) -> dict[Any, Mapping[str, Any]]:
+    """COCO's images or categories, by their numbers."""
+    listed = values.get(name) if isinstance(values, Mapping) else None
+    return {one.get("id"): one for one in listed or () if isinstance(one, Mapping)}
 
 
 def _name(entry: Mapping[str, Any]) -> str:
     return str(next((entry[key] for key in ("label", "name", "category_id", "class") if key in entry), "no label"))[:40]
 
 
-def _read(entry: Mapping[str, Any], sizes: Mapping[Any, tuple[Any, Any]]) -> ImageDetection:
+def _read(
+    entry: Mapping[str, Any], images: Mapping[Any, Mapping[str, Any]], categories: Mapping[Any, Mapping[str, Any]]
+) -> ImageDetection:
+    image = images.get(entry.get("image_id"), {})
     frame = next((entry[key] for key in ("frame", "image_id", "file_name", "image") if key in entry), 0)
+    frame = PurePosixPath(str(image["file_name"])).name if "file_name" in image else frame
     if isinstance(frame, bool) or not isinstance(frame, str | int):
         raise InvalidDetectionError("frame is neither a name nor a number", hint=HINT)
     score = next((entry[key] for key in ("score", "confidence") if key in entry), None)
     label = next((str(entry[key]) for key in ("label", "name", "category_id", "class") if key in entry), None)
-    size = entry.get("size") or entry.get("image_size") or sizes.get(entry.get("image_id"))
+    label = str(categories.get(entry.get("category_id"), {}).get("name", label)) if label else None
+    size = entry.get("size") or entry.get("image_size")
+    if not size and "height" in image and "width" in image:
+        size = image["height"], image["width"]
     common: dict[str, Any] = {
         "frame": frame,
         "label": label,
@@ -166,7 +189,7 @@ def _read(entry: Mapping[str, Any], sizes: Mapping[Any, tuple[Any, Any]]) -> Ima
         "size": None if size is None else tuple(int(side) for side in _numbers(size, 2, "size")),
     }
     for key in ("mask", "segmentation"):
-        if entry.get(key) is not None:
+        if entry.get(key) is not None and not (isinstance(entry[key], list) and not entry[key]):
             return ImageDetection(mask=entry[key], **common)
     segments = entry.get("segments")
     if isinstance(segments, Mapping) and segments.get("x"):

@@ -219,7 +219,6 @@ class Limits:
     most: Solid | None
 
     def apply(self, scene: Solid) -> Solid:
-        """The cleared scene."""
         found = _larger(scene, self.least)
         return found if self.most is None else _smaller(found, self.most)
 

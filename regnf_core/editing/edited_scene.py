@@ -95,7 +95,6 @@ class EditedScene:
 
     @property
     def observation(self) -> Observation | None:
-        """Of the edited scene; None where the scene has none."""
         if self._observation is None or not self.origin.any():
             return self._observation
         return self._observation.seen_in(Sim3.from_translation(-self.origin))
@@ -108,7 +107,6 @@ class EditedScene:
 
     @property
     def device(self) -> torch.device:
-        """That of the scene."""
         return self.scene.device
 
     @property

@@ -6,7 +6,7 @@ Objects and detections have names here; ``open_edits`` turns them into fields an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le, Len, MaxLen
 from pydantic import AfterValidator, BeforeValidator, Discriminator, FiniteFloat, TypeAdapter, ValidationError
@@ -15,9 +15,9 @@ from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError
 from regnf_core.rgb import Rgb
 from regnf_core.rotations import similarity_fault
+from regnf_core.schema.closed import Closed
 
 MOST_EDITS = 64
-_CONFIG: dict[str, Any] = {"extra": "forbid"}
 
 
 def _rows_of(value: Any) -> Any:
@@ -56,10 +56,8 @@ Residual = Annotated[FiniteFloat, Ge(0), Le(1e9)]
 
 
 @dataclass(frozen=True)
-class SubstitutionRequest:
+class SubstitutionRequest(Closed):
     """See :class:`regnf_core.editing.edits.Substitution`."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     object: ObjectName
     T_object_scene: Rows
@@ -70,10 +68,8 @@ class SubstitutionRequest:
 
 
 @dataclass(frozen=True)
-class ReplacementRequest:
+class ReplacementRequest(Closed):
     """See :class:`regnf_core.editing.edits.Replacement`."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     object: ObjectName
     T_object_scene: Rows
@@ -89,10 +85,8 @@ class ReplacementRequest:
 
 
 @dataclass(frozen=True)
-class RemovalRequest:
+class RemovalRequest(Closed):
     """See :class:`regnf_core.editing.edits.Removal`."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     detection: Box = None
     object: ObjectName | None = None
@@ -109,10 +103,8 @@ class RemovalRequest:
 
 
 @dataclass(frozen=True)
-class InsertionRequest:
+class InsertionRequest(Closed):
     """See :class:`regnf_core.editing.edits.Insertion`."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     object: ObjectName
     T_object_scene: Rows

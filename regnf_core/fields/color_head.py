@@ -42,7 +42,6 @@ class PositionalEncoding:
 
     @classmethod
     def of(cls, description: PositionalEncodingDescription | None) -> PositionalEncoding | None:
-        """The encoding of a description, or None where there is none in use."""
         if description is None or not description.used or not description.degree:
             return None
         frequency = 2.0 * math.pi if description.two_pi else 1.0

@@ -182,7 +182,6 @@ def build_neural_points(
 
 
 def _number(cell: Tensor, buffer_size: int) -> Tensor:
-    """The number (...) of a cell (..., 3) in the buffer."""
     return (cell * torch.tensor(_PRIMES, device=cell.device)).sum(-1).remainder(buffer_size)
 
 

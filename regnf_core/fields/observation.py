@@ -108,7 +108,6 @@ class ColoredField(SdfField, HasInverseDeviation, Protocol):
 
 
 def has_color(field: SdfField) -> TypeGuard[ColoredField]:
-    """Whether ``field`` has a color."""
     return hasattr(field, "color")
 
 
@@ -121,7 +120,6 @@ class OnDevice:
     """For dataclasses: ``to`` gives a copy with all that has a device, also within tuples, on another one."""
 
     def to(self, device: torch.device | str) -> Self:
-        """The same on another device."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
         return replace(self, **{name: _moved(value, device) for name, value in values.items()})  # type: ignore[type-var]
 

@@ -277,7 +277,6 @@ class FunctionField(Generic[F]):
         return type(self)(self.function.to(device), self._bounds, self.chunk, self.inverse_deviation)
 
     def with_inverse_deviation(self, inverse_deviation: float | None) -> Self:
-        """The same field with another inverse deviation."""
         return type(self)(self.function, self._bounds, self.chunk, inverse_deviation)
 
     @torch.no_grad()

@@ -210,11 +210,6 @@ class Sim3(Bundle):
         """The same transform in the dtype and on the device of another tensor."""
         return Sim3(self.scale.to(like), self.rotation.to(like), self.translation.to(like))
 
-    def detach(self) -> Sim3:
-        """The same transform, cut from any autograd graph."""
-        found: Sim3 = over_tensors(Tensor.detach, self)
-        return found
-
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values: ``matrix`` (row-major 4x4), ``scale``, ``rotation_quaternion_xyzw``, ``translation``."""
         return {

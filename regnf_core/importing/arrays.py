@@ -20,7 +20,6 @@ _MAX_ELEMENTS = 1 << 60
 
 
 def tensor_error(message: str, reason: str) -> FieldFormatError:
-    """The error for a tensor that is not what it must be."""
     return FieldFormatError(message, reason=reason)
 
 

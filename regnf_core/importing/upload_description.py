@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
@@ -13,8 +15,13 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.library_entries import LABEL_PATTERN, MOST_OF_LABEL
 from regnf_core.schema.similarity import require_similarity
 
-_FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
+
+
+class _Said:
+    """Base of a part of a description: no other members are taken, and no text for a number."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
 
 
 def _sound_box(box: list[list[float]]) -> list[list[float]]:
@@ -40,10 +47,8 @@ _Box = Annotated[list[_Corner], Len(2, 2), AfterValidator(_sound_box)]
 
 
 @dataclass(frozen=True)
-class GridDescription:
+class GridDescription(_Said):
     """What the table's size alone may leave open about a hash grid. Anything left out is searched for."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     levels: Annotated[int, Ge(1), Le(32)] | None = None
     features_per_level: Annotated[int, Ge(1), Le(32)] | None = None
@@ -58,10 +63,8 @@ class GridDescription:
 
 
 @dataclass(frozen=True)
-class EncodingDescription:
+class EncodingDescription(_Said):
     """What the widths alone may leave open about the sines and cosines of the position."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     degree: Annotated[int, Ge(0), Le(24)] | None = None
     """Number of frequencies."""
@@ -81,10 +84,8 @@ Inputs = Literal["all", "no_direction", "no_gradient", "features"]
 
 
 @dataclass(frozen=True)
-class ColorOverrides:
+class ColorOverrides(_Said):
     """What the widths alone may leave open about a network of colors. It changes nothing about the geometry."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     keep: bool | None = None
     """False: leave the color out."""
@@ -106,10 +107,8 @@ class ColorOverrides:
 
 
 @dataclass(frozen=True)
-class CamerasDescription:
+class CamerasDescription(_Said):
     """What the file of cameras does not say of them."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     intrinsics: Annotated[list[Annotated[float, Gt(0), Le(1e6)]], Len(4, 4)] | None = None
     """fx, fy, cx, cy of all images, in pixels."""
@@ -120,10 +119,8 @@ class CamerasDescription:
 
 
 @dataclass(frozen=True)
-class UploadDescription:
+class UploadDescription(_Said):
     """Overrides of what the gate would conclude by itself. None means: conclude it."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     family: Annotated[str, MaxLen(64)] | None = None
     contraction: Literal["none", "linf", "linf_grid"] | None = None
@@ -192,17 +189,27 @@ class UploadDescription:
         return {name: value for name, value in values.items() if value not in (None, {})}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any] | None) -> UploadDescription:
+    def from_dict(cls, values: Mapping[str, Any] | None) -> UploadDescription:
         """The description from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
-        try:
-            return _ADAPTER.validate_json(json.dumps(values or {}, allow_nan=False))
-        except ValidationError as error:
-            first = error.errors(include_url=False, include_input=False)[0]
-            where = ".".join(str(part) for part in first["loc"])
-            message = first["msg"].removeprefix("Value error, ")
-            raise FieldFormatError(f"description.{where}: {message}", reason="INVALID_DESCRIPTION") from error
-        except (TypeError, ValueError, RecursionError) as error:
-            raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
+        return described(cls, values)
 
 
-_ADAPTER = TypeAdapter(UploadDescription)
+_Described = TypeVar("_Described")
+
+
+def described(kind: type[_Described], values: Mapping[str, Any] | None) -> _Described:
+    """A description of this kind from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
+    try:
+        return cast(_Described, _adapter(cast(Any, kind)).validate_json(json.dumps(values or {}, allow_nan=False)))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        raise FieldFormatError(f"description.{where}: {message}", reason="INVALID_DESCRIPTION") from error
+    except (TypeError, ValueError, RecursionError) as error:
+        raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)

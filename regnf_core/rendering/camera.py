@@ -21,7 +21,6 @@ _WIDEST_DEG = 170.0
 
 
 def invalid_camera(message: str) -> InvalidInputError:
-    """The error for what is no camera."""
     return InvalidInputError(message, reason="CAMERA_INVALID")
 
 

@@ -20,7 +20,7 @@ from regnf_core.editing.compose import compose
 from regnf_core.editing.edited_scene import EditedScene, without_unseen
 from regnf_core.editing.edits import open_edits
 from regnf_core.editing.storing import write_field
-from regnf_core.errors import CancelledError, atomic_path
+from regnf_core.errors import atomic_path
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
@@ -126,7 +126,6 @@ def run_render(
     open_object: Callable[[str], SdfField],
     directory: Path,
     progress: Progress | None = None,
-    cancelled: Callable[[], bool] | None = None,
     processes: int = 1,
 ) -> RenderReport:
     """Write the request's files into the existing folder ``directory``.
@@ -134,11 +133,10 @@ def run_render(
     open_object: the field of an object that an edit names · processes: see ``render_frames``. Files: frame-0000.png
     (color), frame-0000-depth.png (16 bit) and .npy, frame-0000-normal.png, and so on; before-0000.png and so on without
     edits; animation.webp, before-after.png, composite.glb, edited.safetensors, render.json.
-    Raises what ``compose`` and ``render_frames`` raise, and CancelledError; what was written by then is the caller's to
-    delete.
+    Raises what ``compose``, ``render_frames`` and ``progress`` raise; what was written by then is the caller's to drop.
     """
     request.check()
-    work = _Work(request.outputs, directory, progress, cancelled)
+    work = _Work(request.outputs, directory, progress)
     with work.stage("composing"):
         scene = without_unseen(scene) if request.clear_unseen else scene
         edited = compose(scene, open_edits(request.edits, open_object), request.seed, work.tell)
@@ -148,7 +146,7 @@ def run_render(
     cut_away = replace(request.options, cut_away=True)
 
     def rendered(field: SdfField, options: RenderOptions) -> Iterator[Frame]:
-        return render_frames(field, cameras, options, work.tell, cancelled, processes)
+        return render_frames(field, cameras, options, work.tell, processes=processes)
 
     with work.stage("rendering"):
         # nobody has chosen the places of an orbit: walls that they stand in are cut away
@@ -173,11 +171,8 @@ def run_render(
 class _Work:
     """The files as they come, and how far the work has come."""
 
-    def __init__(
-        self, outputs: Sequence[str], directory: Path, progress: Progress | None, cancelled: Callable[[], bool] | None
-    ) -> None:
-        self._outputs, self._directory = outputs, directory
-        self._progress, self._cancelled = progress, cancelled
+    def __init__(self, outputs: Sequence[str], directory: Path, progress: Progress | None) -> None:
+        self._outputs, self._directory, self._progress = outputs, directory, progress
         self._done, self._share = 0.0, (0.0, 1.0)
         self._artifacts: list[RenderArtifact] = []
         self._seconds: dict[str, float] = {}
@@ -193,9 +188,7 @@ class _Work:
         self.tell(1.0)
 
     def tell(self, share: float) -> None:
-        """Report the share done of the present stage. Raises CancelledError when the work is to stop."""
-        if self._cancelled is not None and self._cancelled():
-            raise CancelledError("the rendering was cancelled")
+        """Report the share done of the present stage."""
         first, last = self._share
         self._done = max(self._done, first + share * (last - first))
         if self._progress is not None:

@@ -13,6 +13,7 @@ from regnf_core.cost import Cost, Option, Term
 from regnf_core.editing.request import AnyEdit, Axis, Box, Rows, read_edits
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.rgb import Rgb
+from regnf_core.schema.closed import Closed
 
 # What may be chosen of a rendering: plain data, without torch.
 
@@ -81,7 +82,6 @@ def check_extent(frames: int, pixels: int) -> None:
             raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Ask for fewer or smaller frames.")
 
 
-_CONFIG: dict[str, Any] = {"extra": "forbid"}
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 _Angle = Annotated[FiniteFloat, Gt(0), Le(170)]
 _Count = Annotated[int, Ge(1)]
@@ -94,13 +94,11 @@ composite.glb · field: the edited scene as a field file."""
 
 
 @dataclass(frozen=True)
-class OrbitRequest:
+class OrbitRequest(Closed):
     """Cameras round one thing. edit: the number of an edit, whose object is looked at · detection: a box instead;
     neither: the first edit, or without edits the scene's bounds · elevation_deg: above the horizon · start_deg,
     sweep_deg: the first camera's turn about the vertical, and how far the last one is turned from it · distance: from
     the thing's middle, scene units; None: all of it is in view."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     edit: Annotated[int, Ge(0)] | None = None
     detection: Box = None
@@ -114,10 +112,8 @@ class OrbitRequest:
 
 
 @dataclass(frozen=True)
-class StationRequest:
+class StationRequest(Closed):
     """One place to look from. position, target: scene frame."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     position: _Point
     target: _Point
@@ -130,11 +126,9 @@ class StationRequest:
 
 
 @dataclass(frozen=True)
-class PoseRequest:
+class PoseRequest(Closed):
     """A camera whose pose and lens are known. T_scene_camera: rotation and place, OpenCV's axes (x right, y down, z
     forward) · intrinsics: fx, fy, cx, cy in pixels of an image of ``size`` (width, height)."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     T_scene_camera: Rows
     intrinsics: Annotated[list[FiniteFloat], Len(4, 4)]
@@ -148,14 +142,12 @@ class PoseRequest:
 
 
 @dataclass(frozen=True)
-class RenderRequest:
+class RenderRequest(Closed):
     """One rendering of a scene. Exactly one of orbit, look_at and poses; none: an orbit as it is by default.
 
     size: width and height of every frame; None: 480 x 360, or what a pose says · before: the scene without its edits
     is rendered too (files named before-...), as a strip and an animation need it.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = _CONFIG
 
     edits: list[AnyEdit] = field(default_factory=list)
     orbit: OrbitRequest | None = None

@@ -5,12 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, MaxLen
 from pydantic import AfterValidator, Field, FiniteFloat
 
+from regnf_core.schema.closed import Closed
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.similarity import require_similarity
 from regnf_core.schema.tensor_check import (
@@ -42,11 +43,9 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class DirectionEncoding:
+class DirectionEncoding(Closed):
     """Of the line of sight. frequency: the direction d, then sines and cosines of 2^k d (times 2 pi), k < degree, each
     axis by axis. spherical_harmonics: all real ones of orders below ``degree``, as tiny-cuda-nn sorts them."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     encoding: Literal["frequency", "spherical_harmonics"]
     degree: Annotated[int, Ge(0), Le(24)]
@@ -59,13 +58,11 @@ class DirectionEncoding:
 
 
 @dataclass(frozen=True)
-class NetworkColor:
+class NetworkColor(Closed):
     """A network after the geometry's; see :class:`regnf_core.fields.color_head.ColorHead`.
 
     Its input: position, encoded direction, gradient, a hash grid's features, what the geometry's last layer is given.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     form: Literal["network"]
     position: bool = True
@@ -105,10 +102,8 @@ class NetworkColor:
 
 
 @dataclass(frozen=True)
-class ValueColor:
+class ValueColor(Closed):
     """Colors where the kind has its numbers: at a mesh's vertices, at the nodes of a grid or of blocks of voxels."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     form: Literal["values"]
 
@@ -149,10 +144,8 @@ _Count = Annotated[int, Ge(1), Le(MAX_COUNT)]
 
 
 @dataclass(frozen=True)
-class ObservationGrid:
+class ObservationGrid(Closed):
     """A grid of cubic voxels, in the coordinates of the kind's function."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     low: tuple[_Coordinate, _Coordinate, _Coordinate]
     """The lowest corner."""
@@ -187,7 +180,6 @@ class ObservationGrid:
         return grid
 
 
-FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
 Corner = tuple[float, float, float]
 _Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 Rows = tuple[_Row, _Row, _Row, _Row]
@@ -200,10 +192,8 @@ def _similarity(rows: Rows) -> Rows:
 
 
 @dataclass(frozen=True)
-class Placement:
+class Placement(Closed):
     """How a field lies in its dataset's frame, where it is asked for in that."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
 
     transform: Annotated[Rows, AfterValidator(_similarity)]
     """4 x 4 matrix of a similarity, row by row: takes points of the function's frame, after ``world_scale``, to
@@ -213,14 +203,12 @@ class Placement:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FieldDescription(ABC):
+class FieldDescription(Closed, ABC):
     """Which function a file's tensors parametrize. A kind adds entries of its own and ``check_tensors``.
 
     A kind's function f works in its own coordinates; the field is S(x) = sign * world_scale * f(x / world_scale), and
     with a placement of the scale s the field is s S(T^-1 x).
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
 
     kind: str
     """One of the names in ``regnf_core.schema.kinds.KINDS``."""

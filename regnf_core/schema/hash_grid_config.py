@@ -12,12 +12,13 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.schema.closed import Closed
 
 Interpolation = Literal["linear", "smoothstep"]
 _ENTRY_ALIGNMENT = 8
@@ -30,13 +31,11 @@ _ROUNDING_REACH = 1e-3
 
 
 @dataclass(frozen=True)
-class HashGridConfig:
+class HashGridConfig(Closed):
     """A grid of ``levels`` lattices over the unit cube, each with at most 2^log2_table_size entries of features.
 
     A level whose lattice fits into its part of the table is *dense* (one entry a node), a finer one is *hashed*.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     levels: Annotated[int, Ge(1), Le(32)] = 16
     features_per_level: Annotated[int, Ge(1), Le(32)] = 2
@@ -181,10 +180,8 @@ def _fewest(changes: dict[int, int], total: int) -> tuple[int, ...] | None:
 
 
 @dataclass(frozen=True)
-class PositionalEncodingDescription:
+class PositionalEncodingDescription(Closed):
     """Sines and cosines of the position; see :class:`regnf_core.fields.color_head.PositionalEncoding`."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
     degree: Annotated[int, Ge(0), Le(24)] = 6
     two_pi: bool = False

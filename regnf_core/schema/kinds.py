@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Len, MaxLen
 
-from regnf_core.schema.description import FORBID_UNKNOWN, FieldDescription
+from regnf_core.schema.closed import Closed
+from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig, PositionalEncodingDescription
 from regnf_core.schema.onnx_operators import OPERATORS, SHAPE_ONLY
 from regnf_core.schema.tensor_check import (
@@ -134,10 +135,8 @@ AttributeValue = int | float | Annotated[str, MaxLen(64)] | Annotated[tuple[_Num
 
 
 @dataclass(frozen=True)
-class NodeDescription:
+class NodeDescription(Closed):
     """One operation: its operator, the names of what goes in ("" if left out) and comes out, its settings."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
 
     op: Annotated[str, MaxLen(40)]
     inputs: _Names
@@ -146,10 +145,8 @@ class NodeDescription:
 
 
 @dataclass(frozen=True)
-class ConstantDescription:
+class ConstantDescription(Closed):
     """A small array: row after row, last axis fastest."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
 
     type: Literal["float32", "int64", "bool"]
     shape: Annotated[tuple[Annotated[int, Ge(0), Le(MAX_NUMBERS)], ...], MaxLen(8)]

@@ -50,7 +50,6 @@ def local_origin(box: Rows) -> tuple[float, float, float] | None:
 
 
 def shift_rows(shift: Sequence[float]) -> list[list[float]]:
-    """The 4 x 4 rows of a shift."""
     return [[*(float(row == column) for column in range(3)), value] for row, value in enumerate(shift)] + [
         [0.0, 0.0, 0.0, 1.0]
     ]

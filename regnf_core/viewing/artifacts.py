@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.document import IterationRecord, RegistrationResult, json_number, result_document
-from regnf_core.field_notes import FieldNotes
-from regnf_core.geometry.metrics import Symmetries
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.schema.similarity import local_origin
@@ -69,32 +66,22 @@ def write_artifacts(
     result: RegistrationResult,
     directory: Path,
     truth: Sim3 | None = None,
-    symmetries: Symmetries | None = None,
-    object_name: str | None = None,
-    candidates: list[dict[str, Any]] | None = None,
-    fields: Mapping[str, FieldNotes] | None = None,
+    **said: Any,
 ) -> list[str]:
     """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
 
-    ``truth``, ``symmetries``, ``object_name``, ``candidates`` and ``fields`` are for the result document.
+    truth, said: for the result document, as ``result_document``.
     """
-    said: dict[str, Any] = {"object_name": object_name, "candidates": candidates, "fields": fields}
-    return write_pictures(result, directory) + write_result(result, directory, truth, symmetries, **said)
+    return write_pictures(result, directory) + write_result(result, directory, truth, **said)
 
 
-def write_result(
-    result: RegistrationResult,
-    directory: Path,
-    truth: Sim3 | None = None,
-    symmetries: Symmetries | None = None,
-    **said: Any,
-) -> list[str]:
+def write_result(result: RegistrationResult, directory: Path, truth: Sim3 | None = None, **said: Any) -> list[str]:
     """What was found: trace.json, T_scene_object.npy (4x4), considered.npz (what the held-out samples say of each pose
     that was judged, if the result has it), result.json. said: as ``result_document``.
     """
     _write_json(directory / "trace.json", trace_document(result.trace))
     np.save(directory / "T_scene_object.npy", result.T_scene_object.matrix().double().cpu().numpy())
-    document = result_document(result, truth, symmetries, result.scene_samples.points.device, **said)
+    document = result_document(result, truth, result.scene_samples.points.device, **said)
     _write_json(directory / "result.json", document)
     names = ["trace.json", "T_scene_object.npy", "result.json"]
     if result.considered is None:

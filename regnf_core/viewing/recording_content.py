@@ -27,7 +27,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.document import Considered, ConsideredPose, RegistrationResult
+from regnf_core.document import Considered, RegistrationResult
 from regnf_core.errors import InvalidInputError, verdict_hint, verdict_in_words
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
@@ -35,11 +35,6 @@ from regnf_core.viewing.artifacts import CONTEXT_COLOR
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, residual_colors_of
 
 # The texts of a recording: the verdict as Markdown, and what is said of a pose that was judged.
-
-
-def label_of(one: ConsideredPose) -> str:
-    """Probability and reason, short."""
-    return f"{_percent(one.metrics.get('probability'))}, {one.reason}"
 
 
 def verdict_text(result: RegistrationResult, object_name: str | None = None) -> str:
@@ -127,7 +122,8 @@ def _log_considered(stream: rr.RecordingStream, considered: Considered) -> None:
         stream.log(entity, _transform(one.T_scene_object), static=True)
         signs = considered.object_signs[number].cpu().numpy()
         points, colors = _array(considered.object_points), _bytes(_SIGN_COLORS[signs])
-        samples = rr.Points3D(points, colors=colors, labels=[label_of(one)], show_labels=True)
+        said = f"{_percent(one.metrics.get('probability'))}, {one.reason}"
+        samples = rr.Points3D(points, colors=colors, labels=[said], show_labels=True)
         stream.log(f"{entity}/samples", samples, static=True)
 
 

@@ -76,7 +76,6 @@ class Bag:
                 yield connection, time, self.reader.deserialize(raw, connection.msgtype)
 
     def first(self, connection: Any | None) -> Any:
-        """The first message of a connection, if there is one."""
         found = () if connection is None else self.messages([connection])
         return next((message for _, _, message in found), None)
 

@@ -15,12 +15,14 @@ import yaml
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_core.texts import decode_text
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]
 """Height and width, pixels."""
-Lens = Literal["none", "brown", "fisheye"]
-"""none: a pinhole · brown: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 · fisheye: OpenCV's four, of the angle from the axis."""
+Lens = Literal["none", "brown", "fisheye", "inverse"]
+"""none: a pinhole · brown: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 · fisheye: OpenCV's four, of the angle from the axis ·
+inverse: RealSense's, brown's formula from slopes behind the lens to those before it."""
 
 HALF_A_PIXEL = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
 """Added to intrinsics of writers that take pixel centers to lie at whole numbers."""
@@ -34,6 +36,9 @@ _CENTRAL = 0.25
 """Of half of an image's side: how far its principal point may be from its middle."""
 _UNITS_M = 1e-5, 0.01
 """Meters that a step of a depth image may stand for."""
+_NAMED_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_LEAST_PIXELS = 4.0
+"""Of focal lengths and of the principal point: smaller ones are no pixels."""
 _ROUNDS = 8
 """Of the fixed-point inversion that checks a lens: enough for lenses whose image folds nowhere."""
 
@@ -111,7 +116,11 @@ class Camera:
         if max(K[0, 2], K[1, 2]) <= 0.5 and (K[2, 0] > 1.0 or K[2, 1] > 1.0):
             raise DatasetError(f"{name}: the intrinsics are transposed: rows are [fx, 0, cx], ...", reason=_INVALID)
         if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0.0, 0.0, 0.0, 1.0)) or min(K[0, 0], K[1, 1]) <= 0.0:
-            raise DatasetError(f"{name}: the intrinsics are not a camera matrix", reason=_INVALID)
+            said = f"focal lengths {K[0, 0]:g}, {K[1, 1]:g}; last row {K[2].tolist()}"
+            raise DatasetError(f"{name}: the intrinsics are not a camera matrix: {said}", reason=_INVALID)
+        if K[:2].max() < _LEAST_PIXELS:
+            said = "are shares of the image: multiply fx and cx by its width, fy and cy by its height"
+            raise DatasetError(f"{name}: the intrinsics {said}", reason=_INVALID)
         if abs(K[0, 1]) > 1e-3 * K[0, 0]:
             raise DatasetError(f"{name}: the camera's axes are skewed", reason="DATASET_CAMERA_UNSUPPORTED")
         if self.size is not None:
@@ -161,6 +170,11 @@ class Camera:
             a = angle * angle
             bent = angle * (1.0 + a * (k1 + a * (k2 + a * (k3 + a * k4))))
             return slopes * np.where(radius > 1e-9, bent / np.maximum(radius, 1e-9), 1.0)[:, None]
+        if self.lens == "inverse":
+            found, brown = slopes, replace(self, lens="brown")
+            for _ in range(_ROUNDS):
+                found = found + (slopes - brown._bent(found))
+            return found
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *([0.0] * 8))[:8]
         r = squared
         radial = (1.0 + r * (k1 + r * (k2 + r * k3))) / (1.0 + r * (k4 + r * (k5 + r * k6)))
@@ -204,31 +218,38 @@ def read_camera_file(path: Path) -> CameraFile | None:
     """
     if path.stat().st_size > _MOST_BYTES:
         return None
-    text = path.read_text("utf-8", "replace")
     suffix = path.suffix.lower()
-    if suffix in (".json", ".yaml", ".yml"):
-        try:
-            content = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
-        except (ValueError, RecursionError, yaml.YAMLError) as error:
-            raise DatasetError(f"{path.name} cannot be read: {error}", reason=_INVALID) from error
-        return camera_of_values(content, path.name)
+    try:
+        if suffix == ".npy":
+            return camera_of_values(np.load(path, allow_pickle=False).tolist(), path.name)
+        text = decode_text(path.read_bytes())
+        if suffix in (".json", ".yaml", ".yml"):
+            documents = iter([json.loads(text)]) if suffix == ".json" else yaml.safe_load_all(_OPENCV.sub("", text))
+            return camera_of_values(next(documents, None), path.name)
+    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        raise DatasetError(f"{path.name} cannot be read: {error}", reason=_INVALID) from error
+    if named := dict(_NAMED.findall(text)):
+        return camera_of_values(named, path.name)
     numbers = [_numbers(line) for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     return _of_rows([row for row in numbers if row], path.name)
 
 
 def camera_of_values(values: Any, name: str) -> CameraFile | None:
     """As :func:`read_camera_file`, of a JSON or YAML document; the first object in it that holds intrinsics."""
-    for each in _objects(values):
+    for each in _objects({"K": values} if isinstance(values, list) else values):
         found = _matrix(each, name)
         if found is not None:
             width, height = _first(each, "width", "w", "image_width"), _first(each, "height", "h", "image_height")
+            if isinstance(resolution := each.get("resolution"), list) and len(resolution) == 2:  # Kalibr
+                width, height = resolution
             size = (int(height), int(width)) if width and height else None
             lens, coefficients = _lens(each, name)
             K = found + HALF_A_PIXEL
             camera = Camera(K, size, lens, coefficients).check(name)
-            unit = depth_unit(_first(each, "depth_scale", "depth_units", "scale", "depth_unit"))
+            stated = _first(each, "depth_scale", "depth_units", "scale", "depth_unit", "DepthMapFactor")
+            unit = _NAMED_UNITS.get(str(each.get("depth_unit"))) or depth_unit(stated)
             if unit is None and each.get("depth_unit") is not None:
-                told = f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters a step, such as 0.001"
+                told = f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters a step, as 0.001, or mm"
                 raise DatasetError(told, reason=_INVALID)
             return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
@@ -243,17 +264,24 @@ def depth_unit(stated: float | None) -> float | None:
 
 
 def _objects(values: Any, depth: int = 0) -> Iterable[Mapping[str, Any]]:
-    """The JSON objects of a document, the outer ones first."""
+    """The JSON objects of a document, the outer ones first, those of color cameras last."""
     if isinstance(values, Mapping):
         yield values
         if depth < 4:
-            for value in values.values():
-                yield from _objects(value, depth + 1)
+            for key in sorted(values, key=of_color):
+                yield from _objects(values[key], depth + 1)
+
+
+def of_color(name: Any) -> bool:
+    """Whether a name says that it is of a color camera."""
+    return re.search("colou?r|rgb", str(name), re.IGNORECASE) is not None
 
 
 def _first(values: Mapping[str, Any], *names: str) -> float | None:
     for name in names:
         value = values.get(name)
+        if isinstance(value, str) and len(numbers := _numbers(value)) == 1:
+            value = numbers[0]
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
     return None
@@ -265,7 +293,7 @@ def _matrix(values: Mapping[str, Any], name: str) -> Array | None:
     cx, cy = _first(values, "cx", "ppx"), _first(values, "cy", "ppy")
     if None not in (fx, cx, cy):
         return np.array([[fx, 0.0, cx], [0.0, fy or fx, cy], [0.0, 0.0, 1.0]], np.float64)
-    for key in ("intrinsic_matrix", "camera_matrix", "K", "k", "cam_K", "intrinsics", "intrinsic"):
+    for key in ("intrinsic_matrix", "camera_matrix", "K", "k", "cam_K", "intrinsics", "intrinsic", "P", "p"):
         value = values.get(key)
         if isinstance(value, Mapping):
             value = value.get("data")
@@ -275,6 +303,8 @@ def _matrix(values: Mapping[str, Any], name: str) -> Array | None:
             continue
         if matrix.shape == (9,):  # Open3D writes columns first
             matrix = matrix.reshape(3, 3).T if key == "intrinsic_matrix" else matrix.reshape(3, 3)
+        if matrix.shape == (12,):
+            matrix = matrix.reshape(3, 4)
         if matrix.shape in ((3, 3), (4, 4), (3, 4)):
             return matrix[:3, :3]
         if matrix.shape == (4,):
@@ -287,14 +317,16 @@ def _matrix(values: Mapping[str, Any], name: str) -> Array | None:
 def _lens(values: Mapping[str, Any], name: str) -> tuple[Lens, tuple[float, ...]]:
     """The lens's model and coefficients; all zero is none."""
     model = str(values.get("distortion_model", values.get("camera_model", values.get("model", "")))).lower()
-    given = next((values[key] for key in ("distortion_coefficients", "coeffs", "D", "d") if key in values), None)
+    names = ("distortion_coefficients", "distortion_coeffs", "coeffs", "D", "d")
+    given = next((values[key] for key in names if key in values), None)
     if isinstance(given, Mapping):
         given = given.get("data")
     if given is None:
         given = [_first(values, key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
         if "fisheye" in model:
             given = [given[0], given[1], given[4], given[5]]
-    return lens_of(given, "fisheye" in model or "equidistant" in model or "kannala" in model, name)
+    kind, numbers = lens_of(given, "fisheye" in model or "equi" in model or "kannala" in model, name)
+    return "inverse" if kind == "brown" and "inverse" in model else kind, numbers
 
 
 def lens_of(coefficients: Any, fisheye: bool, name: str) -> tuple[Lens, tuple[float, ...]]:
@@ -318,6 +350,10 @@ def lens_of(coefficients: Any, fisheye: bool, name: str) -> tuple[Lens, tuple[fl
 
 
 _WORDS = re.compile(r"[\s,;\[\]()]+")
+_OPENCV = re.compile(r"^%YAML.*$|!!opencv-matrix|^(Camera\d?|RGBD)\.", re.MULTILINE)
+"""What OpenCV's files, and those of ORB-SLAM, have that YAML has not."""
+_NAMED = re.compile(r"\b(f[xy]|c[xy]|pp[xy]|width|height)\s*[:=]\s*([-+.\deE]+)")
+"""Numbers of a text that have names."""
 
 
 def _numbers(line: str) -> list[float]:
@@ -334,6 +370,10 @@ def _of_rows(rows: list[list[float]], name: str) -> CameraFile | None:
         matrix = np.array(rows)[:3, :3]
     elif len(rows) == 1 and len(rows[0]) == 9:
         matrix = np.array(rows[0]).reshape(3, 3)
+    elif len(rows) == 1 and len(rows[0]) == 6 and min(rows[0]) > _LEAST_PIXELS:  # no lens has such coefficients
+        width, height, fx, fy, cx, cy = rows[0]
+        camera = camera_of(fx, fy, cx, cy, (int(height), int(width)), whole_centers=True)
+        return CameraFile(camera.check(name))
     elif len(rows) == 1 and 4 <= len(rows[0]) <= 12:
         fx, fy, cx, cy = rows[0][:4]
         lens = lens_of(rows[0][4:], False, name)

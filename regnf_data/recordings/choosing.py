@@ -37,11 +37,10 @@ _MARGIN = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """indices: of the frames, in their order · bounds: (2, 3), world, of what they show · looked_at: how many were."""
+    """indices: of the frames, in their order · bounds: (2, 3), world, of what they show."""
 
     indices: tuple[int, ...]
     bounds: Array
-    looked_at: int
 
 
 def choose_frames(
@@ -79,7 +78,7 @@ def choose_frames(
     # Two frames of a room see a wall alike; of a thing in a box, the one with the narrower pixels counts for more.
     worth = [1.0 if box is None else sharp for _, sharp in seen]
     picked = _greedy([_cells(each, edge) for each in points], worth, most)
-    return Chosen(tuple(sorted(looked_at[each] for each in picked)), bounds, count)
+    return Chosen(tuple(sorted(looked_at[each] for each in picked)), bounds)
 
 
 def _some_points(frame: Frame) -> Array:

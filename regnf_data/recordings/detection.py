@@ -23,7 +23,7 @@ from regnf_data.recordings.recording import MOST_PIXELS, Frame
 Mask = NDArray[np.bool_]
 
 
-_MASK_FORMATS = ("PNG", "JPEG", "BMP")
+_MASK_FORMATS, _HALF = ("PNG", "JPEG", "BMP"), 127
 
 
 def mask_of(value: Any, size: Size | None = None) -> Mask:
@@ -44,10 +44,23 @@ def mask_of(value: Any, size: Size | None = None) -> Mask:
             data = base64.b64decode(value.partition("base64,")[2] or value, validate=True)
             with Image.open(io.BytesIO(data), formats=_MASK_FORMATS) as image:
                 if image.width * image.height <= MOST_PIXELS:
-                    return np.asarray(image.convert("L")) > 0
+                    return _of_picture(image)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            raise InvalidDetectionError(f"the mask is no image as base64: {error}"[:200]) from error
-    raise InvalidDetectionError("the mask is no file, no image as base64 and no run lengths of COCO", hint=HINT)
+            known = ", ".join(_MASK_FORMATS)
+            raise InvalidDetectionError(f"the mask is no image of the kinds {known}, as base64") from error
+    said = f"the mask is no file, no image as base64 and no run lengths of COCO: {str(value)[:80]!r}"
+    raise InvalidDetectionError(said, hint=HINT)
+
+
+def _of_picture(image: Image.Image) -> Mask:
+    """True where a picture is not black; where it is opaque, if not all of it is; of one with a palette without black,
+    where it has not the first color; of shades, as of probabilities, where it is brighter than half."""
+    if "A" in image.getbands() and np.ptp(alpha := np.asarray(image.getchannel("A"))):
+        return np.asarray(alpha > _HALF)
+    gray = np.asarray(image.convert("L"))
+    if image.mode == "P" and gray.min() > 0:
+        return np.asarray(image) > 0
+    return np.asarray(gray > (_HALF if gray.min() > 0 and np.ptp(gray) > 0 else 0))
 
 
 def _run_lengths(value: Mapping[str, Any]) -> Mask:
@@ -83,9 +96,17 @@ def _text_lengths(text: str) -> list[int]:
 
 
 def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
+    if polygons and isinstance(polygons[0], int | float):
+        polygons = [polygons]
     try:
         flat = [[float(number) for number in polygon] for polygon in polygons]
+        if len(flat) > 2 and {len(polygon) for polygon in flat} == {2}:  # one polygon, of pairs
+            flat = [[number for pair in flat for number in pair]]
         reach = max(max(polygon) for polygon in flat)
+        if {number for polygon in flat for number in polygon} <= {0.0, 1.0}:  # rows of a mask
+            return np.array(flat) > 0.0
+        if reach <= 1.0 and size:  # shares of the image's sides
+            flat = [[number * size[1 - at % 2] for at, number in enumerate(polygon)] for polygon in flat]
         height, width = (int(side) for side in size) if size else (int(reach) + 2, int(reach) + 2)
     except (TypeError, ValueError) as error:
         raise InvalidDetectionError("the mask's polygons are not lists of x, y, x, y ...", hint=HINT) from error
@@ -182,7 +203,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         pixels[pixels] = near
         camera_points = camera_points[near]
     if len(camera_points) < _FEWEST:
-        raise _without_depth(frame, f"{len(camera_points)} pixels of the thing")
+        raise _without_depth(frame, f"{len(camera_points)} of the thing's pixels")
     low, high = (np.quantile(camera_points, share, axis=0) for share in (_TRIMMED, 1.0 - _TRIMMED))
     behind = max(float((high - low)[:2].max()), diameter or 0.0)
     high[2] = max(high[2], low[2] + behind)
@@ -194,7 +215,8 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
 
 
 def _without_depth(frame: Frame, said: str) -> InvalidDetectionError:
-    return InvalidDetectionError(f"frame {frame.name}: {said} have a measured depth", reason="DETECTION_WITHOUT_DEPTH")
+    said = f"frame {frame.name}: depth was measured in {said}; {_FEWEST} are needed"
+    return InvalidDetectionError(said, reason="DETECTION_WITHOUT_DEPTH")
 
 
 def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float, float] | None]:
@@ -205,15 +227,22 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
     if detection.mask is not None:
         mask = mask_of(detection.mask, detection.size or given)
         if mask.shape not in (given, frame.depth.shape):
-            raise InvalidDetectionError(
-                f"frame {frame.name}: the mask has {mask.shape[1]} x {mask.shape[0]} pixels, not {width} x {height}"
-            )
+            if abs(mask.shape[0] * width - mask.shape[1] * height) > max(*mask.shape, width, height):
+                raise InvalidDetectionError(
+                    f"frame {frame.name}: the mask has {mask.shape[1]} x {mask.shape[0]} pixels, not {width} x {height}"
+                )
+            rows, columns = (np.arange(b) * a // b for a, b in zip(mask.shape, given, strict=True))
+            mask = mask[rows[:, None], columns]  # detectors work on smaller images
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the mask is empty")
+        if not mask.all() and mask[[0, -1]].all() and mask[:, [0, -1]].all():
+            raise InvalidDetectionError(f"frame {frame.name}: the mask is true all along the border: is it inverted?")
         return frame.registered(mask), None
     mask = np.zeros(given, dtype=np.bool_)
     if detection.box_2d is not None:
         left, top, right, bottom = detection.box_2d
+        if max(right, bottom) <= 1.0:  # shares of the image's sides
+            left, top, right, bottom = left * width, top * height, right * width, bottom * height
         columns, rows = (np.clip([a, b], 0, side) for a, b, side in ((left, right, width), (top, bottom, height)))
         mask[int(rows[0]) : int(np.ceil(rows[1])), int(columns[0]) : int(np.ceil(columns[1]))] = True
         if not mask.any():

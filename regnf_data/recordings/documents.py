@@ -21,7 +21,7 @@ from regnf_data.recordings.folders import (
     _COLOR_FOLDERS,
     _COLORS,
     _DEPTH_FOLDERS,
-    _DEPTHS,
+    DEPTHS,
     _first_file,
     _lines,
     _subfolder,
@@ -87,7 +87,7 @@ def read_bop(folder: Path, given: Given) -> Recording:
             pose = pose_of(matrix, name, inverse=True, unit=0.001)
         else:
             unplaced += 1
-        depth = _first_file(depths, (name, key), _DEPTHS)
+        depth = _first_file(depths, (name, key), DEPTHS)
         color = _first_file(colors, (name, key), _COLORS) if colors else None
         frames.append(frame_of(name, camera, pose, depth, unit, color))
     notes = []
@@ -127,11 +127,13 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
     listed = values.get("frames")
     if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed) or not listed:
         raise DatasetError(f"{file.name} lists no frames", reason="DATASET_NO_FRAMES")
-    unit = given.depth_unit or float(values.get("depth_unit_scale_factor", 0.001))
+    stated = values.get("depth_unit_scale_factor", values.get("integer_depth_scale", 0.001))  # the latter: instant-ngp
+    unit = given.depth_unit or float(stated)
     named = [each for each in listed if each.get("depth_file_path") or each.get("depth_path")]
     if not named:
         raise DatasetError(
-            f"{file.name} names no depth images (depth_file_path): colors alone make no map. regnf fit takes them",
+            f"{file.name} names no depth images (depth_file_path): colors alone make no map. Name one"
+            " for each frame, beside its file_path",
             reason="DATASET_DEPTH_MISSING",
         )
     frames: list[StoredFrame | None] = []
@@ -272,7 +274,7 @@ def read_colmap(folder: Path, given: Given) -> Recording:
             raise DatasetError(f"{name}: COLMAP's model has no camera {number}", reason=_INVALID)
         pose = np.linalg.inv(poses_of(place[None], quaternion[None], name)[0])
         path = PurePosixPath(name)
-        depth = _first_file(depths, (str(path.with_suffix("")), name), _DEPTHS)
+        depth = _first_file(depths, (str(path.with_suffix("")), name), DEPTHS)
         dense = (depths / f"{name}.{kind}.bin" for kind in ("geometric", "photometric"))
         depth = depth or next((path for path in dense if path.is_file()), None)
         color = None if colors is None or depth is None else _color_path(colors, name)

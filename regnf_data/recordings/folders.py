@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +16,18 @@ import numpy as np
 from PIL import Image
 
 from regnf_core.errors import DatasetError
-from regnf_data.recordings.camera import Array, Camera, CameraFile, camera_of, read_camera_file
+from regnf_data.recordings.camera import Array, Camera, CameraFile, camera_of, of_color, read_camera_file
 from regnf_data.recordings.recording import (
+    DepthFile,
     Recording,
     StoredFrame,
     checked_size,
     color_file,
-    depth_file,
     pose_of,
     recording_of,
+    whole_numbers,
 )
+from regnf_data.sdfstudio import ARRAYS, array_file
 
 if TYPE_CHECKING:
     from regnf_data.recordings.recording import Given
@@ -32,8 +35,10 @@ if TYPE_CHECKING:
 _INVALID = "DATASET_METADATA_INVALID"
 _MILLIMETER = 0.001
 _MOST_TEXT = 256 << 20
-_DEPTHS = (".png", ".tif", ".tiff", ".npy", ".pgm")
+DEPTHS = (".png", ".tif", ".tiff", ".pgm", *ARRAYS)
 _COLORS = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".webp")
+_CAMERAS = (".json", ".txt", ".yaml", ".yml", ".csv", ".npy")
+_POSE_LISTS = (".txt", ".csv", ".npy")
 _NUMBER = re.compile(r"\d+")
 
 
@@ -113,7 +118,8 @@ def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
         known = [number for number, pose in enumerate(found) if pose is not None]
         return wanted[known], np.array([found[number] for number in known])
     if len(lengths) == 1 and min(lengths) >= 8 and rows[0][0] > _NANOSECONDS:
-        rows = [[1e-9 * row[0], *row[1:4], *row[5:8], row[4]] for row in rows]
+        w_first = "," in next(iter(_lines(path)))  # EuRoC's tables; others have but other time stamps
+        rows = [[1e-9 * row[0], *row[1:4], *((*row[5:8], row[4]) if w_first else row[4:8])] for row in rows]
         lengths = {8}
     if lengths != {8}:
         expected = "lines of t tx ty tz qx qy qz qw, or 12 numbers for each depth image"
@@ -165,7 +171,7 @@ _SEVEN_SCENES = 585.0, 585.0, 320.0, 240.0
 
 
 def is_seven_scenes(path: Path) -> bool:
-    return path.is_dir() and any(path.glob("*.pose.txt"))
+    return path.is_dir() and any(path.glob("[!.]*.pose.txt"))
 
 
 def read_seven_scenes(folder: Path, given: Given) -> Recording:
@@ -173,9 +179,9 @@ def read_seven_scenes(folder: Path, given: Given) -> Recording:
     note = "the folder has no intrinsics: those that 7-Scenes publishes for it are taken (585, 585, 320, 240)"
     camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _MILLIMETER, _SEVEN_SCENES, note)
     frames = []
-    for pose_file in sorted(folder.glob("*.pose.txt")):
+    for pose_file in sorted(folder.glob("[!.]*.pose.txt")):
         name = pose_file.name.removesuffix(".pose.txt")
-        depth = _first_file(folder, (f"{name}.depth",), _DEPTHS)
+        depth = _first_file(folder, (f"{name}.depth",), DEPTHS)
         pose = pose_of(matrix_file(pose_file), name)
         color = _first_file(folder, (f"{name}.color", f"{name}.rgb"), _COLORS)
         frames.append(frame_of(name, camera, pose, depth, unit, color))
@@ -185,6 +191,7 @@ def read_seven_scenes(folder: Path, given: Given) -> Recording:
 # Redwood and Open3D: depth/, color/ or image/, a trajectory.
 
 _DEPTH_FOLDERS = ("depth", "depths", "depth_images")
+_POSE_FOLDERS = ("pose", "poses")
 _PRIMESENSE = 525.0, 525.0, 319.5, 239.5
 _COLOR_FOLDERS = ("color", "image", "rgb", "images", "colors")
 
@@ -194,23 +201,26 @@ def is_redwood(path: Path) -> bool:
 
 
 def _trajectory_file(folder: Path) -> Path | None:
-    places = [*sorted(folder.glob("*.log")), *sorted(folder.glob("*.json")), *sorted(folder.glob("scene/*.log"))]
-    places += sorted(folder.glob("scene/*.json"))
-    return next((p for p in places if p.suffix == ".log" or "pose_graph" in p.name or "trajectory" in p.name), None)
+    places = [p for pattern in ("[!.]*", "scene/[!.]*") for p in sorted(folder.glob(pattern))]
+    lists = [p for p in places if re.search(r"traj|pose|odometry", p.name) and p.suffix in (".json", *_POSE_LISTS)]
+    return next((p for p in [*(p for p in places if p.suffix == ".log"), *lists] if p.is_file()), None)
 
 
 def read_redwood(folder: Path, given: Given) -> Recording:
-    """A trajectory has a frame's numbers, then its pose to the world in four rows; images are in their order."""
+    """A trajectory has a frame's numbers, then its pose to the world in four rows; images are in their order. Also
+    lists of a pose a line: a matrix, or Stray Scanner's time stamp, frame, place and quaternion."""
     path = _trajectory_file(folder)
     depths = _subfolder(folder, _DEPTH_FOLDERS)
     if path is None or depths is None:
         raise DatasetError(f"{folder.name} has no depth/ or no trajectory", reason="DATASET_NO_METADATA")
     note = "the folder has no intrinsics: those of the PrimeSense camera, Open3D's default, are taken"
     camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _MILLIMETER, _PRIMESENSE, note)
+    if path.name == "odometry.csv" and camera.size is None:  # of Stray Scanner's video
+        camera = replace(camera, size=(1440, 1920))
     colors = _subfolder(folder, _COLOR_FOLDERS)
     poses = _redwood_poses(path)
-    images = _in_order(depths, _DEPTHS)
-    pictures = _in_order(colors, _COLORS) if colors else []
+    images = in_order(depths, DEPTHS)
+    pictures = in_order(colors, _COLORS) if colors else []
     matched = len(pictures) == len(images)
     if len(poses) > len(images):
         raise DatasetError(
@@ -233,6 +243,17 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
             number = int(_number(lines[at].split()[0], path.name))
             poses[number] = [[_number(word, path.name) for word in line.split()] for line in lines[at + 1 : at + 5]]
         return poses
+    if path.suffix in _POSE_LISTS:
+        rows = matrix_file(path)
+        lengths = {len(row) for row in rows}
+        if lengths in ({9}, {13}):  # Stray Scanner's; intrinsics may follow
+            table = np.array(rows)
+            return dict(zip(map(int, table[:, 1]), poses_of(table[:, 2:5], table[:, 5:9], path.name), strict=True))
+        if lengths == {4} and len(rows) % 4 == 0:
+            return dict(enumerate(np.split(np.array(rows), len(rows) // 4)))
+        if lengths not in ({12}, {16}):
+            raise DatasetError(f"{path.name}: expected a pose a line, 12 or 16 numbers", reason=_INVALID)
+        return dict(enumerate(rows))
     values = read_json(path)
     # Open3D's PoseGraph, and its PinholeCameraTrajectory, world to camera: matrices by columns.
     for key, member, inverse in (("nodes", "pose", False), ("parameters", "extrinsic", True)):
@@ -248,7 +269,7 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
 
 
 def is_scannet(path: Path) -> bool:
-    return path.is_dir() and (path / "pose").is_dir() and _subfolder(path, _DEPTH_FOLDERS) is not None
+    return path.is_dir() and None not in (_subfolder(path, _POSE_FOLDERS), _subfolder(path, _DEPTH_FOLDERS))
 
 
 def read_scannet(folder: Path, given: Given) -> Recording:
@@ -258,9 +279,9 @@ def read_scannet(folder: Path, given: Given) -> Recording:
     camera, unit, _ = _camera_of(folder.name, found, given, _MILLIMETER)
     of_color = _named_camera(folder, "intrinsic_color")
     frames = []
-    for pose_file in sorted((folder / "pose").glob("*.txt"), key=_order):
+    for pose_file in in_order(_subfolder(folder, _POSE_FOLDERS) or folder, (".txt", ".npy")):
         name = pose_file.stem
-        depth = _first_file(depths, (name,), _DEPTHS)
+        depth = _first_file(depths, (name,), DEPTHS)
         color = _first_file(colors, (name,), _COLORS) if colors else None
         pose = pose_of(matrix_file(pose_file), name)
         frames.append(frame_of(name, camera, pose, depth, unit, color, of_color.camera if of_color else None))
@@ -283,7 +304,7 @@ def read_replica(folder: Path, given: Given) -> Recording:
     """A line of traj.txt is a pose to the world, 16 numbers. The intrinsics lie in the folder or the one above it."""
     found = camera_beside(folder) or camera_beside(folder.resolve().parent)
     camera, unit, _ = _camera_of(folder.name, found, given, 1.0 / 6553.5)
-    images = _in_order(folder / "results", _DEPTHS, "depth")
+    images = in_order(folder / "results", DEPTHS, "depth")
     poses = matrix_file(folder / "traj.txt")
     if len(poses) != len(images):
         raise DatasetError(
@@ -307,10 +328,10 @@ def is_frame(path: Path) -> bool:
 def _frame_files(path: Path) -> tuple[Path, Path | None] | None:
     """The depth image and the color image; None where there is no one depth image."""
     if path.is_file():
-        return (path, None) if path.suffix.lower() in _DEPTHS else None
-    images = [p for p in sorted(path.iterdir()) if p.suffix.lower() in (*_DEPTHS, *_COLORS) and p.is_file()]
-    named = [p for p in images if "depth" in p.name.lower() and p.suffix.lower() in _DEPTHS]
-    depths = named or [p for p in images if p.suffix.lower() == ".npy" or _has_16_bits(p)]
+        return (path, None) if path.suffix.lower() in DEPTHS else None
+    images = [p for p in sorted(path.glob("[!.]*")) if p.suffix.lower() in (*DEPTHS, *_COLORS) and p.is_file()]
+    named = [p for p in images if "depth" in p.name.lower() and p.suffix.lower() in DEPTHS]
+    depths = named or [p for p in images if p.suffix.lower() in ARRAYS or _has_16_bits(p)]
     if len(depths) != 1:
         return None
     colors = [p for p in images if p != depths[0] and p.suffix.lower() in _COLORS and "mask" not in p.name.lower()]
@@ -337,8 +358,8 @@ def read_frame(path: Path, given: Given) -> Recording:
     found = camera_beside(folder) if path.is_dir() or given.camera is None else None
     camera, unit, _ = _camera_of(path.name, found, given, _MILLIMETER)
     stated = given.depth_unit or (found and found.depth_unit)
-    whole = depth.suffix.lower() != ".npy"
-    notes = ["no file says the depth's unit: millimeters are taken"] if whole and not stated else []
+    guessed = not stated and whole_numbers(depth)
+    notes = ["no file says the depth's unit: millimeters are taken"] if guessed else []
     # A camera file of the color image's resolution is scaled to the depth image's.
     size = checked_size(depth)
     pose = np.eye(4) if found is None or found.pose is None else pose_of(found.pose, "T_world_camera")
@@ -351,15 +372,14 @@ def read_frame(path: Path, given: Given) -> Recording:
 
 def camera_beside(folder: Path) -> CameraFile | None:
     """The camera of a file of the folder whose name says so; the first that holds intrinsics."""
-    pattern = re.compile(r"intrinsic|camera|cam_params|calib|cam_k|^k\.txt$", re.IGNORECASE)
+    pattern = re.compile(r"^[^.].*(intrinsic|camera|calib)|^(intrinsic|calib|cam)|^k\.(txt|npy)$", re.IGNORECASE)
     places = [
         folder,
         *(folder / name for name in ("intrinsic", "intrinsics", "calibration") if (folder / name).is_dir()),
     ]
     for place in places:
-        for path in sorted(place.iterdir()):
-            suffix = path.suffix.lower()
-            if pattern.search(path.name) and suffix in (".json", ".txt", ".yaml", ".yml") and path.is_file():
+        for path in sorted(place.iterdir(), key=lambda one: (of_color(one.name), one.name)):
+            if pattern.search(path.name) and path.suffix.lower() in _CAMERAS and path.is_file():
                 found = read_camera_file(path)
                 if found is not None:
                     return found
@@ -383,8 +403,8 @@ def _camera_of(
         return camera, unit, []
     if published is None:
         raise DatasetError(
-            f"{name} has no intrinsics: put a camera_intrinsic.json beside the images, or give --intrinsics"
-            " fx,fy,cx,cy",
+            f"{name} has no intrinsics: no file called camera or intrinsics there holds fx, fy, cx, cy or a matrix K."
+            " Write one, or give --intrinsics fx,fy,cx,cy",
             reason="DATASET_INTRINSICS_INVALID",
         )
     return camera_of(*published, size=(480, 640), whole_centers=True), unit, [note]
@@ -402,13 +422,18 @@ def frame_of(
     """A frame of image files; None where it has no pose or no depth."""
     if pose is None or depth is None:
         return None
-    return StoredFrame(name, camera, pose, depth_file(depth, unit), color_file(color) if color else None, color_camera)
+    return StoredFrame(name, camera, pose, DepthFile(depth, unit), color_file(color) if color else None, color_camera)
 
 
 def matrix_file(path: Path) -> list[list[float]]:
     """The numbers of a text file, by rows. Raises DatasetError (DATASET_METADATA_INVALID)."""
-    rows = [[_number(word, path.name) for word in line.replace(",", " ").split()] for line in _lines(path)]
-    return [row for row in rows if row]
+    if path.suffix == ".npy":
+        values = array_file(path)
+        return [row.ravel().tolist() for row in (values if values.ndim > 1 else values[None])]
+    lines = [line.replace(",", " ").split() for line in _lines(path)]
+    if len(lines) > 1 and lines[0][0].lower() in ("timestamp", "time", "frame", "x", "tx"):  # what the columns are
+        del lines[0]
+    return [[_number(word, path.name) for word in words] for words in lines if words]
 
 
 def read_json(path: Path) -> Any:
@@ -443,8 +468,8 @@ def _order(path: Path) -> tuple[list[int], str]:
     return [int(number[:18]) for number in _NUMBER.findall(path.stem)[:8]], path.name
 
 
-def _in_order(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.name.startswith(prefix)]
+def in_order(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Path]:
+    found = [p for p in folder.glob(f"{prefix or '[!.]'}*") if p.suffix.lower() in suffixes and p.is_file()]
     return sorted(found, key=_order)
 
 

@@ -12,6 +12,7 @@ from regnf_data.posed_images import PosedImages
 from regnf_data.recordings.camera import Array
 from regnf_data.recordings.choosing import choose_frames
 from regnf_data.recordings.documents import is_sdfstudio
+from regnf_data.recordings.layouts import SDFSTUDIO
 from regnf_data.recordings.opening import open_recording
 from regnf_data.recordings.recording import Given
 from regnf_data.sdfstudio import load_dataset, read_metadata
@@ -59,7 +60,8 @@ def images_of(
 
 def _of_sdfstudio(folder: Path, given: Given, bounds: Array | None) -> TakenImages:
     """All images. Without a ``scene_box`` the bounds are sdfstudio's usual cube, unless the depths leave it."""
-    images = load_dataset(folder, given.axes == "opengl")
+    terms = replace(SDFSTUDIO, axes=given.axes or "opencv")
+    images = replace(load_dataset(folder, given.axes == "opengl"), terms=terms)
     if bounds is not None:
         return TakenImages(replace(images, bounds=bounds))
     if images.depths is None or images.masks is not None or "scene_box" in read_metadata(folder):

@@ -17,9 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from regnf_core.errors import DatasetError, FieldFormatError, RegnfError
+from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.importing.gate.gate import checked_size, confined, request_of
 from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.recording_description import RecordingDescription
 
 if TYPE_CHECKING:
     from regnf_core.importing.gate.child import ChildOutcome
@@ -38,13 +39,14 @@ def import_recording(
     """Turn an upload into ``out_dir``/field.safetensors, a stored recording, and say what it holds.
 
     upload: an archive (zip, tar, packed or not) of a folder of any layout, a bag, or a stored recording · description:
-    ``depth_unit`` (meters a step), ``layout``, ``camera_axes`` and ``intrinsics`` (as a camera's file), where the files
-    do not say. The report: kind, layout, frames (their names), left_out, size and color_size ([height, width]), bounds,
-    depth_range (m), notes, warnings.
+    of a RecordingDescription. The report: kind, layout, frames (their names), left_out, size and color_size ([height,
+    width]), bounds, depth_range (m), notes, warnings.
     Raises FieldFormatError and DatasetError with the reason, and OSError when the disk is full.
     """
+    from regnf_core.importing.upload_description import described  # of pydantic, which the process does without
+
     limits = limits or ImportLimits.of_the_machine()
-    request = request_of(description, limits, {})
+    request = request_of(described(RecordingDescription, description).non_default(), limits, {})
     return confined(__name__, [upload.resolve(strict=True)], out_dir, request, limits, _report, _MOST_FILES)
 
 
@@ -125,21 +127,21 @@ def main(arguments: list[str]) -> int:
 
 def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], limits: ImportLimits) -> dict[str, Any]:
     from regnf_data.recordings.layouts import read_layout
-    from regnf_data.recordings.recording import check_recording
+    from regnf_data.recordings.recording import Given, check_recording
     from regnf_data.recordings.stored import recording_of_frames, write_recording
 
     source = upload
     if kind in ("zip", "tar", "gzip", "bzip2", "xz"):
-        source = folder / "unpacked"
+        source = folder / "archive"
         unpack(upload, kind, source, limits.file_bytes // 2)
         source = inner_folder(source)
-    recording = read_layout(source, given_of(request["description"] or {}))
+    recording = read_layout(source, Given.of(RecordingDescription(**request["description"])))
     if len(recording) == 1:  # somebody waits for it: it is decoded once
         recording = replace(recording, frames=recording_of_frames([recording.frames[0].read()]).frames)
     warning = check_recording(recording)
     kept, bounds = _kept(recording)
     stored = write_recording(recording, kept, folder / "field.safetensors")
-    shutil.rmtree(folder / "unpacked", ignore_errors=True)
+    shutil.rmtree(folder / "archive", ignore_errors=True)
     return stored | {
         "layout": recording.layout,
         "left_out": len(recording) - len(stored["frames"]),
@@ -149,29 +151,12 @@ def _converted(upload: Path, kind: str, folder: Path, request: dict[str, Any], l
     }
 
 
-def given_of(said: dict[str, Any]) -> Any:
-    """What a description says of a recording. Raises DatasetError (INVALID_DESCRIPTION)."""
-    from regnf_data.recordings.camera import camera_of_values
-    from regnf_data.recordings.recording import Given
-
-    known = {"as", "label", "depth_unit", "layout", "camera_axes", "intrinsics"}
-    unknown = next((name for name in said if name not in known), None)
-    unit, layout, axes = said.get("depth_unit"), said.get("layout"), said.get("camera_axes")
-    plain = isinstance(unit, int | float | None) and isinstance(layout, str | None)
-    if unknown is not None or not plain or axes not in (None, "opencv", "opengl"):
-        raise DatasetError(f"the description: {unknown or 'a member of another type'}", reason="INVALID_DESCRIPTION")
-    camera = None
-    if said.get("intrinsics") is not None:
-        found = camera_of_values(said["intrinsics"], "intrinsics")
-        camera = None if found is None else found.camera
-    return Given(camera, unit, layout, axes)
-
-
 def unpack(upload: Path, kind: str, folder: Path, most: int) -> None:
     """Write an archive's files below ``folder``. Raises FieldFormatError with the ARCHIVE_* reasons."""
     with upload.open("rb") as file:
         # Closed with the last view of it: an error may hold one.
         data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    folder.mkdir()
     for name, content in _members(data, kind, most):
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -183,7 +168,7 @@ def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, byte
     from regnf_core.importing.run.tar_run import TarRun, require_modest
 
     if kind == "zip":
-        members = read_members(data, (STORED, DEFLATED), folders=True)
+        members = read_members(data, (STORED, DEFLATED), True, _MOST_FILES)
         require_modest(sum(one.size for one in members), len(data), most)
         for one in members:
             if not one.name.endswith("/"):
@@ -191,7 +176,7 @@ def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, byte
                 yield one.name, bytes(content)
                 del content
     else:
-        archive = TarRun(data, None if kind == "tar" else kind, most)
+        archive = TarRun(data, None if kind == "tar" else kind, most, _MOST_FILES)
         require_modest(sum(archive.sizes.values()), len(data), most)
         yield from archive.each()
 

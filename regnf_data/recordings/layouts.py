@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from regnf_core.errors import DatasetError, RegnfError
-from regnf_data.agreement import NO_TERMS, Terms
-from regnf_data.recordings import documents, folders
-from regnf_data.recordings.recording import Given, Recording
+from regnf_data.posed_images import NO_TERMS, Terms
+from regnf_data.recordings import documents, folders, phones
+from regnf_data.recordings.recording import DepthFile, Given, Recording
 from regnf_data.recordings.stored import is_stored, read_stored
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -37,7 +37,7 @@ class Layout:
     def recording(self, path: Path, given: Given) -> Recording:
         """That at ``path``, with cameras whose axes are those that were given."""
         try:
-            found = replace(self.read(path, given), terms=self.terms)
+            found = self.read(path, given)
         except (OSError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             if isinstance(error, RegnfError):
                 raise
@@ -49,10 +49,14 @@ class Layout:
             # Readers check what is often wrong; of the rest the reason is all that there is to say.
             said = f"{path.name} cannot be read as {self.words}: {type(error).__name__}: {error}"
             raise DatasetError(said[:400], reason="DATASET_METADATA_INVALID") from error
-        if given.axes in (None, self.terms.axes):
-            return found
+        depth = found.frames[0].depth  # the notes of one file are those of all
+        if isinstance(depth, DepthFile):
+            found = replace(found, notes=(*found.notes, *depth.notes()))
+        terms = self.terms if found.terms == NO_TERMS else found.terms  # a stored one knows those that it had
+        if given.axes in (None, terms.axes):
+            return replace(found, terms=terms)
         turned = (replace(one, T_world_camera=one.T_world_camera @ _OPENGL) for one in found.frames)
-        return replace(found, frames=tuple(turned), terms=replace(self.terms, axes=str(given.axes)))
+        return replace(found, frames=tuple(turned), terms=replace(terms, axes=str(given.axes)))
 
 
 def _bag(path: Path, given: Given) -> Recording:
@@ -66,7 +70,7 @@ def _is_bag(path: Path) -> bool:
 
 
 _BOP = Terms("cam_R_w2c and cam_t_w2c", "cam_K", "depth_scale", to_camera=True)
-_SDFSTUDIO = Terms("camtoworld in meta_data.json", "intrinsics in meta_data.json", "depth_unit_scale_factor")
+SDFSTUDIO = Terms("camtoworld in meta_data.json", "intrinsics in meta_data.json", "depth_unit_scale_factor")
 _NERFSTUDIO = Terms("transform_matrix", "fl_x, fl_y, cx, cy", "depth_unit_scale_factor", axes="opengl")
 _BAG = Terms("tf and odometry", "CameraInfo", "the images' encoding")
 _REDWOOD = Terms("the trajectory or pose graph", "camera_intrinsic.json")
@@ -75,7 +79,7 @@ LAYOUTS = (
     Layout("stored", "regnf's own", "*.safetensors", is_stored, lambda path, _: read_stored(path)),
     Layout("bop", "BOP", "scene_camera.json", documents.is_bop, documents.read_bop, _BOP),
     Layout(
-        "sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio, _SDFSTUDIO
+        "sdfstudio", "sdfstudio", "meta_data.json", documents.is_sdfstudio, documents.read_sdfstudio, SDFSTUDIO
     ),
     Layout(
         "nerfstudio", "nerfstudio", "transforms.json", documents.is_nerfstudio, documents.read_nerfstudio, _NERFSTUDIO
@@ -93,6 +97,8 @@ LAYOUTS = (
            _COLMAP),
     Layout("7scenes", "7-Scenes, 3DMatch", "*.pose.txt, *.depth.png", folders.is_seven_scenes,
            folders.read_seven_scenes, Terms("*.pose.txt", "camera-intrinsics.txt")),
+    Layout("phone", "Polycam, 3D Scanner App, Record3D", "keyframes/, frame_*.json, metadata.json and depth/",
+           phones.is_phone, phones.read_phone, Terms("the app's poses", "the app's intrinsics", axes="opengl")),
     Layout("frame", "one frame", "one depth image, intrinsics", folders.is_frame, folders.read_frame),
 )  # fmt: skip
 
@@ -125,9 +131,20 @@ def read_layout(path: str | os.PathLike[str], given: Given | None = None) -> Rec
             reason="DATASET_NOT_RECOGNIZED",
         )
     known = "; ".join(f"{layout.words}: {layout.looks_for}" for layout in LAYOUTS)
-    raise DatasetError(
-        f"{source.name} is no recording that is known. Looked for {known}", reason="DATASET_NOT_RECOGNIZED"
-    )
+    said = f"{source.name} is no recording that is known{_almost(source)}. Looked for {known}"
+    raise DatasetError(said, reason="DATASET_NOT_RECOGNIZED")
+
+
+def _almost(source: Path) -> str:
+    """What a folder has of a recording, in words."""
+    files = [p for pattern in ("[!.]*", "*/[!.]*") for p in sorted(source.glob(pattern)) if p.is_file()]
+    depths = [p for p in files if "depth" in str(p.relative_to(source)).lower()]
+    read = [p for p in depths if p.suffix.lower() in folders.DEPTHS]
+    if depths and not read:
+        return f": depth is not read from {depths[0].name}, but from {', '.join(folders.DEPTHS)}"
+    if not read:
+        return ""
+    return f": no poses were found for its {len(read)} depth images. Without poses give one of them, {read[0].name}"
 
 
 def has_layout(path: str | os.PathLike[str]) -> bool:

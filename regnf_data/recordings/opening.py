@@ -9,8 +9,9 @@ import tarfile
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
 
+from regnf_core.errors import made_folder
+from regnf_core.version import __version__
 from regnf_data.recordings.layouts import has_layout, read_layout
 from regnf_data.recordings.recording import Given, Recording
 from regnf_data.recordings.stored import read_stored
@@ -60,16 +61,12 @@ def _archive(path: Path, given: Given) -> Recording:
     from regnf_core.loading import default_cache_dir
     from regnf_data.recordings.importing import import_recording
 
-    said: dict[str, Any] = {"depth_unit": given.depth_unit, "layout": given.layout, "camera_axes": given.axes}
-    if given.camera is not None:
-        K, size = given.camera.K, given.camera.size or (None, None)
-        said["intrinsics"] = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] - 0.5, "cy": K[1, 2] - 0.5}
-        said["intrinsics"] |= {} if size[0] is None else {"height": size[0], "width": size[1]}
-    description = {name: value for name, value in said.items() if value is not None}
+    description = given.described().non_default()
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256")
-    digest.update(json.dumps(description, sort_keys=True).encode())
+    digest.update(json.dumps([__version__, description], sort_keys=True).encode())
     kept = default_cache_dir().parent / "recordings" / digest.hexdigest()[:32]
     if not (kept / "field.safetensors").is_file():
-        import_recording(path, kept, description)
+        with made_folder(kept):
+            import_recording(path, kept, description)
     return read_stored(kept / "field.safetensors", path.name)

@@ -11,11 +11,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from regnf_core.detections.images import place_of_frame
 from regnf_core.errors import DatasetError
-from regnf_data.agreement import NO_TERMS, Terms, check_views
-from regnf_data.posed_images import PosedImages
-from regnf_data.recordings.camera import Array, Camera, Size
-from regnf_data.sdfstudio import decoded, opened_image, read_depth, read_mask
+from regnf_core.importing.recording_description import RecordingDescription
+from regnf_data.agreement import check_views
+from regnf_data.posed_images import NO_TERMS, PosedImages, Terms
+from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, Size, camera_of_values
+from regnf_data.sdfstudio import ARRAYS, array_file, decoded, opened_image, read_depth, read_mask
 
 MOST_FRAMES = 100_000
 MOST_PIXELS = 1 << 25
@@ -24,6 +26,8 @@ _FARTHEST = 1e6
 """Camera positions beyond are no meters."""
 _NOT_RIGID = 0.02
 _MILLIMETER, _EIGHT_BITS = 0.001, 255.5
+_FAR, _NO_DEPTH = 100.0, 1e6
+"""Meters: what depth cameras see is nearer; numbers that renderers write for nothing are beyond."""
 _FEW = 4
 """Different depths of an image that shows but a wall."""
 
@@ -145,15 +149,11 @@ class Recording:
 
         Raises DatasetError (DATASET_FRAMES_INVALID).
         """
-        if isinstance(name, int) and 0 <= name < len(self):
-            return name
-        names = [frame.name for frame in self.frames]
-        wanted = str(name)
-        for place, known in enumerate(names):
-            if wanted in (known, Path(known).name, Path(known).stem):
-                return place
-        if wanted.isdigit() and int(wanted) < len(self):
-            return int(wanted)
+        names, wanted = [frame.name for frame in self.frames], str(name)
+        if (place := place_of_frame(names, wanted)) is not None:
+            return place
+        if len(self) == 1 and (isinstance(name, int) or Path(wanted).suffix):  # as detectors number and name images
+            return 0
         near = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         raise DatasetError(f"{self.name} has no frame {wanted[:80]!r}; it has {near}", reason="DATASET_FRAMES_INVALID")
 
@@ -163,10 +163,10 @@ class Recording:
         for index in chosen:  # a color image may be far larger than its depth image: one is held at a time
             frame = self.frames[index].read()
             frames.append(frame if frame.color is None else replace(frame, color=frame.registered(frame.color)))
-        return replace(as_posed_images(frames, bounds), T_metric_world=self.T_metric_world)
+        return replace(as_posed_images(frames, bounds, self.terms), T_metric_world=self.T_metric_world)
 
 
-def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
+def as_posed_images(frames: Sequence[Frame], bounds: Array, terms: Terms = NO_TERMS) -> PosedImages:
     """Frames as images of one size, the most common among them; gray where a frame has no color of that size. bounds:
     (2, 3), world."""
     shapes = [frame.depth.shape for frame in frames]
@@ -180,6 +180,7 @@ def as_posed_images(frames: Sequence[Frame], bounds: Array) -> PosedImages:
         T_world_camera=np.stack([frame.T_world_camera for frame in frames]),
         bounds=bounds,
         depths=np.stack([frame.depth for frame in frames]),
+        terms=terms,
     )
 
 
@@ -227,6 +228,23 @@ class Given:
     layout: str | None = None
     axes: Literal["opencv", "opengl"] | None = None
 
+    @classmethod
+    def of(cls, said: RecordingDescription) -> Given:
+        """Raises DatasetError (DATASET_INTRINSICS_INVALID)."""
+        found = None if said.intrinsics is None else camera_of_values(said.intrinsics, "intrinsics")
+        if found is None and said.intrinsics is not None:
+            raise DatasetError("the description's intrinsics hold none", reason="DATASET_INTRINSICS_INVALID")
+        unit = said.depth_unit or (found.depth_unit if found else None)
+        return cls(found.camera if found else None, unit, said.layout, said.camera_axes)
+
+    def described(self) -> RecordingDescription:
+        """The same in plain values."""
+        camera, said = self.camera, None
+        if camera is not None:
+            said = {"K": (camera.K - HALF_A_PIXEL).tolist(), "model": camera.lens, "D": list(camera.distortion)}
+            said |= {} if camera.size is None else {"height": camera.size[0], "width": camera.size[1]}
+        return RecordingDescription(self.depth_unit, self.layout, self.axes, said)
+
 
 def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[Any]]:
     ideal, found = camera.undistorted()
@@ -241,14 +259,23 @@ def _without_lens(camera: Camera, image: NDArray[Any]) -> tuple[Camera, NDArray[
 # What readers of layouts share.
 
 
-def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float32]]:
-    """Reads a depth image: whole numbers of ``unit`` meters, or numbers in meters where the file has a point."""
+@dataclass(frozen=True)
+class DepthFile:
+    """Reads a depth image: whole numbers of ``unit`` meters, or numbers in meters where the file has a point; in that
+    unit where they would be no meters. unit None: all numbers are world units."""
 
-    def read() -> NDArray[np.float32]:
-        size = checked_size(path)
-        if unit is None or not _whole_numbers(path):
-            return read_depth(path, size, unit and 1.0)
-        depth = read_depth(path, size, unit) * np.float32(unit if path.suffix.lower() == ".npy" else 1.0)
+    path: Path
+    unit: float | None
+
+    def __call__(self) -> NDArray[np.float32]:
+        path, unit, size = self.path, self.unit, checked_size(self.path)
+        if unit is None:
+            return read_depth(path, size, None)
+        if not whole_numbers(path):
+            depth = read_depth(path, size, 1.0)
+            depth[depth >= _NO_DEPTH] = 0.0
+            return depth * np.float32(unit) if no_meters(depth) else depth
+        depth = read_depth(path, size, unit) * np.float32(unit if path.suffix.lower() in ARRAYS else 1.0)
         some = np.round(depth[::4, ::4] / unit)
         spread = next((by for by in (256, 257) if not (some % by).any() and len(np.unique(some)) > _FEW), None)
         if unit <= _MILLIMETER and (spread or 0.0 < depth.max() <= _EIGHT_BITS * unit):
@@ -258,7 +285,19 @@ def depth_file(path: Path, unit: float | None) -> Callable[[], NDArray[np.float3
             )
         return depth
 
-    return read
+    def notes(self) -> list[str]:
+        """What is taken for granted of this file's numbers."""
+        if self.unit is None or whole_numbers(self.path):
+            return []
+        if not no_meters(read_depth(self.path, checked_size(self.path), 1.0)):
+            return []
+        return [f"{self.path.name}: its depths are too large for meters: steps of {self.unit:g} m are taken"]
+
+
+def no_meters(depth: NDArray[np.float32]) -> bool:
+    """Whether most depths, of those that are some, would be farther than depth cameras see."""
+    some = depth[(depth > 0.0) & (depth < _NO_DEPTH)]
+    return some.size > 0 and float(np.median(some)) > _FAR
 
 
 def color_file(path: Path) -> Callable[[], NDArray[np.uint8]]:
@@ -273,12 +312,8 @@ def mask_file(path: Path) -> NDArray[np.bool_]:
 
 def checked_size(path: Path) -> Size:
     """The size by the file's header. Raises DatasetError (DATASET_IMAGE_INVALID, DATASET_TOO_LARGE)."""
-    if path.suffix.lower() == ".npy":
-        try:
-            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
-        except (OSError, ValueError, EOFError) as error:
-            raise DatasetError(f"{path.name} cannot be read: {error}", reason="DATASET_IMAGE_INVALID") from error
-        shape = tuple(side for side in shape if side != 1)
+    if path.suffix.lower() in ARRAYS:
+        shape = tuple(side for side in array_file(path).shape if side != 1)
         if len(shape) != 2:
             raise DatasetError(f"{path.name} is no image of one channel", reason="DATASET_IMAGE_INVALID")
         size = (int(shape[0]), int(shape[1]))
@@ -290,9 +325,9 @@ def checked_size(path: Path) -> Size:
     return size
 
 
-def _whole_numbers(path: Path) -> bool:
-    if path.suffix.lower() == ".npy":
-        return bool(np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind in "iu")
+def whole_numbers(path: Path) -> bool:
+    if path.suffix.lower() in ARRAYS:
+        return bool(array_file(path).dtype.kind in "iu")
     with opened_image(path) as image:
         return bool(image.mode != "F")
 

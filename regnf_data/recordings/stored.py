@@ -1,15 +1,17 @@
 """A recording in one file of plain arrays: what a service keeps, and what is sent to it. No image is decoded from it.
 
-A safetensors file. depth: (N, H, W) int16, steps of ``depth_unit`` meters along the camera's axis, 0 where nothing was
-measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4, 4) float64, OpenCV's axes · color:
-(N, H', W', 3) uint8 and color_K: (N, 3, 3), where the frames have colors. Its metadata: an entry ``recording``, JSON.
+A safetensors file. depth: (N, H, W) int16, steps of ``depth_unit``, (N, 1) float64, meters along the camera's axis, 0
+where nothing was measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4, 4) float64, OpenCV's
+axes · color: (N, H', W', 3) uint8 and color_K: (N, 3, 3), where the frames have colors. Its metadata: an entry
+``recording``, JSON.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,13 +21,18 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import DatasetError, atomic_path
+from regnf_data.posed_images import NO_TERMS, Terms
 from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, Lens, camera_of, lens_of
-from regnf_data.recordings.recording import Frame, Recording, StoredFrame, pose_of
+from regnf_data.recordings.recording import Frame, Recording, StoredFrame, no_meters, pose_of
 
 _KEY = "recording"
 _STEPS = 32_767
 _FINEST = 1e-4
 """Meters a step of stored depths, where they reach no farther than 3.2 m; else as many as reach asks for."""
+
+
+_Sizes = tuple[tuple[int, ...], tuple[int, ...] | None]
+"""Of a depth image and of its color image: height and width."""
 
 
 def write_recording(recording: Recording, indices: Sequence[int], path: Path) -> dict[str, Any]:
@@ -35,87 +42,84 @@ def write_recording(recording: Recording, indices: Sequence[int], path: Path) ->
     What was written: frames (their names), size and color_size ([height, width]), depth_range (m).
     Raises DatasetError as the frames' readers do, and DATASET_DEPTH_MISSING.
     """
-    sizes, ends = {}, []
-    for index in indices:
-        depth = recording.frames[index].read(color=False).depth
-        sizes[index] = depth.shape
-        if (depth > 0.0).any():
-            ends.append((float(depth[depth > 0.0].min()), float(depth.max())))
-    if not ends:
-        raise DatasetError(f"{recording.name}: no frame has a measured depth", reason="DATASET_DEPTH_MISSING")
-    shape = _most_common([*sizes.values()])
-    kept = [recording.frames[index] for index in indices if sizes[index] == shape]
-    colors = [(0, 0) if one.color is None else one.color().shape[:2] for one in kept]
-    color = _most_common([*filter(any, colors)] or [None])
+    frames = [recording.frames[index] for index in indices]
+    wanted = _sizes(frames[0].read())
+    with atomic_path(path) as target:
+        while True:  # once, where all frames have the sizes of the first one
+            sizes, ends = _write_frames(recording, frames, wanted, target)
+            if not ends:
+                raise DatasetError(f"{recording.name}: no frame has a measured depth", reason="DATASET_DEPTH_MISSING")
+            shape = _most_common([depth for depth, _ in sizes])
+            common = shape, _most_common([color for _, color in sizes if color] or [None])
+            kept = [frame for frame, (depth, _) in zip(frames, sizes, strict=True) if depth == shape]
+            if common == wanted and len(kept) == len(frames):
+                break
+            frames, wanted = kept, common
     near, far = min(low for low, _ in ends), max(high for _, high in ends)
-    unit = max(_FINEST, far / _STEPS)
-    matrices: list[Array] = []
-    taken: list[Camera | None] = []
-    names = [frame.name for frame in kept]
+    names = [frame.name for frame in frames]
+    return {"frames": names, "size": wanted[0], "color_size": wanted[1], "depth_range": [near, far]}
 
-    def depths() -> Iterator[NDArray[Any]]:
-        for one in kept:
-            frame = one.read(color=False)
-            matrices.append(frame.camera.K)
-            yield np.round(frame.depth / unit).astype(np.int16)
 
-    def pictures() -> Iterator[NDArray[Any]]:
-        for one, size in zip(kept, colors, strict=True):
-            frame = one.read() if size == color else None
-            taken.append(None if frame is None else frame.color_camera)
-            yield np.zeros((*color, 3), np.uint8) if frame is None or frame.color is None else frame.color
+def _sizes(frame: Frame) -> _Sizes:
+    return frame.depth.shape, None if frame.color is None else frame.color.shape[:2]
 
-    count, first = len(kept), kept[0]
-    seen, bent = first.color_camera or first.camera, first.taken or first.camera
+
+def _write_frames(
+    recording: Recording, frames: Sequence[StoredFrame], wanted: _Sizes, path: Path
+) -> tuple[list[_Sizes], list[tuple[float, float]]]:
+    """Write those of the wanted sizes, each at its place, to a safetensors file; the sizes that all have, and the ends
+    of their depths. The format: https://github.com/huggingface/safetensors, 8 bytes of the header's length, the header,
+    the bytes."""
+    count, (shape, color) = len(frames), wanted
+    seen, bent = frames[0].color_camera or frames[0].camera, frames[0].taken or frames[0].camera
     said = {
-        "names": names,
-        "depth_unit": unit,
+        "names": [frame.name for frame in frames],
         "layout": recording.layout,
         "notes": list(recording.notes),
         "is_metric": recording.is_metric,
         "lens": [bent.lens, list(bent.distortion)],
         "color_lens": [seen.lens, list(seen.distortion)],
         "T_metric_world": None if recording.T_metric_world is None else recording.T_metric_world.tolist(),
+        "terms": asdict(recording.terms),
     }
-    arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]] = {
-        "depth": ("I16", (count, *shape), depths),
-        "K": ("F64", (count, 3, 3), lambda: iter(matrices)),
-        "T_world_camera": ("F64", (count, 4, 4), lambda: (one.T_world_camera for one in kept)),
-    }
-    if color is not None:
-        arrays["color"] = ("U8", (count, *color, 3), pictures)
-        none = np.zeros((3, 3))
-        arrays["color_K"] = ("F64", (count, 3, 3), lambda: (none if one is None else one.K for one in taken))
-    with atomic_path(path) as target:
-        _write(target, arrays, {_KEY: json.dumps(said)})
-    return {"frames": names, "size": shape, "color_size": color, "depth_range": [near, far]}
-
-
-_ITEM = {"U8": 1, "I16": 2, "F64": 8}
-
-
-def _write(
-    path: Path,
-    arrays: dict[str, tuple[str, tuple[int, ...], Callable[[], Iterator[NDArray[Any]]]]],
-    metadata: dict[str, str],
-) -> None:
-    """A safetensors file, array by array and part by part: type, shape, and what gives the parts in their order.
-
-    The format: https://github.com/huggingface/safetensors, 8 bytes of the header's length, the header, the bytes.
-    """
-    header: dict[str, Any] = {"__metadata__": metadata}
+    kinds = {"depth_unit": ("F64", (1,)), "K": ("F64", (3, 3)), "T_world_camera": ("F64", (4, 4))}
+    kinds |= {"color_K": ("F64", (3, 3)), "depth": ("I16", shape), "color": ("U8", (*(color or ()), 3))}
+    if color is None:
+        del kinds["color_K"], kinds["color"]
+    header: dict[str, Any] = {"__metadata__": {_KEY: json.dumps(said)}}
     at = 0
-    for name, (kind, shape, _) in arrays.items():
-        end = at + _ITEM[kind] * math.prod(shape)
-        header[name] = {"dtype": kind, "shape": list(shape), "data_offsets": [at, end]}
+    for name, (kind, one) in kinds.items():
+        end = at + _ITEM[kind] * count * math.prod(one)
+        header[name] = {"dtype": kind, "shape": [count, *one], "data_offsets": [at, end]}
         at = end
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
+    sizes, ends = [], []
     with path.open("wb") as file:
         file.write(len(text).to_bytes(8, "little") + text)
-        for _, _, parts in arrays.values():
-            for part in parts():
-                file.write(np.ascontiguousarray(part).tobytes())
+        file.seek(7 + len(text) + at)
+        file.write(b"\0")  # what is not written below is 0
+        for number, stored in enumerate(frames):
+            frame = stored.read()
+            sizes.append(_sizes(frame))
+            if sizes[-1][0] != shape:
+                continue
+            far = float(frame.depth.max())
+            if far > 0.0:
+                ends.append((float(frame.depth[frame.depth > 0.0].min()), far))
+            unit = max(_FINEST, far / _STEPS)
+            parts = {"depth_unit": np.array([unit]), "K": frame.camera.K, "T_world_camera": frame.T_world_camera}
+            parts["depth"] = np.round(frame.depth / unit).astype(np.int16)
+            if frame.color is not None and frame.color_camera is not None and sizes[-1][1] == color:
+                parts |= {"color_K": frame.color_camera.K, "color": frame.color}
+            for name, array in parts.items():
+                first, last = header[name]["data_offsets"]
+                file.seek(8 + len(text) + first + number * (last - first) // count)
+                file.write(np.ascontiguousarray(array).tobytes())
+    return sizes, ends
+
+
+_ITEM = {"U8": 1, "I16": 2, "F64": 8}
 
 
 def is_stored(path: Path) -> bool:
@@ -138,20 +142,24 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
         with safe_open(path, "numpy") as file:
             said = json.loads((file.metadata() or {})[_KEY])
             shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
-            K, poses = file.get_tensor("K"), file.get_tensor("T_world_camera")
+            K, poses, units = (file.get_tensor(key) for key in ("K", "T_world_camera", "depth_unit"))
             color_K = file.get_tensor("color_K") if "color_K" in shapes else None
-        names, unit = [str(one)[:200] for one in said["names"]], float(said["depth_unit"])
+        names = [str(one)[:200] for one in said["names"]]
         count, height, width = shapes["depth"]
         fits = K.shape == (count, 3, 3) and poses.shape == (count, 4, 4) and len(names) == count
         color = shapes.get("color")
         if color is not None and color_K is not None:
             fits = fits and len(color) == 4 and (color[0], color[3]) == (count, 3) and color_K.shape == (count, 3, 3)
-        if not (fits and 0.0 < unit < 1.0):
+        if not (fits and units.shape == (count, 1) and ((units > 0.0) & (units < 1.0)).all()):
             raise ValueError("its arrays do not fit together")
         colors = None if color is None or color_K is None else ((color[1], color[2]), color_K)
         metric = None if said.get("T_metric_world") is None else np.array(said["T_metric_world"], np.float64)
         lens, color_lens = (_lens_of(said.get(one, ["none", []]), path.name) for one in ("lens", "color_lens"))
         layout, notes = str(said["layout"])[:100], tuple(str(one)[:500] for one in said["notes"])
+        told = said.get("terms", {})
+        terms = Terms(**{key: type(usual)(told.get(key, usual)) for key, usual in asdict(NO_TERMS).items()})
+        if terms.axes not in ("opencv", "opengl"):
+            raise ValueError("the axes of its cameras are not known")
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         message = f"{path.name} is no recording of regnf: {error}"
         raise DatasetError(message[:300], reason="DATASET_FILE_INVALID") from error
@@ -166,20 +174,21 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
                 names[number],
                 Camera(K[number].astype(np.float64), (height, width)),
                 pose,
-                partial(_depth, path, number, unit),
+                partial(_depth, path, number, float(units[number, 0])),
                 partial(_color, path, number) if colored else None,
                 Camera(colors[1][number].astype(np.float64), colors[0], *color_lens) if colored and colors else None,
                 taken=None if lens[0] == "none" else Camera(K[number].astype(np.float64), (height, width), *lens),
             )
         )
-    return Recording(name or path.name, layout, tuple(frames), notes, metric, bool(said.get("is_metric", True)))
+    return Recording(name or path.name, layout, tuple(frames), notes, metric, bool(said.get("is_metric", True)), terms)
 
 
 def _lens_of(said: Any, name: str) -> tuple[Lens, tuple[float, ...]]:
     kind, coefficients = said
-    if kind not in ("none", "brown", "fisheye"):
+    if kind not in ("none", "brown", "fisheye", "inverse"):
         raise ValueError(f"a lens {str(kind)[:20]!r}")
-    return ("none", ()) if kind == "none" else lens_of(coefficients, kind == "fisheye", name)
+    found, numbers = ("none", ()) if kind == "none" else lens_of(coefficients, kind == "fisheye", name)
+    return "inverse" if (found, kind) == ("brown", "inverse") else found, numbers
 
 
 def _depth(path: Path, number: int, unit: float) -> NDArray[np.float32]:
@@ -232,6 +241,9 @@ def frame_of_arrays(
     whole = image.dtype.kind in "iu"
     meters = image.astype(np.float32) * np.float32((depth_unit or 0.001) if whole else (depth_unit or 1.0))
     limit = np.iinfo(image.dtype).max if whole else np.inf
+    if not whole and depth_unit is None and no_meters(meters):
+        message = f"{name}: the depths are {np.nanmedian(meters):.4g} in the median, no meters: say depth_unit"
+        raise DatasetError(message, reason="DATASET_IMAGE_INVALID")
     meters[~((meters > 0.0) & (image < limit))] = 0.0
     matrix: Array = np.array(K, np.float64)
     if matrix.shape == (4,):

@@ -66,7 +66,6 @@ class DepthSupervision:
     near: MapDistances | None = None
 
     def to(self, device: torch.device) -> DepthSupervision:
-        """The same on another device."""
         return on_device(self, device)
 
 

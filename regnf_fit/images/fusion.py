@@ -199,7 +199,6 @@ class MapDistances:
     detailed: Tensor
 
     def to(self, device: torch.device) -> MapDistances:
-        """The same on another device."""
         return on_device(self, device)
 
 

@@ -126,7 +126,6 @@ class PixelRays:
         return PixelRays(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def to(self, device: torch.device) -> PixelRays:
-        """The same rays on another device."""
         return on_device(self, device)
 
     def at(self, depths: Tensor) -> Tensor:

@@ -78,14 +78,18 @@ def recorded_scene(
         own = [one.frame for one in first]
         left = ", ".join(one.frame.name for one in shown if one not in first)
         told = (f"the detections of other frames show another thing than {left}: left out",) if left else ()
-    region = OrientedBox(box.center, box.size + 2.0 * _AROUND * box.size.max(), box.rotation)
+    region = _around(box)
     names = [frame.name for frame in own]
     others: list[Frame] = []
     if len(recording) > len(own) and len(own) < _MOST_FRAMES:
         chosen = [recording.frames[index] for index in choose_frames(recording, _MOST_FRAMES, region).indices]
         others = [frame.read(color=not own) for frame in chosen if frame.name not in names]
     frames = [*own, *others][:_MOST_FRAMES]
-    disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)))) if len(frames) > 1 else None
+    disagreement = check_agreement(as_posed_images(frames, np.zeros((2, 3)), recording.terms))
+    if disagreement is not None:  # by no convention do they show one scene: together they would show another one
+        frames, first = [own[0] if own else max(frames, key=lambda one: _shown(one, box))], first[:1]
+        box = first[0].box if first else box
+        region, disagreement = _around(box), f"{disagreement}. Only the frame {frames[0].name} is used"
     aligned = align_frames(frames, region)
     frames = list(aligned.frames)
     field = focused_field(frames, region, spread=aligned.spread, things=[one.pixels for one in first])
@@ -98,6 +102,11 @@ def recorded_scene(
     if unit in METERS and options.robust.object_unit == "auto":
         notes += (f"the object's unit is taken to be {unit}, by its size: say --object-unit, or --scale free",)
     return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), notes)
+
+
+def _around(box: OrientedBox) -> OrientedBox:
+    """The region that is seen."""
+    return OrientedBox(box.center, box.size + 2.0 * _AROUND * box.size.max(), box.rotation)
 
 
 def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:

@@ -73,7 +73,6 @@ class CameraPoses(nn.Module):
 
     @torch.no_grad()
     def corrected(self, images: PosedImages) -> PosedImages:
-        """The images with corrected poses."""
         turns, shifts = (part.double().cpu().numpy() for part in self.corrections())
         poses: NDArray[np.float64] = images.T_world_camera.copy()
         poses[:, :3, :3] = turns @ poses[:, :3, :3]
@@ -261,7 +260,6 @@ class Trainer:
         return all(bool(torch.isfinite(parameter).all()) for parameter in self.field.parameters())
 
     def step(self) -> None:
-        """One iteration."""
         share = self.options.rate_share(self.iteration)
         for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * share

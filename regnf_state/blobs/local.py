@@ -208,9 +208,6 @@ class LocalBlobStore:
             self.require()
         return found
 
-    def size(self, key: str) -> int:
-        return self.tried(lambda: self.path_of(key).stat().st_size)
-
     def list(self, prefix: str) -> Iterator[str]:
         return iter(self.tried(lambda: self._there(self._keys(prefix))))
 

@@ -276,9 +276,6 @@ class ObjectBlobStore:
             return False
         return True
 
-    def size(self, key: str) -> int:
-        return self._head(key)["size"]
-
     def _entries(self, prefix: str) -> Iterator[BlobEntry]:
         with translate_errors():
             for page in obstore.list(self.client, prefix or None, chunk_size=_PAGE):

@@ -3,8 +3,8 @@
 Keys:  regnf:job:{id}             hash: the record          regnf:jobs:created    sorted by time of creation,
                                                             also one for each owner, :{owner}
        regnf:job:{id}:events      stream                    regnf:jobs:active     set of accepted and running
-       regnf:job:{id}:gone        tombstone: the owner      regnf:jobs:waiting    sorted by time of acceptance
-       regnf:field:{sha256}       hash: the record          regnf:jobs:expiring   sorted by time of expiry
+       regnf:job:{id}:gone        tombstone: the owner      regnf:jobs:expiring   sorted by time of expiry
+       regnf:field:{sha256}       hash: the record
 """
 
 from __future__ import annotations
@@ -77,7 +77,6 @@ def _event(entry: tuple[bytes | str, dict[bytes | str, bytes | str]]) -> JobEven
 
 _CREATED = f"{PREFIX}jobs:created"
 _ACTIVE = f"{PREFIX}jobs:active"
-_WAITING = f"{PREFIX}jobs:waiting"
 _EXPIRING = f"{PREFIX}jobs:expiring"
 _EVENTS_KEPT = "1000"
 _EVENTS_KEPT_AT_END = "8"
@@ -144,10 +143,6 @@ class RecordStore(RedisLibrary):
                 for each in (_ACTIVE, owned_key(after.owner, "active"))
             ),
         ]
-        if after.status != "accepted":
-            commands.append(("ZREM", _WAITING, after.id))
-        elif before is None or before.status != "accepted":
-            commands.append(("ZADD", _WAITING, repr(after.updated), after.id))
         commands += counters.of_job(before, after)
         event = transitions.event_of(before, after)
         if event is not None:
@@ -197,7 +192,6 @@ class RecordStore(RedisLibrary):
         super()._heal(kind, name, stored, error)
         if kind is JOB and not error.newer:
             self._redis.srem(_ACTIVE, name)
-            self._redis.zrem(_WAITING, name)
 
     def owns(self, owner: str, job_id: str) -> bool:
         """Whether the owner's jobs list it, even if its record cannot be read."""
@@ -361,7 +355,7 @@ class RecordStore(RedisLibrary):
                 raise StaleAttemptError(f"a job that is {known.status} is not deleted")
             version = known.version if known is not None else 0
             commands: list[Command] = [("DEL", JOB.key(job_id), f"{JOB.key(job_id)}:events", f"{JOB.key(job_id)}:gone")]
-            indexes = [_CREATED, _WAITING, _EXPIRING]
+            indexes = [_CREATED, _EXPIRING]
             if known is not None:
                 indexes.append(_created_keys(known)[1])
                 commands += outbox.forgetting(known)
@@ -385,11 +379,6 @@ class RecordStore(RedisLibrary):
                 expired.append(job_id)
         return expired
 
-    def queue_position(self, job_id: str) -> int | None:
-        """1 for the accepted job that is next; None for a job that does not wait."""
-        rank: Any = self._redis.zrank(_WAITING, job_id)
-        return None if rank is None else int(rank) + 1
-
     def events(self, job_id: str, after: str | None) -> list[JobEvent]:
         """Events after the given id (None: from the start). Raises ValueError when ``after`` is no event id."""
         with self._redis.pipeline(transaction=False) as pipeline:
@@ -412,5 +401,5 @@ class RecordStore(RedisLibrary):
         names = sorted(map(text, self._redis.smembers(owned_key(owner_of(sha256), "active"))))
         for name, _, stored in self._fetch_in_portions(JOB, names):
             record = self._readable(JOB, name, stored)
-            if record is not None and transitions.uses_field(record, sha256):
+            if record is not None and sha256 in (*transitions.fields_of(record), *record.inputs.values()):
                 yield record.id

@@ -95,7 +95,6 @@ class Message:
 
     @classmethod
     def named(cls, name: str, line: str) -> Message:
-        """The message of this name."""
         job_id, attempt, place = name.rsplit("-", 2)
         return cls(job_id, int(attempt), int(place), line)
 
@@ -111,7 +110,6 @@ class Message:
 
     @property
     def name(self) -> str:
-        """Its name in its line."""
         return f"{self.job_id}-{self.attempt}-{self.place}"
 
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from benchmarks.robust.bent_field import BentField
 from benchmarks.robust.plain_field import PlainField
+from benchmarks.solids import BoxField
 from regnf_core import open_field
-from regnf_core.fields.composite import BoxField
 
 BOX = BoxField((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
 

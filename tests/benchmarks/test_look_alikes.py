@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from benchmarks.random_worlds.mesh import Mesh, block, together
 from benchmarks.robust.cases import Case
+from benchmarks.symmetric_errors import Symmetries
 from benchmarks.worlds.cases import WorldCase
 from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
 from benchmarks.worlds.making import WORLD
 from benchmarks.worlds.similar_objects import SIMILAR, similar_object
 from regnf_core import OrientedBox, Sim3
 from regnf_core.fields.mesh import MeshField
-from regnf_core.geometry.metrics import Symmetries
 
 T_OBJECT_MODEL = np.diag([2.0, 2.0, 2.0, 1.0])
 SEAT, CUSHION = block([0.0, 0.0, 0.2], [0.5, 0.5, 0.4]), block([0.0, 0.0, 0.55], [0.3, 0.2, 0.2])

@@ -19,9 +19,9 @@ from benchmarks.peers.judging import NO_POSE, SKIPPED, WRONG, run_one
 from benchmarks.peers.nerf2nerf import Nerf2nerf, RigidMotion, one_way_residuals
 from benchmarks.peers.registry import PEERS, Entry
 from benchmarks.robust.cases import Case
+from benchmarks.symmetric_errors import mssd
 from regnf_core import Sim3
 from regnf_core.errors import InitializationError
-from regnf_core.geometry.metrics import mssd
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from tests.core.analytic import chair, chair_box, chair_pose, seen_from
 from tests.core.robust.shapes import random_pose

@@ -33,7 +33,7 @@ def test_every_page_that_a_message_names_is_there() -> None:
     sources = [path for top in ("regnf_cli", "regnf_core", "regnf_state") for path in (ROOT / top).rglob("*.py")]
     named = {name for path in sources for name in NAMED.findall(path.read_text())}
     hinted = {name for hint in HINTS.values() for name in NAMED.findall(hint)}
-    assert {"families", "import-gate", "how-to/symmetry"} <= named | hinted
+    assert {"families", "import-gate", "how-to/library"} <= named | hinted
     assert hinted | {name for name in named if not name.startswith(("adr/", "reference/"))} <= set(pages)
 
 

@@ -18,6 +18,7 @@ from PIL import Image
 import regnf_client.fields
 from regnf_client import AsyncClient, Client, Field, ServiceError
 from regnf_core.detections.images import ImageDetection
+from regnf_core.errors import FieldFormatError
 from tests.contract.asgi import AppTransport
 from tests.contract.world import World
 from tests.frame_forms import CAMERA, COLOR, DEPTH, SIZE, stored
@@ -55,6 +56,11 @@ def test_a_folder_is_packed_and_sent_once(world: World, client: Client, tmp_path
     assert client.recordings.upload(folder).state == "ready"
     client.recordings.delete(found)
     assert client.recordings.entries() == []
+    said = {"depth_unit": 0.0002, "camera_axes": "opengl"}
+    described = [client.recordings.upload(folder, wait=False, description=said) for _ in "12"]
+    assert [one.description for one in described] == [{"as": "recording", **said}] * 2
+    with pytest.raises(FieldFormatError, match="camera_axes"):
+        client.recordings.upload(folder, description={"camera_axes": "unity"})
 
 
 def test_a_large_file_goes_in_pieces(

@@ -9,7 +9,6 @@ from typing import Any
 import httpx
 import pytest
 
-from regnf_core.importing.gate.report import OF_THE_CIRCUMSTANCES
 from regnf_state.ownership import reference_of
 from regnf_state.reasons import problem_document
 from regnf_state.records import FieldRecord
@@ -130,7 +129,8 @@ def test_bytes_that_were_rejected_are_not_imported_again(shared: Callable[..., W
     ("reason", "seconds"),
     [
         ("FIELD_SHAPES_MISMATCH", 86400),
-        *((reason, None) for reason in sorted(OF_THE_CIRCUMSTANCES)),
+        ("IMPORT_TOO_COSTLY", None),
+        ("STORAGE_FULL", None),
         ("OUT_OF_MEMORY", None),
         ("WORKER_LOST", None),
         ("INTERNAL", None),

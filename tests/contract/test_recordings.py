@@ -69,6 +69,28 @@ def test_files_are_taken_as_they_are_and_have_a_label(world: World) -> None:
     assert world.client.get("/fields").json()["fields"] == []
 
 
+SAID = {"depth_unit": 0.0002, "layout": "tum", "camera_axes": "opengl", "intrinsics": {"K": [9, 9, 8, 6]}}
+
+
+def described(**said: Any) -> dict[str, Any]:
+    return {"description": (None, json.dumps(said).encode())}
+
+
+def test_a_description_comes_with_a_file_its_pieces_or_a_frame(world: World) -> None:
+    file = {"file": ("kitchen.zip", FOLDER)}
+    for parts, status in ((frame_parts(), 201), (file, 201), ({"upload": (None, sha256(FOLDER))}, 200)):
+        answer = world.client.post("/recordings", files=parts | described(**SAID))
+        assert (answer.status_code, answer.json()["description"]) == (status, {"as": "recording", **SAID}), answer.text
+    assert world.client.post("/recordings", content=FOLDER).status_code == 200  # nothing is said
+    other = world.client.post("/recordings", files=file | described(depth_unit=0.001))
+    assert_refused(other, 409, "FIELD_DESCRIPTION_DIFFERS")
+    before = set(world.blobs.blobs)
+    for said in ({"depth_unit": 2.0}, {"camera_axes": "unity"}, {"intrinsics": [9, 9, 8, 6]}, {"as": "field"}):
+        answer = world.client.post("/recordings", files={"file": ("f", archive(a_bin=b"1"))} | described(**said))
+        assert_refused(answer, 422, "INVALID_DESCRIPTION")
+        assert set(world.blobs.blobs) == before, said
+
+
 BAD_FRAMES: list[tuple[dict[str, Any], int, str]] = [
     ({"depth": None}, 400, "MALFORMED_MULTIPART"),
     ({"camera": None}, 400, "MALFORMED_MULTIPART"),
@@ -312,7 +334,9 @@ def test_one_body_is_refused_whole(world: World) -> None:
     assert set(world.blobs.blobs) == before
 
 
-def test_a_large_recording_comes_in_pieces(world: World) -> None:
+def test_a_large_recording_comes_in_pieces(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, size in (("uploads._BLOCK_BYTES", 600), ("uploads.HEAD_BYTES", 500), ("piecewise.HEAD_BYTES", 500)):
+        monkeypatch.setattr(f"regnf_service.fields.{name}", size)  # a piece is written in several blocks
     data = b"\x89MCAP0\r\n" + bytes(3000)
     name = sha256(data)
     for first, last in ((0, 1999), (2000, len(data) - 1)):

@@ -20,11 +20,13 @@ BOUNDS = np.array([[-RADIUS] * 3, [RADIUS] * 3])
 METERS = RegistrationOptions.from_dict({"robust": {"object_unit": "m"}})
 
 
-def recording_of_turns(angles: list[float], read: list[str] | None = None) -> tuple[Recording, list[Any]]:
+def recording_of_turns(
+    angles: list[float], read: list[str] | None = None, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+) -> tuple[Recording, list[Any]]:
     """Frames from around the ball, and the mask of the ball in each."""
     frames, masks = [], []
     for number, angle in enumerate(angles):
-        T = about(CENTER, turned([0.0, 1.0, 0.0], angle), np.zeros(3))
+        T = about(CENTER, turned(axis, angle), np.zeros(3))
         rng = np.random.default_rng(number)
         depth = depth_from(T, "ball on a table", rng)
         masks.append(np.abs(depth - depth_from(T, "table", rng)) > 0.03)
@@ -74,3 +76,13 @@ def test_frames_that_look_elsewhere_are_not_read() -> None:
     chosen = choose_frames(Recording("more", "made", (*away, *recording.frames)), 8, REGION)
     assert set(read) == {"0", "1", "2", "3"}
     assert min(chosen.indices) >= len(away)
+
+
+def test_frames_that_show_no_common_scene_are_not_put_together() -> None:
+    """As of files without poses, whose frames all are where the first camera was."""
+    recording, masks = recording_of_turns([0.0, -15.0, -30.0, -45.0], axis=(1.0, 0.0, 0.0))
+    same = tuple(StoredFrame(one.name, CAMERA, np.eye(4), one.depth) for one in recording.frames)
+    found = recorded_scene(Recording("one place", "made", same), told(masks[:1], ()), BOUNDS, METERS)
+    assert found.frames == ("0",)
+    assert any("Only the frame 0 is used" in note for note in found.notes)
+    np.testing.assert_allclose(found.box.center.numpy()[2], 1.0, atol=0.3)

@@ -42,16 +42,6 @@ def test_the_cap_holds_under_concurrent_requests(store: RecordStore) -> None:
     assert len(store.active_jobs()) == 5
 
 
-def test_queue_positions_follow_acceptance(store: RecordStore) -> None:
-    for name in ("a", "b", "c"):
-        store.create_job(job(store, name), 10)
-    assert [store.queue_position(name) for name in "abc"] == [1, 2, 3]
-    store.update_job("a", 1, status="running")
-    assert [store.queue_position(name) for name in "abc"] == [None, 1, 2]
-    store.requeue_job("a", 1)
-    assert [store.queue_position(name) for name in "abc"] == [3, 1, 2]
-
-
 def test_listing_pages_through_every_job_once(store: RecordStore) -> None:
     times = [5.0, 5.0, 7.0, 5.0, 6.0]
     for number, created in enumerate(times):
@@ -178,7 +168,6 @@ def test_finished_jobs_expire_and_leave_a_tombstone(redis_url: str) -> None:
             b"regnf:counters",
             b"regnf:owners",
             b"regnf:jobs:active",
-            b"regnf:jobs:waiting",
         }
 
 

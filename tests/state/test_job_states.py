@@ -43,7 +43,6 @@ def test_a_job_without_result_is_started_anew(store: RecordStore, status: str) -
     assert (again.status, again.attempt, again.error, again.progress) == ("accepted", 2, None, 0.0)
     assert (again.finished, again.started, again.cancel_requested) == (None, None, False)
     assert again.created == before.created
-    assert store.queue_position("j1") == 1
     assert store.update_job("j1", 2, status="running").attempt == 2
 
 
@@ -115,7 +114,6 @@ def test_unknown_jobs(store: RecordStore) -> None:
     assert store.get_job("j9") is None
     assert store.request_cancel("j9") is None
     assert not store.delete_job("j9")
-    assert store.queue_position("j9") is None
     assert not store.job_expired("j9")
     assert store.events("j9", None) == []
     with pytest.raises(StaleAttemptError):
@@ -134,7 +132,6 @@ def test_a_requeued_job_fences_off_its_older_attempt(store: RecordStore) -> None
             write("j1", 1)
     with pytest.raises(StaleAttemptError):
         store.update_job("j1", 1, status="successful")
-    assert store.queue_position("j1") == 1
 
 
 def test_work_given_back_in_good_order_does_not_count_as_lost(store: RecordStore) -> None:
@@ -158,7 +155,6 @@ def test_cancelling(store: RecordStore) -> None:
     dismissed = store.request_cancel("waiting")
     assert dismissed is not None
     assert (dismissed.status, dismissed.cancel_requested) == ("dismissed", True)
-    assert store.queue_position("waiting") is None
     started(store, "running")
     asked = store.request_cancel("running")
     assert asked is not None

@@ -23,7 +23,7 @@ from regnf_worker.engine import Engine, core_importer
 from regnf_worker.imports import run_import_attempt
 from regnf_worker.models import Context
 from regnf_worker.recorded import place_of
-from tests.frame_forms import CAMERA, COLOR, DEPTH, MASK, SIZE, archive, png
+from tests.frame_forms import CAMERA, COLOR, DEPTH, SIZE, archive, png
 from tests.frames import K, Shot, error_m, shots, write_model
 from tests.requests import registration_request
 from tests.worker.doubles import SHA
@@ -53,7 +53,8 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
     record = imported(context, frame())
     assert (record.state, record.views, record.report["kind"]) == ("ready", "none", "recording"), record.error
     assert list(context.blobs.list("")) == [f"fields/{SHA}/{name}" for name in ("field.safetensors", "report.json")]
-    assert record.kept_bytes == context.blobs.size(f"fields/{SHA}/field.safetensors")
+    sizes = {entry.key: entry.bytes for entry in context.blobs.entries("")}
+    assert record.kept_bytes == sizes[f"fields/{SHA}/field.safetensors"]
     assert context.records.undrawn_fields() == []
     moved = [[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     far = frame(png(np.full(SIZE, 9000, np.uint16)), T_world_camera=moved)
@@ -68,16 +69,28 @@ def test_a_recording_is_imported_as_a_field_is_and_gets_frames(context: Context)
         assert held.frames[1].T_world_camera.tolist() == moved
 
 
+def test_what_is_said_of_a_recording_goes_before_its_files(context: Context) -> None:
+    said = {"depth_unit": 0.002, "layout": "frame", "camera_axes": "opengl", "intrinsics": {"K": [16, 16, 8, 6]}}
+    record = imported(context, frame(), **said)
+    assert record.state == "ready", record.error
+    with context.blobs.local_copy(f"fields/{SHA}/field.safetensors") as path:
+        (held,) = read_stored(path).frames
+        assert held.read().depth.max() == pytest.approx(1.6, abs=1e-3)
+        assert (held.camera.K[0, 0], held.T_world_camera[1, 1]) == (16.0, -1.0)
+
+
 @pytest.mark.parametrize(
     ("said", "data", "reason"),
     [
+        ({"intrinsics": {"nothing": 1}}, frame(), "DATASET_INTRINSICS_INVALID"),
+        ({"layout": "none such"}, frame(), "DATASET_NOT_RECOGNIZED"),
         ({"after": SHA, "frame": "depth"}, frame(), "DATASET_FRAMES_INVALID"),
         ({"after": SHA, "frame": "left"}, frame(png(np.full((24, 32), 700, np.uint16))), "DATASET_SIZES_DIFFER"),
         ({"after": "c" * 64, "frame": "left"}, frame(), "FIELD_NOT_FOUND"),
         ({}, frame(png(np.zeros(SIZE, np.uint16))), "DATASET_DEPTH_MISSING"),
         ({}, frame(cx=900.0), "DATASET_INTRINSICS_INVALID"),
         ({}, frame(depth_unit=1e9), "DATASET_INTRINSICS_INVALID"),
-        ({}, frame(depth_unit="mm"), "DATASET_INTRINSICS_INVALID"),
+        ({}, frame(depth_unit="feet"), "DATASET_INTRINSICS_INVALID"),
         ({}, frame(T_world_camera=np.diag([1, 1, -1, 1]).tolist()), "DATASET_POSE_NOT_RIGID"),
         ({}, frame()[:300], "FILE_TRUNCATED"),
         ({}, archive(notes_txt=b"nothing"), "DATASET_NOT_RECOGNIZED"),
@@ -140,7 +153,11 @@ def empty() -> str:
 @pytest.mark.parametrize(
     ("detection", "reason", "told"),
     [
-        ({"mask": base64.b64encode(MASK).decode()}, "INVALID_DETECTION", "frame a: the mask has 16 x 12 pixels"),
+        (
+            {"mask": base64.b64encode(png(np.eye(9, 16) > 0)).decode()},
+            "INVALID_DETECTION",
+            "the mask has 16 x 9 pixels",
+        ),
         ({"mask": empty(), "frame": "b"}, "INVALID_DETECTION", "frame b: the mask is empty"),
         ({"mask": {"size": [180, 240], "counts": [100, 5]}}, "INVALID_DETECTION", "runs have 105 pixels"),
         ({"mask": {"size": [180, 240], "counts": "QQQ"}}, "INVALID_DETECTION", "run lengths"),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from regnf_core.library_folder import digest_of
 from regnf_state.blobs.base import BlobStore
 from regnf_state.manifest import EDITED_FIELD, Artifact, Manifest, artifact_key, manifest_key, read_result
 from regnf_state.ownership import reference_of
@@ -35,8 +36,7 @@ def keep_edited_field(context: Context, owner: str, manifest: Manifest) -> None:
         if known is not None and known.state != "rejected":
             return
         with context.blobs.open(manifest.key(EDITED_FIELD)) as source, context.blobs.writer() as writer:
-            while chunk := source.read(_CHUNK_BYTES):
-                writer.write(chunk)
+            shutil.copyfileobj(source, writer, _CHUNK_BYTES)
             writer.commit(original_key(reference))
         _import(context, reference, artifact.bytes)
     except (FileNotFoundError, UnreadableRecordError) as error:
@@ -98,10 +98,7 @@ def discard_others(blobs: BlobStore, manifest: Manifest) -> None:
 
 
 def _store(blobs: BlobStore, key: str, path: Path) -> Artifact:
-    digest = hashlib.sha256()
     with path.open("rb") as source, blobs.writer() as writer:
-        while chunk := source.read(_CHUNK_BYTES):
-            digest.update(chunk)
-            writer.write(chunk)
+        shutil.copyfileobj(source, writer, _CHUNK_BYTES)
         writer.commit(key)
-    return Artifact(path.name, path.stat().st_size, digest.hexdigest())
+    return Artifact(path.name, path.stat().st_size, digest_of(path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from regnf_core import __version__
 from regnf_core.field_notes import NO_NOTES, FieldNotes
 from regnf_core.importing.gate.gate import ImportLimits, import_field
+from regnf_core.library_folder import digest_of
 from regnf_core.options import RegistrationOptions
 from regnf_core.rendering.request import RenderRequest
 from regnf_core.version import ENGINE_REVISION
@@ -225,9 +225,12 @@ def core_importer(limits: ImportLimits) -> Importer:
         if description.get("as") == RECORDING:
             from regnf_data.recordings.importing import import_recording
 
-            return import_recording(upload, folder, {"as": RECORDING}, limits)
-        said = description or None
-        report = import_field(upload, folder, said, limits, settings=settings, cameras=cameras, ask_by_picture=True)
+            of_record = ("as", "after", "frame")
+            said = {name: value for name, value in description.items() if name not in of_record}
+            return import_recording(upload, folder, said, limits)
+        report = import_field(
+            upload, folder, description or None, limits, settings=settings, cameras=cameras, ask_by_picture=True
+        )
         return report.to_dict()
 
     return run
@@ -244,7 +247,7 @@ def write_result(folder: Path, request: RenderRequest, report: RenderReport, eng
         "size": list(request.image_size),
         "depth_unit": report.depth_unit,
         "seconds": report.seconds,
-        "field": _digest(folder / EDITED_FIELD) if EDITED_FIELD in names else None,
+        "field": digest_of(folder / EDITED_FIELD) if EDITED_FIELD in names else None,
         "seed": request.seed,
         "options": asdict(request.options),
         "engine": engine,
@@ -252,8 +255,3 @@ def write_result(folder: Path, request: RenderRequest, report: RenderReport, eng
     }
     (folder / "result.json").write_text(json.dumps(document), encoding="utf-8")
     return [*names, "result.json"]
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -150,8 +150,7 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
         _require_current(context, field)
         delete_all_but_upload(context.blobs, field)  # an object's model, of what the field was before
         with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
-            while chunk := source.read(1 << 20):
-                writer.write(chunk)
+            shutil.copyfileobj(source, writer, 1 << 20)
             writer.commit(f"fields/{sha256}/field.safetensors")
     context.blobs.put(_report(sha256), json.dumps({"description": description, "report": report}).encode())
     return report

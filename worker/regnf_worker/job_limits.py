@@ -76,7 +76,7 @@ class JobLimits:
 
 def granted_memory(own_group: Path = Path("/proc/self/cgroup"), groups: Path = _GROUPS) -> int:
     """Bytes of memory that this machine has, or that a control group of this process may use, whichever is least."""
-    found = [_machine_memory()]
+    found = [_KIB * _kib_of(Path("/proc/meminfo"), ("MemTotal:",)) or 1 << 62]
     for path in (*_group_limits(own_group, groups), _LIMIT_OF_VERSION_1):
         with suppress(OSError, ValueError):
             found.append(int(path.read_text()))  # "max" without a limit
@@ -132,10 +132,6 @@ def _kib_of(path: Path, names: tuple[str, ...]) -> int:
             name, *value = line.split()
             total += int(value[0]) if name in names else 0
     return total
-
-
-def _machine_memory() -> int:
-    return _KIB * _kib_of(Path("/proc/meminfo"), ("MemTotal:",)) or 1 << 62
 
 
 def _limit(kind: int, soft: int, hard: int) -> None:

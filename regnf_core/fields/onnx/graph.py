@@ -234,7 +234,9 @@ def _fault(where: str, error: Exception) -> Exception:
 
 def build_onnx(description: OnnxDescription, tensors: Mapping[str, Tensor]) -> FunctionField[OnnxFunction]:
     """The field of ``description`` with its weights in ``tensors``. What no point changes is computed here, once."""
-    known: dict[str, Tensor | None] = {name: _in_our_type(tensor) for name, tensor in tensors.items()}
+    known: dict[str, Tensor | None] = {
+        name: tensor.float() if tensor.is_floating_point() else tensor.long() for name, tensor in tensors.items()
+    }
     for name, constant in description.constants.items():
         if math.prod(constant.shape) != len(constant.values):
             raise FieldFormatError(
@@ -262,7 +264,3 @@ def build_onnx(description: OnnxDescription, tensors: Mapping[str, Tensor]) -> F
     function = OnnxFunction(tuple(steps), settled, description.input, description.output, description.batch)
     bounds = torch.tensor(description.function_bounds, dtype=torch.float64)
     return FunctionField(function, bounds, chunk=max(description.batch, 1 << 12))
-
-
-def _in_our_type(tensor: Tensor) -> Tensor:
-    return tensor.float() if tensor.is_floating_point() else tensor.long()

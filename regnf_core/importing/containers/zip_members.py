@@ -220,7 +220,9 @@ class Member:
             raise faulty
 
 
-def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders: bool = False) -> list[Member]:
+def read_members(
+    data: memoryview, methods: Collection[int] = (STORED,), folders: bool = False, most: int = MAX_ENTRIES
+) -> list[Member]:
     """Check the structure of the zip file ``data`` and list its entries in the order in which they lie.
 
     ``methods`` are the ways of compression that are allowed. folders: take empty entries for folders too, whose names
@@ -230,7 +232,7 @@ def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders
     """
     _check_ends(data)
     directory = _directory_end(data)
-    return _tile(data, _central_headers(data, directory, methods), directory[0], folders)
+    return _tile(data, _central_headers(data, directory, methods, most), directory[0], folders)
 
 
 def _check_ends(data: memoryview) -> None:
@@ -247,10 +249,10 @@ def _check_ends(data: memoryview) -> None:
     raise FieldFormatError("the archive's end is missing: the file was cut short", reason="FILE_TRUNCATED")
 
 
-def _central_headers(data: memoryview, directory: _Directory, methods: Collection[int]) -> list[Header]:
+def _central_headers(data: memoryview, directory: _Directory, methods: Collection[int], most: int) -> list[Header]:
     at, end, count = directory
-    if not 0 < count <= MAX_ENTRIES:
-        raise malformed(f"{count} entries; at most {MAX_ENTRIES} are read", "ARCHIVE_TOO_MANY_ENTRIES")
+    if not 0 < count <= most:
+        raise malformed(f"{count} entries; at most {most} are read", "ARCHIVE_TOO_MANY_ENTRIES")
     headers = []
     for _ in range(count):
         header = _central_header(data, at, end)

@@ -129,14 +129,9 @@ def space_readings(
         others = tuple(itertools.islice(entry.grid.stride_variants(), _MAX_STRIDES)) if entry.tier == 0 else ()
         for reading in grid_readings(table, (entry.grid, *others), layers, entries):
             tier = entry.tier + (reading.description["hash"]["strides"] is not None)
-            said = replace(reading, say={"hash": entry.said}, tier=tier, scale=finest_of(entry.grid))
+            said = replace(reading, say={"hash": entry.said}, tier=tier, scale=math.log(entry.grid.scales()[-1] + 1.0))
             readings.append(replace(said, interpolation=interpolation))
     return most_usual(readings)
-
-
-def finest_of(grid: HashGridConfig) -> float:
-    """Natural logarithm of the finest level's resolution."""
-    return math.log(grid.scales()[-1] + 1.0)
 
 
 def most_usual(readings: Sequence[Reading]) -> tuple[Reading, ...]:

@@ -180,12 +180,8 @@ def _with_relu(reading: Reading) -> Reading:
     return with_hidden_factor(reading, reading.tensors[f"layers.{last}.weight"].shape[1], 1.0 / _SHARPER)
 
 
-def _as_it_is(reading: Reading) -> Reading:
-    return reading
-
-
 _ACTIVATIONS = (
-    Variant("softplus between the layers", {"activation": "softplus"}, _as_it_is),
+    Variant("softplus between the layers", {"activation": "softplus"}, lambda reading: reading),
     Variant("ReLU between the layers", {"activation": "relu"}, _with_relu),
 )
 

@@ -38,23 +38,17 @@ _SHARED = frozenset(
 """Entries that mean something for every family."""
 
 
-def shared_entries(
-    overrides: UploadDescription,
-    bounds: Sequence[Sequence[float]],
-    world_scale: float = 1.0,
-    sign: int = 1,
-) -> dict[str, Any]:
+def shared_entries(overrides: UploadDescription, bounds: Sequence[Sequence[float]]) -> dict[str, Any]:
     """The entries of a safe field's description that all kinds share.
 
-    bounds: lowest and highest corner in the coordinates of the checkpoint's function · world_scale: length of one unit
-    of those coordinates in the family's own unit · sign: -1 where the family's functions are negative in free space.
-    What ``overrides`` says goes before.
+    bounds: lowest and highest corner in the coordinates of the checkpoint's function. What ``overrides`` says goes
+    before.
     """
-    scale = world_scale * (overrides.world_scale or 1.0)
+    scale = overrides.world_scale or 1.0
     return {
         "bounds": overrides.bounds or [[scale * value for value in corner] for corner in bounds],
         "world_scale": scale,
-        "sign": overrides.sign or sign,
+        "sign": overrides.sign or 1,
         "up_axis": overrides.up_axis,
         "label": overrides.label,
     }

@@ -125,7 +125,6 @@ def network_reading(family: str, network: Network, form: Form, entries: Mapping[
 def network_field(
     network: Network, form: Form, family: str, entries: Mapping[str, Any], why: tuple[str, ...]
 ) -> ConvertedField:
-    """The field of one form."""
     reading = network_reading(family, network, form, entries)
     return ConvertedField(family, why, reading.description, reading.tensors)
 

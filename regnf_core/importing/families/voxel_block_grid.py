@@ -152,7 +152,6 @@ def _distances(
 
 
 def _attribute(arrays: ArraySource, name: str) -> str:
-    """The array that holds the attribute ``name``."""
     number = _one(arrays, f"attr_name_{name}")
     text = f"{number:g}"
     if not _INDEX.fullmatch(text):

@@ -81,17 +81,6 @@ _WORDS_OF_THE_FILE = """
 """
 OF_THE_FILE = frozenset(_WORDS_OF_THE_FILE.split())
 """Reasons that follow from the bytes and what was said of them: the same upload ends so again, whenever it is tried."""
-OF_THE_CIRCUMSTANCES = frozenset(
-    {
-        "IMPORT_CRASHED",
-        "IMPORT_OUTPUT_TOO_LARGE",
-        "IMPORT_OUT_OF_MEMORY",
-        "IMPORT_TIMEOUT",
-        "IMPORT_TOO_COSTLY",
-        "STORAGE_FULL",
-    }
-)
-"""Reasons in which a limit, a setting or the machine's load has a part: tried again, the same upload may be taken."""
 
 
 @dataclass(frozen=True)

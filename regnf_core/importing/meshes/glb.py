@@ -30,6 +30,7 @@ from regnf_core.importing.meshes.triangle_files import (
     unsupported,
     within_unit,
 )
+from regnf_core.rotations import rotation_rows
 
 # The numbers: accessors into buffers, every extent checked first. A buffer is the file's own binary chunk, text within
 # the document, or a file that came with it. None is ever looked for.
@@ -309,12 +310,7 @@ def _rotations(quaternions: npt.NDArray[np.float64]) -> Float64Array:
     if not (square > 0.0).all():
         raise malformed("a glTF node or instance turned by no rotation")
     x, y, z, w = (quaternions / np.sqrt(square)[:, None]).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+    return np.array(rotation_rows(x, y, z, w)).transpose(2, 0, 1)
 
 
 _HEADER, _CHUNK_HEADER = 12, 8

@@ -24,6 +24,7 @@ from regnf_core.importing.observing.trajectory import (
 )
 from regnf_core.importing.settings.facts import is_similarity
 from regnf_core.importing.settings.keys import MAX_NUMBER_CHARACTERS, Keys, decoded, looks_like_json, read_json
+from regnf_core.rotations import rotation_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -171,9 +172,7 @@ def read_tum(name: str, data: bytes | memoryview) -> Array | None:
         x, y, z, w = (values[:, 4:] / length).T
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, 3] = values[:, 1:4]
-    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1)
-    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1)
-    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1)
+    poses[:, :3, :3] = np.array(rotation_rows(x, y, z, w)).transpose(2, 0, 1)
     return poses
 
 

@@ -18,7 +18,6 @@ _MAX_LINE_BYTES = 512
 
 
 def pickle_error(message: str, reason: str = "PICKLE_MALFORMED") -> FieldFormatError:
-    """The error for a fault in the pickle."""
     return FieldFormatError(message, reason=reason)
 
 
@@ -52,7 +51,6 @@ class PickleStream:
         return int.from_bytes(self.take(size), "little", signed=True)
 
     def blob(self, length_size: int) -> bytes:
-        """Bytes behind a length of ``length_size`` bytes."""
         length = self.unsigned(length_size)
         if length > MAX_STRING_BYTES:
             raise pickle_error(f"a string of {length} bytes", "PICKLE_STRING_TOO_LARGE")

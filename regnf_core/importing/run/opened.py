@@ -144,7 +144,7 @@ def choose_settings(names: Collection[str], checkpoint: str) -> tuple[str, ...]:
     known = [name for name in names if name != checkpoint]
     chosen: dict[str, str] = {}
     for folder in list(here.parents)[:_LEVELS]:
-        for pattern in run_patterns(here.stem):
+        for pattern in (*RUN_FILES, f"LatentCodes/{here.stem}.pth"):
             for name in sorted(known):
                 path = PurePosixPath(name)
                 if path.is_relative_to(folder) and _fits(path.relative_to(folder), pattern):
@@ -157,11 +157,6 @@ def choose_settings(names: Collection[str], checkpoint: str) -> tuple[str, ...]:
     if len(scales) == 1:
         chosen.setdefault("normalization", scales[0])
     return tuple(chosen.values())[:MAX_FILES]
-
-
-def run_patterns(stem: str) -> tuple[str, ...]:
-    """Where the settings of the checkpoint of the name ``stem`` lie, below one of its folders."""
-    return (*RUN_FILES, f"LatentCodes/{stem}.pth")
 
 
 def _fits(path: PurePosixPath, pattern: str) -> bool:

@@ -168,8 +168,8 @@ class TarRun:
     Raises FieldFormatError: FILE_TRUNCATED, LEGACY_TORCH_FILE and the ARCHIVE_* reasons of docs/import-gate.md.
     """
 
-    def __init__(self, data: memoryview, packing: str | None, most: int) -> None:
-        self._data, self._packing, self._most = data, packing, most
+    def __init__(self, data: memoryview, packing: str | None, most: int, members: int = _MAX_MEMBERS) -> None:
+        self._data, self._packing, self._most, self._most_members = data, packing, most, members
         self.sizes: dict[str, int] = {}
         """Each member's size in bytes."""
         for name, size, _ in self._members():
@@ -203,8 +203,8 @@ class TarRun:
         try:
             archive = tarfile.TarFile(fileobj=stream, encoding="utf-8", errors="strict")  # type: ignore[arg-type]
             for number, member in enumerate(archive):
-                if number >= _MAX_MEMBERS:
-                    raise archive_error(f"more than {_MAX_MEMBERS} members", "ARCHIVE_TOO_MANY_ENTRIES")
+                if number >= self._most_members:
+                    raise archive_error(f"more than {self._most_members} members", "ARCHIVE_TOO_MANY_ENTRIES")
                 name = _checked_name(member)
                 if not member.isdir():
                     yield name, member.size, stream

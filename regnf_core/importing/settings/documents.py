@@ -300,7 +300,6 @@ class Documents:
     """Files of torch.save beside the settings: latent codes."""
 
     def named(self, name: str) -> Keys | None:
-        """The text of this name, if it is there."""
         return next((keys for keys in self.keys if keys.file == name), None)
 
     def mappings(self) -> Iterator[Keys]:

@@ -86,7 +86,6 @@ class Keys:
         return self.tree.tag if isinstance(self.tree, Tagged) else ""
 
     def below(self, path: str) -> Keys:
-        """The part at ``path``."""
         return Keys(self.file, self.find(path), f"{self.at}{path}.")
 
     def has(self, path: str) -> bool:

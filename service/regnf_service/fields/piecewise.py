@@ -35,7 +35,9 @@ class PieceUpload(Upload):
         self._recognized = piece.first != 0 or piece.length < HEAD_BYTES
 
     def _recognize(self) -> None:
-        if not self._pending.startswith(RECORDINGS):  # which become recordings
+        if self._pending.startswith(RECORDINGS):
+            self._recognized = True
+        else:
             super()._recognize()
 
 

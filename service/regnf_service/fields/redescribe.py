@@ -62,17 +62,12 @@ def _import_anew(services: Services, known: FieldRecord, function: dict[str, Any
         raise Problem("CONFLICT") from error
     try:
         _require_unused(services, field)
-        _require_bytes_of(services, field)
+        if not services.blobs.exists(original_key(field.sha256)):  # they may have been let go of in between
+            raise Problem("FIELD_BYTES_GONE")
     except Problem:
         services.records.undo_reimport(known, field.attempt)
         raise
     services.queue.enqueue_import(field.sha256, field.attempt)
-
-
-def _require_bytes_of(services: Services, field: FieldRecord) -> None:
-    """They may have been let go of in between."""
-    if not services.blobs.exists(original_key(field.sha256)):
-        raise Problem("FIELD_BYTES_GONE")
 
 
 # The mesh and the picture of a field: a worker makes them when it has time, first those that somebody asks for.

@@ -7,7 +7,6 @@ such an address its own.
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from regnf_service.http.problems import problem_response
 from regnf_service.problem import Problem
-from regnf_state.settings import Settings
+from regnf_state.settings import Settings, address_of
 
 _NAME = r"[a-z0-9_](?:[a-z0-9_-]{0,62})(?:\.[a-z0-9_](?:[a-z0-9_-]{0,62}))*"
 _AUTHORITY = re.compile(rf"(?P<host>{_NAME}|\[[0-9a-f:.]{{2,45}}\])(?::(?P<port>[0-9]{{1,5}}))?")
@@ -65,15 +64,6 @@ def parse_origin(text: str) -> Authority | None:
     if match is None or site is None:
         return None
     return Authority(site.host, None) if site.port == _DEFAULT_PORTS[match["scheme"]] else site
-
-
-def address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """The IP address that ``host`` is, an IPv4 address inside of IPv6 unpacked, no zone; None for a name."""
-    try:
-        address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return None
-    return getattr(address, "ipv4_mapped", None) or address
 
 
 class AllowedHosts:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 import re
 import time
@@ -21,6 +20,7 @@ from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
+from regnf_state.settings import address_of
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -105,12 +105,8 @@ def is_open(scope: Scope) -> bool:
 
 
 def _came_from_outside(scope: Scope) -> bool:
-    try:
-        address = ipaddress.ip_address((scope.get("server") or ("",))[0] or "")
-    except ValueError:
-        return False
-    mapped = getattr(address, "ipv4_mapped", None)
-    return not (mapped or address).is_loopback
+    address = address_of((scope.get("server") or ("",))[0] or "")
+    return address is not None and not address.is_loopback
 
 
 class TokenGate:

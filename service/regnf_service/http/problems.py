@@ -71,6 +71,7 @@ SECURITY_HEADERS = {**_FIXED, **_UNLESS_SAID}
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
+_PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.-]{1,200}")
 _RECORDS_FULL = "The record store keeps its last room for what goes on. Delete jobs, or retry later."
 _STATUS_REASONS = {401: "UNAUTHENTICATED", 404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: "REQUEST_TOO_LARGE"}
 
@@ -128,15 +129,11 @@ def problem_response(problem: Problem, scope: Mapping[str, Any]) -> JSONResponse
         headers["X-Request-ID"] = request_id
     if any(name == b"expect" for name, _ in scope.get("headers", ())):
         headers["Connection"] = "close"  # nobody knows whether the body still comes
-    instance = json_instance(scope.get("path", ""))
+    path = scope.get("path", "")
+    instance = path if _PLAIN_PATH.fullmatch(path) else None  # never an echo of anything odd or long
     return JSONResponse(
         problem.document(instance, request_id), status_code=problem.status, headers=headers, media_type=MEDIA_TYPE
     )
-
-
-def json_instance(path: str) -> str | None:
-    """The request's path when it is made of plain characters; never an echo of anything odd or long."""
-    return path if re.fullmatch(r"[A-Za-z0-9/_.-]{1,200}", path) else None
 
 
 async def _answer(request: Request, error: Exception) -> JSONResponse:

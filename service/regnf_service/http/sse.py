@@ -13,17 +13,12 @@ from starlette.types import Receive, Scope, Send
 
 from regnf_service.concurrency import Slots
 from regnf_service.services import Services
-from regnf_state.records import FINISHED, JobEvent
+from regnf_state.records import FINISHED
 
 MEDIA_TYPE = "text/event-stream"
 logger = logging.getLogger(__name__)
 _HEARTBEAT_S = 10.0
 _RECONNECT_MS = 2000
-
-
-def format_event(event: JobEvent) -> str:
-    """One event. JSON without line breaks needs no splitting."""
-    return f"id: {event.id}\nevent: {event.name}\ndata: {json.dumps(event.data)}\n\n"
 
 
 async def event_stream(services: Services, job_id: str, after: str | None) -> AsyncIterator[str]:
@@ -41,7 +36,7 @@ async def event_stream(services: Services, job_id: str, after: str | None) -> As
             logger.warning("an event stream ends: a store does not answer: %s", type(error).__name__)
             return
         for event in events:
-            yield format_event(event)
+            yield f"id: {event.id}\nevent: {event.name}\ndata: {json.dumps(event.data)}\n\n"
             after = event.id
         if events:
             last_sent = time.monotonic()

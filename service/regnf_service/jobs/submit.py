@@ -150,7 +150,6 @@ class FieldLookup:
         self._held = {one: held[one] if one in held else found[one] for one in references}
 
     def get(self, name: str) -> FieldRecord | None:
-        """One that was read."""
         return self._held[reference_of(self._caller, name)]
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
+from regnf_core.detections.images import place_of_frame
 from regnf_service.problem import Problem
 
 _MOST_HEADER_BYTES = 32 << 20
@@ -25,7 +25,8 @@ def frame_picture(file: BinaryIO, wanted: str) -> bytes:
     length = int.from_bytes(file.read(8), "little")
     header = json.loads(file.read(min(length, _MOST_HEADER_BYTES)))
     names = json.loads(header["__metadata__"]["recording"])["names"]
-    number = _place(names, wanted)
+    if (number := place_of_frame(names, wanted)) is None:
+        raise Problem("RECORDING_FRAME_NOT_FOUND")
     for kind in ("color", "depth"):
         if kind in header:
             shape, (begin, end) = header[kind]["shape"], header[kind]["data_offsets"]
@@ -44,12 +45,3 @@ def frame_picture(file: BinaryIO, wanted: str) -> bytes:
     held = io.BytesIO()
     image.save(held, "PNG", compress_level=_FAST)
     return held.getvalue()
-
-
-def _place(names: list[str], wanted: str) -> int:
-    for place, name in enumerate(names):
-        if wanted in (name, PurePosixPath(name).name, PurePosixPath(name).stem):
-            return place
-    if wanted.isascii() and wanted.isdigit() and len(wanted) < 9 and int(wanted) < len(names):
-        return int(wanted)
-    raise Problem("RECORDING_FRAME_NOT_FOUND")

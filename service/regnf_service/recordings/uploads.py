@@ -17,7 +17,7 @@ from regnf_service.fields.ingest import Beside
 from regnf_service.fields.uploads import Received, Upload
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.records import RECORDING
+from regnf_state.records import RECORDING, FieldRecord
 
 FRAME_BYTES = 256 << 20
 """Of all parts of a frame."""
@@ -25,7 +25,13 @@ CAMERA_BYTES = 64 * 1024
 _FORMATS = RUN_ARCHIVES | {"sqlite", "safetensors"}
 _WRITTEN = (1980, 1, 1, 0, 0, 0)
 _IMAGES: dict[str, dict[bytes, str]] = {
-    "depth": {b"\x89PNG": ".png", b"II*\0": ".tiff", b"MM\0*": ".tiff", b"\x93NUM": ".npy"},
+    "depth": {
+        b"\x89PNG": ".png",
+        b"II*\0": ".tiff",
+        b"MM\0*": ".tiff",
+        b"\x93NUM": ".npy",
+        b"\x76\x2f\x31\x01": ".exr",
+    },
     "color": {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg", b"BM": ".bmp", b"RIFF": ".webp"},
 }
 """How images of each part begin, and the endings of their names in the zip."""
@@ -34,8 +40,8 @@ _MAGIC_BYTES = 4
 
 @dataclass(frozen=True)
 class AsRecording(Beside):
-    """What makes an upload a recording. name: for people · said: ``after`` and ``frame`` of a frame that is added to
-    another recording."""
+    """What makes an upload a recording. name: for people · said: entries of a RecordingDescription; ``after`` and
+    ``frame`` of a frame that is added to another recording."""
 
     name: str | None = None
     said: Mapping[str, Any] = field(default_factory=dict)
@@ -47,6 +53,10 @@ class AsRecording(Beside):
 
     def function(self) -> dict[str, Any]:
         return {"as": RECORDING, **self.said}
+
+    def is_function_of(self, known: FieldRecord) -> bool:
+        """Where nothing is said, any recording of the same bytes is meant."""
+        return known.is_recording and (not self.said or super().is_function_of(known))
 
 
 class RecordingUpload(Upload):

@@ -208,7 +208,8 @@ class Deliverer:
             if error.newer:
                 return None  # it comes up again in a minute: a process of the later release may send it
             record = None
-        if record is None or not _is_about(message, record):
+        current = record is not None and record.attempt == message.attempt and record.status in FINISHED
+        if record is None or not current or message.place >= len(record.webhooks):
             self._outbox.settle(message, Delivery("failed", last_error="JOB_GONE"))
             return None
         return record, self._outbox.deliveries(record)[message.place], self._records.now()
@@ -239,10 +240,6 @@ class Deliverer:
         )
         outcome = "delivered" if sent.state == "delivered" else error or f"status_{(status or 0) // 100}xx"
         self._outbox.settle(message, sent, outcome)
-
-
-def _is_about(message: Message, record: JobRecord) -> bool:
-    return record.attempt == message.attempt and record.status in FINISHED and message.place < len(record.webhooks)
 
 
 def message_id(record: JobRecord, place: int) -> str:

@@ -12,7 +12,6 @@ import hashlib
 import hmac
 import ipaddress
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -22,6 +21,7 @@ from regnf_service.tokens import TokensError
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
 from regnf_state.records import JobRecord
 from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+from regnf_state.settings import address_of
 
 _PORTS = {"http": 80, "https": 443}
 _MAX_URL_CHARS = 2000
@@ -62,7 +62,7 @@ class AllowList:
 
     def permits(self, address: str) -> bool:
         """Whether a connection to this address, which a host's name resolved to, may be opened."""
-        return str(_plain(address)) in self._addresses or is_public(address)
+        return str(address_of(address)) in self._addresses or is_public(address)
 
 
 def _entry(entry: str) -> Target:
@@ -85,20 +85,14 @@ def target_of(url: str) -> Target | None:
     if parts.scheme not in _PORTS or not parts.hostname or "@" in parts.netloc or parts.fragment:
         return None
     host = parts.hostname.rstrip(".")
-    with suppress(ValueError):  # a name
-        host = str(_plain(host))
+    host = str(address_of(host) or host)
     return Target(parts.scheme, host, _PORTS[parts.scheme] if port is None else port)
-
-
-def _plain(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-    found = ipaddress.ip_address(address.partition("%")[0])
-    return getattr(found, "ipv4_mapped", None) or found
 
 
 def is_public(address: str) -> bool:
     """Whether an address belongs to the public Internet, those that carry another address inside aside."""
-    found = _plain(address)
-    if any(found in network for network in _SPECIAL) or (found.version == 6 and found not in _UNICAST):
+    found = address_of(address)
+    if found is None or any(found in network for network in _SPECIAL) or (found.version == 6 and found not in _UNICAST):
         return False
     return found.is_global and not found.is_multicast and not found.is_reserved
 

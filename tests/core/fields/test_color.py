@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.solids import BoxField, UnionField
 from regnf_core.fields.build import ScaledField
-from regnf_core.fields.composite import BoxField, TransformedField, UnionField
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.observation import (
     ColoredField,
     Observation,

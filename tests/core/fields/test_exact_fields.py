@@ -10,7 +10,8 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from regnf_core.fields.composite import BoxField, SurfaceSource, UnionField
+from benchmarks.solids import BoxField, UnionField
+from regnf_core.fields.composite import SurfaceSource
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
 from regnf_core.importing.mesh_file import load_mesh

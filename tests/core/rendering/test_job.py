@@ -90,14 +90,15 @@ def _pose() -> list[list[float]]:
 
 
 def test_cancelling_ends_the_work(tmp_path: Path) -> None:
-    calls: list[None] = []
+    calls: list[float] = []
 
-    def cancelled() -> bool:
-        calls.append(None)
-        return len(calls) > 4
+    def tell(share: float) -> None:
+        calls.append(share)
+        if len(calls) > 4:
+            raise CancelledError("enough")
 
     with pytest.raises(CancelledError):
-        run_render(room(), RenderRequest.from_dict(SMALL), ball, tmp_path, cancelled=cancelled)
+        run_render(room(), RenderRequest.from_dict(SMALL), ball, tmp_path, tell)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from benchmarks.solids import BoxField, UnionField
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.importing.observing.trajectory import Array, Axes, Intrinsics, Trajectory, trajectory_of

@@ -80,6 +80,11 @@ def later(folder: Path) -> None:
         (folder / name).write_text("\n".join(f"{1.4e9 + float(row[0]):.6f} {row[1]}" for row in rows))
 
 
+def as_npz(path: Path) -> None:
+    path.unlink()
+    np.savez(path.with_suffix(".npz"), a=np.ones((HEIGHT, WIDTH)), b=np.ones((HEIGHT, WIDTH)))
+
+
 def spread_over_16_bits(path: Path) -> Any:
     return (np.asarray(Image.open(path)) // 20 % 256 * 257).astype(np.uint16)
 
@@ -90,6 +95,16 @@ REFUSED: dict[str, tuple[str, Change, str, str]] = {
     "65535": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((9, 9), 65535, np.uint16))), "INTRINSICS_INVALID", "-0"),
     "8 bits": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((HEIGHT, WIDTH), 9, np.uint8))), "IMAGE_INVALID",
                "8 bit"),
+    "palette": (SCENES, all_of(DEPTHS, lambda p: Image.new("P", (WIDTH, HEIGHT)).save(p)), "IMAGE_INVALID", "palette"),
+    "shares": (SCENES, intrinsics(np.diag([1 / WIDTH, 1 / HEIGHT, 1.0]) @ K), "INTRINSICS_INVALID", "by its width"),
+    "no focal length": (SCENES, intrinsics(np.diag([0.0, 1.0, 1.0]) @ K), "INTRINSICS_INVALID", "focal lengths 0, 72"),
+    "PIZ": ("record3d", first_of("*.exr", lambda p: writers.exr(p, TRUTH.depths[0], 4)), "IMAGE_INVALID", "with ZIP"),
+    "cut EXR": ("record3d", first_of("*.exr", lambda p: p.write_bytes(p.read_bytes()[:900])), "IMAGE_INVALID", "0.exr"),
+    "Record3D's own": ("record3d", all_of("*.exr", lambda p: p.rename(p.with_suffix(".depth"))), "NO_FRAMES", "depth"),
+    "no poses": ("redwood", first_of("*.log", Path.unlink), "NOT_RECOGNIZED", "no poses were found for its 3 depth"),
+    "only JPEG": ("redwood", all_of("depth/*", lambda p: p.rename(p.with_suffix(".jpg"))), "SIZES_DIFFER",
+                  "3 poses, depth 0 images"),
+    "which array": (SCENES, first_of(DEPTHS, as_npz), "IMAGE_INVALID", "which of its arrays"),
     "8 of 16": (SCENES, all_of(DEPTHS, lambda p: put(p, np.full((HEIGHT, WIDTH), 200, np.uint16))), "IMAGE_INVALID",
                 "up to 200"),
     "8 spread over 16": (SCENES, all_of(DEPTHS, lambda p: put(p, spread_over_16_bits(p))), "IMAGE_INVALID",
@@ -148,7 +163,68 @@ def as_float_tiff(path: Path) -> None:
     path.unlink()
 
 
+def as_array(ending: str, factor: float) -> Change:
+    def write(path: Path) -> None:
+        depth = np.asarray(Image.open(path)).astype(np.float64) * factor
+        path.unlink()
+        depth[0, :2] = np.nan, 1e10  # as renderers write for nothing
+        target = path.with_suffix(ending)
+        np.savez(target, depth=depth, labels=depth) if ending == ".npz" else np.save(target, depth)
+
+    return all_of(DEPTHS, write)
+
+
+def listed(name: str, lines: Callable[[], list[str]]) -> Change:
+    """A list of poses in place of Redwood's trajectory."""
+
+    def write(folder: Path) -> None:
+        (folder / "trajectory.log").unlink()
+        (folder / name).write_text("\n".join(lines()))
+
+    return write
+
+
+def lines_of_stray() -> list[str]:
+    turns = Rotation.from_matrix(TRUTH.poses[:, :3, :3]).as_quat()
+    rows = zip(TRUTH.poses[:, :3, 3], turns, strict=True)
+    named = (f"{0.1 * i}, {i:06d}, " + ", ".join(map(str, (*place, *turn))) for i, (place, turn) in enumerate(rows))
+    return ["timestamp, frame, x, y, z, qx, qy, qz, qw", *named]
+
+
+def in_a_folder(folder: Path) -> None:
+    (folder / "trajectory.log").unlink()
+    (folder / "poses").mkdir()
+    for i, one in enumerate(TRUTH.poses, 1):
+        np.save(folder / "poses" / f"{i:06d}.npy", one)
+
+
 READ: dict[str, tuple[str, Change, int]] = {
+    "millimeters with a point": (SCENES, as_array(".npy", 1.0), 3),
+    "arrays by name": (SCENES, as_array(".npz", 0.001), 3),
+    "Stray Scanner": ("redwood", listed("odometry.csv", lines_of_stray), 3),
+    "a matrix a line": ("redwood", listed("poses.txt", lines_of_kitti), 3),
+    "four lines a matrix": (
+        "redwood",
+        listed("traj.txt", lambda: [" ".join(map(str, row)) for one in TRUTH.poses for row in one]),
+        3,
+    ),
+    "an array of poses": (
+        "redwood",
+        lambda f: ((f / "trajectory.log").unlink(), np.save(f / "poses.npy", TRUTH.poses)),
+        3,
+    ),
+    "a folder of poses": ("redwood", in_a_folder, 3),
+    "what the columns are": (
+        "tum",
+        all_of("groundtruth.txt", lambda p: p.write_text(p.read_text().replace("# timestamp", "timestamp"))),
+        3,
+    ),
+    "files of macOS": (SCENES, all_of("*.p*", lambda p: (p.parent / f"._{p.name}").write_bytes(b"\0\5\x16\7")), 3),
+    "instant-ngp": (
+        "nerfstudio",
+        document(lambda d: d.update(integer_depth_scale=d.pop("depth_unit_scale_factor", 0.001))),
+        3,
+    ),
     "meters": (SCENES, all_of(DEPTHS, as_float_tiff), 3),
     "zeros of a lost tracker": (
         "tum",

@@ -13,8 +13,11 @@ import numpy as np
 import pytest
 
 from regnf_core.errors import DatasetError
+from regnf_data.agreement import check_agreement
+from regnf_data.recordings.images import images_of
 from regnf_data.recordings.opening import open_recording
 from regnf_data.recordings.recording import Given, check_recording
+from regnf_data.recordings.stored import write_recording
 from tests.data.recordings import writers
 from tests.data.recordings.truth import HEIGHT, WIDTH, Array, K, Truth, walk
 
@@ -96,6 +99,17 @@ def test_a_wrong_convention_is_named(wrong: str, tmp_path: Path) -> None:
     assert found.value.reason == "DATASET_FRAMES_DISAGREE"
     assert re.search(mend, str(found.value.hint)), found.value.hint
     assert "meta_data" not in str(found.value.hint)
+
+
+@pytest.mark.parametrize("wrong", ["camera to world", "OpenCV's axes"])
+def test_it_is_named_alike_when_it_is_stored_and_when_it_is_fused(wrong: str, tmp_path: Path) -> None:
+    layout, make, _, mend = WRONG[wrong]
+    recording = open_recording(writers.FOLDERS[layout][0](tmp_path / "recording", make()))
+    write_recording(recording, range(12), tmp_path / "stored.safetensors")
+    for path in (tmp_path / "recording", tmp_path / "stored.safetensors"):
+        with pytest.raises(DatasetError, match="contradict each other") as found:
+            check_agreement(images_of(path).images)
+        assert re.search(mend, str(found.value.hint)), found.value.hint
 
 
 @pytest.mark.parametrize(("layout", "axes"), [("7scenes", "opengl"), ("nerfstudio", "opencv")])

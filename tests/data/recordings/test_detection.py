@@ -17,7 +17,7 @@ from regnf_core.errors import InvalidDetectionError
 from regnf_data.recordings.camera import Camera
 from regnf_data.recordings.detection import lift, mask_of
 from regnf_data.recordings.recording import Frame, Recording, StoredFrame
-from regnf_data.recordings.stored import read_stored, write_recording
+from regnf_data.recordings.stored import read_stored, recording_of_frames, write_recording
 
 H, W = 120, 160
 CAMERA = Camera(np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]]), (H, W))
@@ -75,6 +75,80 @@ def test_a_mask_is_read_however_it_is_written(given: dict[str, Any], tmp_path: P
     assert is_image_detection(given)
     (found,) = read_image_detections(given)
     np.testing.assert_array_equal(mask_of(found.beside(tmp_path).mask), MASK)
+
+
+def picture(**how: Any) -> str:
+    """A mask as a picture that is made of it in another way, as base64."""
+    image = Image.fromarray(how["pixels"], how.get("mode"))
+    if "palette" in how:
+        image.putpalette(how["palette"])
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return base64.b64encode(file.getvalue()).decode()
+
+
+_ONES, _SIZE = MASK.astype(np.uint8), MASK.shape
+PICTURES = {
+    "ones": picture(pixels=_ONES),
+    "16 bits": picture(pixels=_ONES.astype(np.uint16) * 65535),
+    "white with alpha": picture(pixels=np.dstack([_ONES * 0 + 255] * 3 + [_ONES * 255])),
+    "black with alpha": picture(pixels=np.dstack([_ONES * 0] * 3 + [_ONES * 255])),
+    "opaque": picture(pixels=np.dstack([_ONES * 255] * 3 + [_ONES * 0 + 255])),
+    "palette": picture(pixels=_ONES, palette=[0, 0, 0, 128, 0, 0]),
+    "palette without black": picture(pixels=_ONES, palette=[9, 9, 9, 128, 0, 0]),
+    "probabilities": picture(pixels=25 + 204 * _ONES),
+}
+
+
+@pytest.mark.parametrize("kind", PICTURES)
+def test_a_mask_is_read_from_pictures_of_any_kind(kind: str) -> None:
+    np.testing.assert_array_equal(mask_of(PICTURES[kind]), MASK)
+
+
+SQUARE = [[40.0, 30.0, 120.0, 30.0, 120.0, 90.0, 40.0, 90.0]]
+SHARES = [[one / (160.0, 120.0)[at % 2] for at, one in enumerate(SQUARE[0])]]
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [SQUARE, SQUARE[0], [SQUARE[0][at : at + 2] for at in range(0, 8, 2)], SHARES, SHARES[0]],
+    ids=["polygons", "one", "pairs", "shares", "shares of one"],
+)
+def test_a_polygon_is_read_however_it_is_written(mask: Any) -> None:
+    found = mask_of(mask, (120, 160))
+    assert found[31:89, 41:119].all()
+    assert found.sum() <= 61 * 81
+
+
+@pytest.mark.parametrize("kind", ["rows of ones", "half as large", "shares of the sides"])
+def test_a_detection_of_other_pixels_is_that_thing(kind: str) -> None:
+    frame, shown = ball_image()
+    rows, columns = np.nonzero(shown)
+    box = columns.min() / 160, rows.min() / 120, (columns.max() + 1) / 160, (rows.max() + 1) / 120
+    given = {"rows of ones": {"mask": shown.tolist()}, "half as large": {"mask": shown[::2, ::2]}}
+    found = lift(frame, ImageDetection(**given.get(kind, {"box_2d": box})))
+    assert (found.pixels & shown).sum() > 0.9 * shown.sum()
+
+
+def test_a_mask_that_is_inverted_is_refused() -> None:
+    frame, shown = ball_image()
+    with pytest.raises(InvalidDetectionError, match="is it inverted"):
+        lift(frame, ImageDetection(mask=~shown))
+
+
+def test_annotations_of_coco_name_their_image_and_their_category() -> None:
+    listed = {
+        "images": [{"id": 7, "file_name": "rgb/000003.png", "height": 12, "width": 16}],
+        "categories": [{"id": 3, "name": "cup"}],
+        "annotations": [{"image_id": 7, "category_id": 3, "segmentation": [], "bbox": [10, 20, 20, 40]}],
+    }
+    (found,) = read_image_detections(listed)
+    assert (found.frame, found.label, found.size, found.box_2d) == ("000003.png", "cup", (12, 16), (10, 20, 30, 60))
+    frames = [replace(ball_image()[0], name=name) for name in ("000001", "000003", "100.1000", "100.2000")]
+    recording = recording_of_frames(frames)
+    assert [recording.index(name) for name in (found.frame, 3, "3", 1, 0, "100.2000")] == [1, 1, 1, 0, 0, 3]
+    alone = recording_of_frames(frames[:1])
+    assert [alone.index(name) for name in (7, "rgb/color.png")] == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -170,7 +244,9 @@ def test_a_detection_beside_the_image_is_refused(detection: ImageDetection, said
 def test_a_detection_without_depth_is_refused() -> None:
     frame, shown = ball_image()
     holes = Frame("0", np.where(shown, 0.0, frame.depth).astype(np.float32), CAMERA, np.eye(4))
-    with pytest.raises(InvalidDetectionError, match=r"frame 0: 0 of \d+ pixels of the detection") as found:
+    with pytest.raises(
+        InvalidDetectionError, match=r"frame 0: depth was measured in 0 of \d+ pixels of the detection"
+    ) as found:
         lift(holes, ImageDetection(mask=shown))
     assert found.value.reason == "DETECTION_WITHOUT_DEPTH"
 

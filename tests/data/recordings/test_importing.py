@@ -118,6 +118,12 @@ def empty(folder: Path) -> Path:
     return folder / "e.zip"
 
 
+def hollow(folder: Path) -> Path:
+    with zipfile.ZipFile(folder / "h.zip", "w") as archive:
+        archive.writestr("kitchen/", "")
+    return folder / "h.zip"
+
+
 def unknown(folder: Path) -> Path:
     with zipfile.ZipFile(folder / "u.zip", "w") as archive:
         archive.writestr("readme.txt", "nothing to see")
@@ -131,6 +137,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "inverted poses": (inverted, "DATASET_FRAMES_DISAGREE"),
     "no archive": (text, "DATASET_NOT_RECOGNIZED|DATASET_FILE_INVALID"),
     "nothing in it": (empty, "ARCHIVE_|DATASET_NOT_RECOGNIZED"),
+    "a folder without files": (hollow, "DATASET_NOT_RECOGNIZED"),
     "no recording in it": (unknown, "DATASET_NOT_RECOGNIZED"),
 }
 

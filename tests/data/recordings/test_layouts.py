@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import torch
 
 from regnf_core.errors import DatasetError
 from regnf_core.fields.build import open_field
-from regnf_data.recordings.camera import Camera
+from regnf_data.exr import read_exr
+from regnf_data.recordings.camera import Camera, camera_of_values
 from regnf_data.recordings.opening import open_recording
 from regnf_data.recordings.recording import Frame, Recording, as_posed_images
 from regnf_fit.images.fusion import FusionOptions, fuse_images
@@ -86,6 +89,53 @@ def test_a_frame_alone_is_read_with_any_file_of_intrinsics(camera: str, tmp_path
     np.testing.assert_allclose(frame.camera.K, K + HALF)
     np.testing.assert_array_equal(frame.T_world_camera, np.eye(4))
     assert ("millimeters" in " ".join(recording.notes)) == (camera != "realsense")
+
+
+PAIRS = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+YAML = f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  data: "
+CAMERAS: dict[str, tuple[str, str]] = {
+    "four numbers": ("camera.json", json.dumps([70, 72, 39, 31])),
+    "rows": ("camera.json", json.dumps(K.tolist())),
+    "P": ("camera.json", json.dumps({"P": np.hstack([K, np.zeros((3, 1))]).ravel().tolist()})),
+    "numbers as text": ("camera.json", json.dumps({name: str(value) for name, value in PAIRS.items()})),
+    "a mark of Windows": ("camera.json", "\ufeff" + json.dumps(PAIRS)),
+    "color's first": ("rs.camera.json", json.dumps({"color": {**PAIRS, "fx": 600.0}, "depth": PAIRS})),
+    "OpenCV": ("camera.yml", f"%YAML:1.0\n---\n{YAML}{K.ravel().tolist()}\n"),
+    "ORB-SLAM": ("tum.camera.yaml", "%YAML:1.0\n" + "".join(f"Camera.{name}: {n}\n" for name, n in PAIRS.items())),
+    "a topic's echo": ("camera_info.yaml", f"height: {HEIGHT}\nwidth: {WIDTH}\nk: {K.ravel().tolist()}\n---\n"),
+    "Kalibr": ("camchain.yaml", f"cam0:\n  intrinsics: [70, 72, 39, 31]\n  resolution: [{WIDTH}, {HEIGHT}]\n"),
+    "a table": ("camera_matrix.csv", "70,0,39\n0,72,31\n0,0,1\n"),
+    "with the size": ("intrinsics.txt", f"{WIDTH} {HEIGHT} 70 72 39 31"),
+    "with names": ("intrinsics.txt", "fx = 70, fy = 72\ncx = 39, cy = 31\n"),
+}
+
+
+@pytest.mark.parametrize("form", CAMERAS)
+def test_intrinsics_are_read_however_they_are_written(form: str, tmp_path: Path) -> None:
+    name, text = CAMERAS[form]
+    writers.depth_png(tmp_path / "depth.png", truth().depths[0], 1000.0)
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    (tmp_path / "._camera.json").write_bytes(b"\0\5\x16\7")
+    np.testing.assert_allclose(open_recording(tmp_path).frames[0].read().camera.K, K + HALF)
+
+
+def test_intrinsics_are_read_from_an_array_and_a_lens_that_realsense_calls_inverse(tmp_path: Path) -> None:
+    writers.depth_png(tmp_path / "depth.png", truth().depths[0], 1000.0)
+    np.save(tmp_path / "K.npy", K)
+    np.testing.assert_allclose(open_recording(tmp_path).frames[0].read().camera.K, K + HALF)
+    said = {**PAIRS, "model": "distortion.inverse_brown_conrady", "coeffs": [-0.1, 0.02, 0.001, 0.0, 0.0]}
+    found = camera_of_values(said, "camera")
+    assert found is not None
+    slopes = np.array([[0.4, -0.3], [0.1, 0.2]])
+    brown = replace(found.camera, lens="brown")
+    np.testing.assert_allclose(brown._bent(found.camera._bent(slopes)), slopes, atol=1e-4)
+
+
+@pytest.mark.parametrize("compression", [0, 2, 3])
+def test_depths_of_openexr(compression: int, tmp_path: Path) -> None:
+    depth = truth().depths[0].astype(np.float32)
+    writers.exr(tmp_path / "depth.exr", depth, compression)
+    np.testing.assert_array_equal(read_exr(tmp_path / "depth.exr"), depth)
 
 
 def test_a_folder_of_recordings_names_them(tmp_path: Path) -> None:

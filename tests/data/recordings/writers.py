@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -221,6 +222,68 @@ def colmap_binary(folder: Path, truth: Truth) -> Path:
 
 
 Writer = Callable[[Path, Truth], Path]
+# Apps of phones: ARKit's cameras look against z. Facts by the apps' documentation and files that people show.
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def polycam(folder: Path, truth: Truth) -> Path:
+    for i, pose in enumerate(truth.poses @ _OPENGL):
+        name = str(1442008525605 + 100_000 * i)
+        depth_png(folder / f"keyframes/depth/{name}.png", truth.depths[i], 1000.0)
+        png(folder / f"keyframes/images/{name}.png", truth.colors[i])
+        (folder / "keyframes/cameras").mkdir(exist_ok=True)
+        entries = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        camera_json(folder / f"keyframes/cameras/{name}.json", **entries, blur_score=90.0)
+    return folder
+
+
+def scanner_app(folder: Path, truth: Truth) -> Path:
+    for i, pose in enumerate(truth.poses @ _OPENGL):
+        depth_png(folder / f"depth_{i:05d}.png", truth.depths[i], 1000.0)
+        png(folder / f"frame_{i:05d}.png", truth.colors[i])
+        said = {"cameraPoseARFrame": pose.ravel().tolist(), "intrinsics": K.ravel().tolist(), "frame_index": i}
+        (folder / f"frame_{i:05d}.json").write_text(json.dumps(said))
+    return folder
+
+
+def record3d(folder: Path, truth: Truth) -> Path:
+    poses = truth.poses @ _OPENGL
+    for i, depth in enumerate(truth.depths):
+        exr(folder / f"depth/{i}.exr", depth)
+        png(folder / f"rgb/{i}.png", truth.colors[i])
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    rows = np.concatenate([turns, poses[:, :3, 3]], axis=1).tolist()
+    said = {"w": WIDTH, "h": HEIGHT, "K": K.T.ravel().tolist(), "fps": 60, "poses": rows}
+    (folder / "metadata.json").write_text(json.dumps(said))
+    return folder
+
+
+def exr(path: Path, depth: Array, compression: int = 3) -> None:
+    """One channel R of 32 bits: 0: as it is, 2: each line, 3: blocks of 16 lines by zip."""
+    height, width = depth.shape
+
+    def attribute(name: bytes, kind: bytes, value: bytes) -> bytes:
+        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(value)) + value
+
+    window, zeros = struct.pack("<4i", 0, 0, width - 1, height - 1), struct.pack("<2f", 0.0, 0.0)
+    channel = b"R\0" + struct.pack("<iBBBBii", 2, 0, 0, 0, 0, 1, 1) + b"\0"
+    head = b"\x76\x2f\x31\x01\x02\0\0\0" + attribute(b"channels", b"chlist", channel)
+    head += attribute(b"compression", b"compression", bytes([compression]))
+    head += attribute(b"dataWindow", b"box2i", window) + attribute(b"displayWindow", b"box2i", window)
+    head += attribute(b"lineOrder", b"lineOrder", b"\0") + attribute(b"screenWindowCenter", b"v2f", zeros) + b"\0"
+    blocks, step = [], {0: 1, 2: 1, 3: 16}.get(compression, 32)
+    for top in range(0, height, step):
+        raw = depth[top : top + step].astype("<f4").tobytes()
+        halves = np.frombuffer(raw[::2] + raw[1::2], np.uint8).astype(np.int64)
+        packed = zlib.compress(np.append(halves[:1], (np.diff(halves) + 128) % 256).astype(np.uint8).tobytes())
+        data = packed if compression and len(packed) < len(raw) else raw
+        blocks.append(struct.pack("<ii", top, len(data)) + data)
+    ends = np.cumsum([len(head) + 8 * len(blocks), *map(len, blocks[:-1])]).tolist()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(head + struct.pack(f"<{len(ends)}Q", *ends) + b"".join(blocks))
+
+
 FOLDERS: dict[str, tuple[Writer, float]] = {
     "bop": (bop, 1e-4),
     "tum": (tum, 2e-4),
@@ -233,6 +296,9 @@ FOLDERS: dict[str, tuple[Writer, float]] = {
     "sdfstudio": (sdfstudio, 1e-6),
     "colmap": (colmap_text, 1e-3),
     "colmap binary": (colmap_binary, 1e-3),
+    "polycam": (polycam, 1e-3),
+    "3d scanner app": (scanner_app, 1e-3),
+    "record3d": (record3d, 1e-6),
 }
 """Writers, and the step of the depths they write, m."""
 

@@ -9,9 +9,10 @@ import pytest
 import torch
 import trimesh
 
+from benchmarks.solids import BoxField
 from regnf_core.errors import CancelledError, InvalidInputError
 from regnf_core.fields.build import open_field
-from regnf_core.fields.composite import BoxField, TransformedField
+from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.sim3 import Sim3

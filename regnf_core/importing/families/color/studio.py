@@ -47,7 +47,7 @@ def read_color(
     first, features = layers[0][0], len(weight) - 1
     embedding = _embedding(state, source)
     spare = first.shape[1] - 6 - features
-    widths = [spare - columns for columns in (embedding.shape[1], 0) if _is_direction(spare - columns)]
+    widths = [spare - columns for columns in (embedding.shape[1], 0) if (spare - columns) % 6 == 3 <= spare - columns]
     understood(bool(widths), f"{first.shape[1]} inputs; expected position, direction, gradient, features, appearance")
     degree = degree_of(widths[0], overrides.direction_degree)
     padding = 0.0 if nerfstudio else _PADDING if overrides.padding is None else overrides.padding
@@ -72,10 +72,6 @@ def assumed_of(state: Mapping[str, Any], overrides: ColorOverrides) -> str | Non
         "the images' appearance is taken to be zeros (use_average_appearance_embedding false). If the trainer evaluates"
         " with their mean, say color.average_appearance true, or add its settings"
     )
-
-
-def _is_direction(columns: int) -> bool:
-    return columns >= 3 and columns % 6 == 3
 
 
 def _embedding(state: Mapping[str, Any], source: TensorSource) -> Float32Array:

@@ -12,6 +12,7 @@ from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from regnf_core.importing.recording_description import RecordingDescription
 from regnf_service.concurrency import PARSING, blocking, in_thread
 from regnf_service.fields.ingest import StoredUpload, room_for_bytes, store_upload
 from regnf_service.fields.piecewise import finish_pieces
@@ -22,6 +23,7 @@ from regnf_service.http.body import (
     PageTokenQuery,
     PrefixDep,
     ServicesDep,
+    Sink,
     boundary_of,
     read_parts,
 )
@@ -41,14 +43,17 @@ from regnf_service.http.routes.documentation import (
 from regnf_service.http.routes.fields import FIELD_ANSWERS, delete_field, get_field, require_field
 from regnf_service.http.routes.uploads import (
     ANSWERS,
+    DESCRIPTION_BYTES,
     UPLOAD_BYTES,
     UPLOAD_PART,
     compared,
     named_upload,
+    read_description,
     receive_raw,
     upload_answer,
 )
 from regnf_service.http.schemas.fields import FieldDocument, RecordingPage, field_document
+from regnf_service.http.schemas.reading import reference
 from regnf_service.http.schemas.results import Label
 from regnf_service.http.strict_json import parse_json
 from regnf_service.problem import Problem
@@ -61,7 +66,7 @@ from regnf_state.records import FieldRecord
 router = APIRouter(tags=["recordings"])
 _REFUSALS = (
     f"{UPLOAD_REFUSALS.replace('FIELD_NOT', 'RECORDING_NOT')} {MULTIPART_REFUSALS} {PIECE_REFUSALS} MALFORMED_JSON "
-    "FIELD_DESCRIPTION_DIFFERS INVALID_QUERY"
+    "FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION INVALID_QUERY"
 )
 FRAME_PARTS: dict[str, Any] = {
     "depth": FILE | {"description": "A PNG of 16 bits, a TIFF or a `.npy` file."},
@@ -72,13 +77,15 @@ FRAME_PARTS: dict[str, Any] = {
         "`T_world_camera`, 4x4, where they are known.",
     },
 }
+_WHOLE = {"file": FILE, "upload": UPLOAD_PART}
 _NAME = r"[A-Za-z0-9._-]{1,100}"
 LabelQuery = Annotated[Label | None, Query(description="A name for people.")]
 DigestHeader = Annotated[str | None, Header(description="RFC 9530, of the body as sent.")]
 
 
 def _body(required: list[str], **more: Any) -> dict[str, Any]:
-    form = {"type": "object", "required": required, "additionalProperties": False, "properties": FRAME_PARTS | more}
+    parts = {**FRAME_PARTS, "description": reference(RecordingDescription), **more}
+    form = {"type": "object", "required": required, "additionalProperties": False, "properties": parts}
     files = {} if required else {"application/octet-stream": {"schema": FILE}}
     return {"requestBody": {"required": True, "content": {**files, "multipart/form-data": {"schema": form}}}}
 
@@ -89,7 +96,7 @@ def _body(required: list[str], **more: Any) -> dict[str, Any]:
     response_model=FieldDocument,
     status_code=201,
     responses={**ANSWERS, **refusals(_REFUSALS)},
-    openapi_extra=_body([], upload=UPLOAD_PART),
+    openapi_extra=_body([], **_WHOLE),
 )
 async def post_recording(
     request: Request,
@@ -99,10 +106,11 @@ async def post_recording(
     label: LabelQuery = None,
     content_digest: DigestHeader = None,
 ) -> JSONResponse:
-    """An archive of a folder, a bag (ROS, MCAP) or a stored recording as the body; or one frame in parts.
+    """An archive of a folder, a bag (ROS, MCAP) or a stored recording, as the body or as the part `file`; or one frame.
 
     The answer's `sha256` names the recording: `POST /register` takes it as `scene`. The same parts in the same order
-    are the same recording. `upload`, alone, names a file whose pieces came by `PUT /fields/{sha256}`.
+    are the same recording. `upload`, in place of `file`, names a file whose pieces came by `PUT /fields/{sha256}`;
+    `description` says what no file says.
     """
     return upload_answer(await _taken(request, services, caller, content_digest, AsRecording(name=label)), prefix)
 
@@ -142,24 +150,30 @@ async def _taken(
     in_parts = kind == "multipart/form-data"
     if kind.startswith("text/") or (as_.said and not in_parts):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.")
-    declared = body.declared_length(request, besides=CAMERA_BYTES if in_parts else 0)
+    declared = body.declared_length(request, besides=CAMERA_BYTES + DESCRIPTION_BYTES if in_parts else 0)
     async with AsyncExitStack() as stack:
         stack.enter_context(services.uploads.held(fair_key(request.scope, caller)))
         room = await in_thread(room_for_bytes, services, caller)
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
+        upload = await stack.enter_async_context(RecordingUpload(services, claim))
         if not in_parts:
-            upload = await stack.enter_async_context(RecordingUpload(services, claim))
             received = await receive_raw(request, services, upload, digest)
             return await store_upload(services, caller, upload, received, as_)
         frame = await stack.enter_async_context(FrameUpload(services, claim))
-        parts = await _receive_parts(request, frame, digest)
-        if parts.keys() == {"upload"} and not as_.said:
+        most = max(FRAME_BYTES, services.settings.max_upload_bytes)
+        parts = await _receive_parts(request, {"file": upload, **frame.images}, most, digest)
+        said = read_description(parts.pop("description", None), RecordingDescription)
+        as_ = AsRecording(name=as_.name, said={**as_.said, **({} if said is None else said.non_default())})
+        adds = "after" in as_.said
+        if parts.keys() == {"upload"} and not adds:
             return await finish_pieces(services, caller, named_upload(parts["upload"]), as_, RecordingUpload)
-        wanted = ["camera", "depth"] + (["name"] if as_.said else [])
+        if parts.keys() == {"file"} and not adds:
+            return await store_upload(services, caller, upload, await upload.finish(), as_)
+        wanted = ["camera", "depth"] + (["name"] if adds else [])
         if sorted(parts.keys() - {"color"}) != wanted:
             raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and color if there is one.")
         texts = {"camera.json": camera_of(parts)}
-        if as_.said:
+        if adds:
             name = parts["name"].decode("utf-8", "replace")
             if not re.fullmatch(_NAME, name):
                 raise Problem("INVALID_REQUEST", f"The part `name` is not {_NAME}.")
@@ -168,13 +182,13 @@ async def _taken(
         return await store_upload(services, caller, frame, await frame.finish_frame(texts), as_)
 
 
-async def _receive_parts(request: Request, frame: FrameUpload, digest: str | None) -> dict[str, bytes]:
+async def _receive_parts(
+    request: Request, files: Mapping[str, Sink], most: int, digest: str | None
+) -> dict[str, bytes]:
     body.refuse_encoding(request)
-    data = body.chunks(request, FRAME_BYTES + 2 * CAMERA_BYTES)
-    texts = {"camera": CAMERA_BYTES, "name": UPLOAD_BYTES, "upload": UPLOAD_BYTES}
-    return await read_parts(
-        data if digest is None else compared(data, digest), boundary_of(request), frame.images, texts
-    )
+    data = body.chunks(request, most + 2 * CAMERA_BYTES + DESCRIPTION_BYTES)
+    texts = {"camera": CAMERA_BYTES, "description": DESCRIPTION_BYTES, "name": UPLOAD_BYTES, "upload": UPLOAD_BYTES}
+    return await read_parts(data if digest is None else compared(data, digest), boundary_of(request), files, texts)
 
 
 def camera_of(parts: Mapping[str, bytes]) -> bytes:

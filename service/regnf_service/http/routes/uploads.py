@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Header, Path
 from starlette.requests import Request
@@ -277,13 +277,12 @@ def named_upload(text: bytes) -> str:
     return named
 
 
-def read_description(text: bytes | None) -> UploadDescription | None:
+_Described = TypeVar("_Described")
+
+
+def read_description(text: bytes | None, kind: type[_Described] = UploadDescription) -> _Described | None:  # type: ignore[assignment]
     """What a part says of a file. Raises Problem MALFORMED_JSON, INVALID_DESCRIPTION."""
-    return (
-        None
-        if text is None
-        else read_model(UploadDescription, text, "INVALID_DESCRIPTION", what="The part `description`")
-    )
+    return None if text is None else read_model(kind, text, "INVALID_DESCRIPTION", what="The part `description`")
 
 
 async def compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
@@ -297,7 +296,6 @@ async def compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[byt
 
 
 def upload_answer(taken: StoredUpload, prefix: str) -> JSONResponse:
-    """The document of what was taken in."""
     document = field_document(taken.record, prefix)
     headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
     return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)

@@ -106,7 +106,6 @@ def summary_document(batch: Summary, retention_s: float, prefix: str) -> dict[st
 
 
 def batch_document(batch: Batch, state: BatchState, retention_s: float, prefix: str) -> dict[str, Any]:
-    """The batch as it travels."""
     pairs = len(batch.pairs)
     refused = [{"line": pair.line, "error": pair.error} for pair in batch.pairs if pair.error is not None]
     return summary_document(Summary(batch.id, batch.created, pairs), retention_s, prefix) | {

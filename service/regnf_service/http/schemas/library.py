@@ -161,7 +161,6 @@ Choice = Discriminator(by_library)
 
 
 def entry_document(entry: LibraryEntry, prefix: str) -> dict[str, Any]:
-    """The entry as it travels."""
     field, notes = entry.field, entry.notes
     address = f"{prefix}/library/{quote(notes.name, safe='')}"
     at_field = f"{prefix}/fields/{sha256_of(field.sha256)}"

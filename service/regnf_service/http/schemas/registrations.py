@@ -99,8 +99,10 @@ Similarity = Annotated[
 SPELLINGS = frozenset({"matrix_rows", "transform_object", "object_pose"})
 
 
-def rows_of(transform: Rows | TransformObject) -> Rows:
-    """The 4x4 of either spelling."""
+def rows_of(transform: Rows | TransformObject | ObjectPose) -> Rows:
+    """The 4x4 of any spelling; of a pose its T_object_scene."""
+    if isinstance(transform, ObjectPose):
+        return transform.rows
     return transform.matrix if isinstance(transform, TransformObject) else transform
 
 
@@ -149,11 +151,6 @@ Start = Annotated[
     | Annotated[ObjectPose, Tag("object_pose")],
     Discriminator(_spelling_of_start),
 ]
-
-
-def start_rows(start: Rows | TransformObject | ObjectPose) -> Rows:
-    """The 4x4 T_object_scene of any spelling."""
-    return start.rows if isinstance(start, ObjectPose) else rows_of(start)
 
 
 PRESET_FAULT = "preset_unsuitable"
@@ -246,7 +243,7 @@ class RegistrationSpec(Incoming):
             detection=self.detection,
             options=self.options,
             seed=self.seed,
-            initial_transform=None if start is None else start_rows(start),
+            initial_transform=None if start is None else rows_of(start),
             ground_truth=None if truth is None else truth.rows,
             webhook=None if webhook is None else webhook.url,
             pictures=self.pictures,
