@@ -22,6 +22,7 @@ from regnf_core.field_files import library_files, stored_bounds
 from regnf_core.field_source import FieldSource, SettingsChoice
 from regnf_core.library_folder import LibraryFolder
 from regnf_core.options import Preset, RegistrationOptions
+from regnf_core.processes import keep_freed_memory
 
 if TYPE_CHECKING:
     from regnf_data.recordings.recording import Recording
@@ -77,6 +78,7 @@ def register(
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.
     """
+    keep_freed_memory()
     found = cli.read_detection(detection, detection_index)
     request = _request(found, cli.read_options(options, preset, object_unit, scale), seed)
     if initial_transform and RegistrationOptions.from_dict(request["options"]).preset != "robust":

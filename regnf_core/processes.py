@@ -32,6 +32,20 @@ def die_with_parent(parent_pid: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+_MALLOPT = (-1, 1 << 26), (-3, 1 << 24)
+"""M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt, bytes."""
+
+
+def keep_freed_memory() -> None:
+    """Have the C library keep some freed memory for what is allocated next (glibc; nothing elsewhere).
+
+    Else each larger array is given back to the system, and the next one's pages are made anew, one by one.
+    """
+    with suppress(OSError, AttributeError):
+        for parameter, size in _MALLOPT:
+            ctypes.CDLL(None).mallopt(parameter, size)
+
+
 def memory_of_the_machine() -> int:
     """All of it, bytes."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -13,12 +13,12 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
-from regnf_core.importing.gate.gate import checked_size, confined
+from regnf_core.importing.gate.gate import checked_size, confined, request_of
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.recording_description import RecordingDescription
 
@@ -46,10 +46,8 @@ def import_recording(
     from regnf_core.importing.upload_description import described  # of pydantic, which the process does without
 
     limits = limits or ImportLimits.of_the_machine()
-    said = described(RecordingDescription, description).non_default()
-    request = {"description": said, "limits": asdict(limits), "parent_pid": os.getpid()}
-    text = json.dumps(request, allow_nan=False).encode()
-    return confined(__name__, [upload.resolve(strict=True)], out_dir, text, limits, _report, _MOST_FILES)
+    request = request_of(described(RecordingDescription, description).non_default(), limits, {})
+    return confined(__name__, [upload.resolve(strict=True)], out_dir, request, limits, _report, _MOST_FILES)
 
 
 def _report(
@@ -93,7 +91,8 @@ _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE
 
 
 def main(arguments: list[str]) -> int:
-    """Confine, read, write, report. Our own code is loaded before: where it lies may not be read afterwards."""
+    """Confine, read, write, report. Our own code is loaded before: where it lies may not be read afterwards. What is
+    no argument comes with the request: the folder to work in and the upload."""
     from regnf_core.importing.containers import zip_members  # noqa: F401
     from regnf_core.importing.gate.sandbox import confine
     from regnf_core.importing.run import tar_run  # noqa: F401
@@ -101,7 +100,9 @@ def main(arguments: list[str]) -> int:
     from regnf_data.recordings import bags, choosing, layouts, stored  # noqa: F401
 
     request = json.load(sys.stdin)
+    arguments = arguments or request["arguments"]
     limits, folder = ImportLimits(**request["limits"]), Path(arguments[0])
+    os.chdir(folder)
     opened = os.open(arguments[1], os.O_RDONLY)
     head = os.pread(opened, 512, 0)
     kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")

@@ -58,7 +58,8 @@ class Frame:
         """
         of_color = self.color is not None and image.shape[:2] == self.color.shape[:2]
         source = (self.color_camera if of_color else self.taken) or self.camera
-        if image.shape[:2] == self.depth.shape and source is self.camera:
+        alike = source is self.camera or (source.lens == "none" and np.array_equal(source.K, self.camera.K))
+        if image.shape[:2] == self.depth.shape and alike:
             return image
         height, width = self.depth.shape
         rows, columns = np.indices((height, width)) + 0.5

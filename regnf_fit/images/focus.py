@@ -26,9 +26,12 @@ from regnf_data.recordings.recording import Frame
 from regnf_fit.images.observing import pixel_planes
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Masks = Sequence[NDArray[np.bool_]]
 
 _MOST_NODES = 1_000_000
+_AT_ONCE = 1 << 15
+"""Nodes: what is in use of them stays in the processor's cache."""
 _SHARP = 0.25
 """The share of the measured pixels that are no wider at their surface than a voxel is."""
 _PLANAR, _BESIDE = 3.0, 1.5
@@ -82,12 +85,19 @@ def focused_field(
     edge = max(voxel or _pixel_width(views), float(np.prod(2.0 * half) / _MOST_NODES) ** (1.0 / 3.0))
     shape = tuple(int(n) for n in np.ceil(2.0 * half / edge) + 1)
     low = -half
-    axes = (low[k] + edge * np.arange(shape[k]) for k in range(3))
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    free, behind = _carved(nodes, views, edge, spread)
-    values = _distances(nodes, points, normals, behind, low, edge, shape)
+    places, planes, nearest = _nearest(points, normals, low, edge, shape)
+    axes = [(low[k] + edge * np.arange(shape[k])).astype(np.float32) for k in range(3)]
+    values, free = np.empty(shape, np.float32), np.empty(shape, np.bool_)
+    several = max(1, _AT_ONCE // (shape[1] * shape[2]))
+    for start in range(0, shape[0], several):
+        slab = slice(start, start + several)
+        nodes = np.stack(np.meshgrid(axes[0][slab], *axes[1:], indexing="ij"), axis=-1).reshape(-1, 3)
+        through, behind = _carved(nodes, views, edge, spread)
+        place, plane = (each.take(nearest[slab].ravel(), axis=0) for each in (places, planes))
+        found = _distances(nodes - place, plane, behind, edge)
+        values[slab], free[slab] = (each.reshape(-1, *shape[1:]) for each in (found, through))
     told = np.where((told == 0) & _on_planes(points, normals, told, 2.0 * edge), np.int8(-1), told)
-    observation = _observation(points, told, free.reshape(shape), low, edge, shape)
+    observation = _observation(points, told, free, low, edge, shape)
     high = low + edge * (np.array(shape) - 1)
     origin, top, step = (torch.from_numpy(v.astype(np.float32)) for v in (low, high, np.full(3, edge)))
     function = BoxExtension(VoxelGridFunction(torch.from_numpy(values), origin, step), origin, top, 1.0)
@@ -123,10 +133,13 @@ def _view(frame: Frame, T_region_world: Floats, half: Floats, thing: NDArray[np.
     # A plane's own depth would cut the tops of curved surfaces: voxels average the noise.
     kept = np.where(planes.known, depth, np.float32(0.0))
     row, column = np.nonzero(kept > 0.0)
-    slopes = (np.stack([column, row], axis=1) + 0.5 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    local = np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1) * kept[row, column][:, None]
+    local = np.empty((len(row), 3))
+    local[:, 2] = kept[row, column]
+    for axis, place in enumerate((column, row)):
+        local[:, axis] = (place + 0.5 - K[axis, 2]) / K[axis, axis] * local[:, 2]
     points = local @ T_region_camera[:3, :3].T + T_region_camera[:3, 3]
-    inside = (np.abs(points) <= half).all(axis=1)
+    x, y, z = np.abs(points).T
+    inside = (x <= half[0]) & (y <= half[1]) & (z <= half[2])
     if not inside.any():
         return None
     normals = planes.normals[row[inside], column[inside]].astype(np.float64) @ T_region_camera[:3, :3].T
@@ -174,38 +187,37 @@ def _carved(
     return free, behind & ~free
 
 
-def _distances(
-    nodes: NDArray[np.float32],
-    points: Floats,
-    normals: Floats,
-    behind: NDArray[np.bool_],
-    low: Floats,
-    edge: float,
-    shape: tuple[int, ...],
-) -> NDArray[np.float32]:
-    """(X, Y, Z): from the nearest voxel's mean point and plane near the surface, from the point beyond."""
+def _nearest(
+    points: Floats, normals: Floats, low: Floats, edge: float, shape: tuple[int, ...]
+) -> tuple[Singles, Singles, NDArray[np.int32]]:
+    """Means (C, 3) of points and normals in voxels that hold some; which of these is nearest to nodes: (X, Y, Z)."""
     cells = np.clip(np.round((points - low) / edge).astype(np.int64), 0, np.array(shape) - 1)
-    held, of, count = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True, return_counts=True)
+    cell = np.ravel_multi_index(tuple(cells.T), shape)
+    counts = np.bincount(cell, minlength=np.prod(shape))
+    number = np.cumsum(counts > 0, dtype=np.int32) - np.int32(1)  # of the voxels that hold points
+    of, count = number[cell], counts[counts > 0]
 
-    def means(values: Floats) -> NDArray[np.float32]:
-        sums = [np.bincount(of, values[:, axis], minlength=len(held)) for axis in range(3)]
+    def means(values: Floats) -> Singles:
+        sums = [np.bincount(of, values[:, axis], minlength=len(count)) for axis in range(3)]
         return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
 
     places, planes = means(points), means(normals)
     planes /= np.maximum(np.linalg.norm(planes, axis=1, keepdims=True), 1e-9)
-    number = np.full(len(nodes), -1)
-    number[held] = np.arange(len(held))
-    empty = (number < 0).reshape(shape)
-    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    index = number[np.ravel_multi_index(tuple(nearest.reshape(3, -1)), shape)]
-    offset = nodes - places[index]
-    apart = np.sqrt(np.einsum("nc,nc->n", offset, offset))
-    across = np.einsum("nc,nc->n", offset, planes[index])
+    empty = (counts == 0).reshape(shape)
+    x, y, z = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return places, planes, number[(x * shape[1] + y) * shape[2] + z]
+
+
+def _distances(offset: Singles, planes: Singles, behind: NDArray[np.bool_], edge: float) -> Singles:
+    """(N,): from the plane of the nearest voxel's mean point near the surface, from the point beyond. offset: from it;
+    planes: their normals; (N, 3)."""
+    (x, y, z), (a, b, c) = offset.T, planes.T
+    apart, across = np.sqrt(x * x + y * y + z * z), x * a + y * b + z * c
     sign = np.where(behind & (apart <= _BEHIND * edge), np.float32(-1.0), np.float32(1.0))
     # Straight above a pixel's patch its plane tells the distance; beside the patch the point does.
     straight = apart * apart - across * across <= (_BESIDE * edge) ** 2
     far = sign * np.where(straight, np.abs(across), apart)
-    return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32).reshape(shape)
+    return np.asarray(np.where(apart <= _PLANAR * edge, across, far), np.float32)
 
 
 def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:
@@ -244,8 +256,9 @@ def _observation(
     padded[tuple(slice(0, min(s, 2 * n)) for s, n in zip(shape, counts, strict=True))] = free[
         tuple(slice(0, 2 * n) for n in counts)
     ]
-    blocks = padded.reshape(counts[0], 2, counts[1], 2, counts[2], 2)
-    states[blocks.all(axis=(1, 3, 5))] = FREE
+    padded = padded[::2] & padded[1::2]
+    padded = padded[:, ::2] & padded[:, 1::2]
+    states[padded[..., ::2] & padded[..., 1::2]] = FREE
     cells = np.floor((points - low) / (2.0 * edge)).astype(np.int64)
     within = ((cells >= 0) & (cells < np.array(counts))).all(axis=1)
     surfaces = np.zeros((3, *counts), np.bool_)

@@ -173,66 +173,66 @@ class PixelPlanes:
     deviations: NDArray[np.float32]
 
 
-def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
-    """The planes of :func:`local_planes` for one image. depth: (H, W) · camera: (3, 3)."""
-    rows, columns = np.indices(depth.shape) + 0.5
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera).T  # (H, W, 3)
-    valid = depth > 0.0
-    inverse = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=valid)
-    x, y = rays[..., 0], rays[..., 1]
-    count, sums = _moments(np.asarray(np.linalg.inv(camera))[:2, :2], inverse, valid)
-    known = valid & (count >= _MIN_PIXELS)
-    mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
-    # all relative to the pixel itself, see _moments
-    xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
-    xi, yi, ii = xi - mx * mi, yi - my * mi, ii - mi * mi
-    determinant = xx * yy - xy * xy
-    known &= determinant > 1e-2 * (xx + yy) ** 2
-    determinant = np.where(known, determinant, 1.0)
-    a, b = (yy * xi - xy * yi) / determinant, (xx * yi - xy * xi) / determinant
-    # 1/z = a x + b y + c: the plane's normal is (a, b, c), and its product with the ray (x, y, 1) is 1/z
-    here = inverse + mi - a * mx - b * my
-    normal = np.stack([a, b, here - a * x - b * y], axis=-1)
-    cosine = here / np.maximum(np.linalg.norm(normal, axis=-1) * np.linalg.norm(rays, axis=-1), 1e-12)
-    # three numbers were fitted to each window; a deviation of 1/z is one of z by z squared
-    variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
-    deviation = np.where(known, np.sqrt(variance) * depth.astype(np.float64) ** 2, 0.0)
-    cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
-    normals = -normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    return PixelPlanes(known, *(each.astype(np.float32) for each in (normals, cosine, deviation)))
-
-
 _ROWS = 24
 """That are done at once: what is in use stays in the processor's cache."""
 
 
-def _moments(step: Floats, inverse: Floats, valid: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def pixel_planes(depth: NDArray[np.float32], camera: Floats) -> PixelPlanes:
+    """The planes of :func:`local_planes` for one image. depth: (H, W) · camera: (3, 3)."""
+    K_inverse = np.asarray(np.linalg.inv(camera))
+    inverses = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=depth > 0.0)
+    around = np.pad(np.where(depth > 0.0, inverses, np.inf), _NORMAL_REACH, constant_values=np.inf)
+    parts = []
+    for top in range(0, len(depth), _ROWS):
+        inverse, measured = inverses[top : top + _ROWS], depth[top : top + _ROWS].astype(np.float64)
+        rows, columns = np.indices(inverse.shape) + 0.5
+        rays = np.stack([columns, rows + top, np.ones_like(rows)], axis=-1) @ K_inverse.T
+        x, y, z = np.ascontiguousarray(np.moveaxis(rays, 2, 0))  # of the rays, (h, W) each
+        count, sums = _moments(K_inverse[:2, :2], inverse, around[top : top + len(inverse) + 2 * _NORMAL_REACH])
+        known = (measured > 0.0) & (count >= _MIN_PIXELS)
+        mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
+        # all relative to the pixel itself, see _moments
+        xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my
+        xi, yi, ii = xi - mx * mi, yi - my * mi, ii - mi * mi
+        determinant = xx * yy - xy * xy
+        known &= determinant > 1e-2 * (xx + yy) ** 2
+        determinant = np.where(known, determinant, 1.0)
+        a, b = (yy * xi - xy * yi) / determinant, (xx * yi - xy * xi) / determinant
+        # 1/z = a x + b y + c: the plane's normal is (a, b, c), and its product with the ray (x, y, 1) is 1/z
+        here = inverse + mi - a * mx - b * my
+        c = here - a * x - b * y
+        length = np.sqrt(a * a + b * b + c * c)
+        cosine = here / np.maximum(length * np.sqrt(x * x + y * y + z * z), 1e-12)
+        # three numbers were fitted to each window; a deviation of 1/z is one of z by z squared
+        variance = np.maximum(ii - a * xi - b * yi, 0.0) * count / np.maximum(count - 3.0, 1.0)
+        deviation = np.where(known, np.sqrt(variance) * measured**2, 0.0)
+        cosine = np.where(known, np.clip(cosine, _STEEPEST_NORMAL, 1.0), 0.0)
+        normals = np.stack([a, b, c], axis=-1) / -np.maximum(length, 1e-12)[..., None]
+        parts.append((known, *(each.astype(np.float32) for each in (normals, cosine, deviation))))
+    return PixelPlanes(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _moments(step: Floats, inverse: Floats, around: Floats) -> tuple[Floats, Floats]:
     """How many pixels of each window lie on its middle's surface, (H, W), and sums over them, (9, H, W): of x, y and
     i = 1/z less the middle's, and of their products xx, yy, xy, xi, yi, ii.
 
-    step: (2, 2), x and y of one pixel to the right and of one down: those of a window's pixels are the same everywhere.
+    step: (2, 2), x and y of one pixel to the right and of one down: those of a window's pixels are the same everywhere
+    · around: as ``inverse``, and what windows reach on every side, infinite where there is no depth.
     """
     height, width = inverse.shape
-    reach = _NORMAL_REACH
-    padded = np.pad(np.where(valid, inverse, np.inf), reach, constant_values=np.inf)
-    offsets = list(product(range(2 * reach + 1), repeat=2))
-    x, y = step @ (np.array(offsets).T[::-1] - reach)
+    offsets = list(product(range(2 * _NORMAL_REACH + 1), repeat=2))
+    x, y = step @ (np.array(offsets).T[::-1] - _NORMAL_REACH)
     of_count, of_inverse = np.stack([np.ones_like(x), x, y, x * x, y * y, x * y]), np.stack([np.ones_like(x), x, y])
-    count, sums = np.zeros(inverse.shape), np.zeros((9, height, width))
-    for top in range(0, height, _ROWS):
-        here = inverse[top : top + _ROWS]
-        rows = len(here)
-        windows = [padded[top + down : top + down + rows, right : right + width] for down, right in offsets]
-        i = np.stack(windows) - here
-        same = np.abs(i) < _SAME_SURFACE * here
-        i[~same] = 0.0
-        flat = i.reshape(len(offsets), -1)
-        counted = (of_count @ same.reshape(len(offsets), -1).astype(np.float64)).reshape(6, rows, width)
-        part = slice(top, top + rows)
-        count[part], sums[0:2, part], sums[3:6, part] = counted[0], counted[1:3], counted[3:]
-        first, sums[6, part], sums[7, part] = (of_inverse @ flat).reshape(3, rows, width)
-        sums[2, part], sums[8, part] = first, np.einsum("kn,kn->n", flat, flat).reshape(rows, width)
-    return count, sums
+    i = np.stack([around[down : down + height, right : right + width] for down, right in offsets]) - inverse
+    same = np.abs(i) < _SAME_SURFACE * inverse
+    i[~same] = 0.0
+    flat = i.reshape(len(offsets), -1)
+    counted = (of_count @ same.reshape(len(offsets), -1).astype(np.float64)).reshape(6, height, width)
+    sums = np.empty((9, height, width))
+    sums[0:2], sums[3:6] = counted[1:3], counted[3:]
+    sums[2], sums[6], sums[7] = (of_inverse @ flat).reshape(3, height, width)
+    sums[8] = np.einsum("kn,kn->n", flat, flat).reshape(height, width)
+    return counted[0], sums
 
 
 _MARGIN = 1.0

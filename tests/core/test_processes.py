@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import gc
 import os
+import platform
+import resource
 import select
 import signal
 from collections.abc import Iterator
 from multiprocessing import active_children
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from regnf_core.errors import CancelledError, NoSurfaceError
-from regnf_core.processes import ProcessLostError, can_fork, in_processes
+from regnf_core.processes import ProcessLostError, can_fork, in_processes, keep_freed_memory
 
 pytestmark = pytest.mark.skipif(not can_fork(), reason="this system cannot copy a process")
 
@@ -24,6 +27,22 @@ def _nothing_is_left() -> Iterator[None]:
     yield
     gc.collect()
     assert not active_children()
+
+
+def _new_pages(task: int) -> int:
+    """Pages that arrays of 8 MB cost, one after another."""
+    if task:
+        keep_freed_memory()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        np.ones(1 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_freed_memory_is_used_again() -> None:
+    (kept,) = in_processes(_new_pages, [1], 2)
+    assert kept < 2 * (8 << 20) // resource.getpagesize()
 
 
 def test_results_come_in_the_order_of_their_tasks() -> None:

@@ -53,6 +53,21 @@ def test_distances_near_the_seen_surface_are_those_of_the_ball(noise: float) -> 
     assert [int(observation.at(p)) for p in (before, on, behind)] == [FREE, SURFACE, UNSEEN]
 
 
+def test_distances_do_not_depend_on_how_many_nodes_are_done_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, ball = ball_image()
+    found = []
+    for nodes in (1, 1 << 30):
+        monkeypatch.setattr("regnf_fit.images.focus._AT_ONCE", nodes)
+        field = focused_field([replace(frame, T_world_camera=TURN)], region(), things=[ball])
+        points = world(CENTER + 0.1 * np.random.default_rng(0).normal(size=(2000, 3)))
+        found.append((field.signed_distance(points), observation_of(field)))
+    assert torch.allclose(found[0][0], found[1][0], atol=1e-7)
+    first, second = (seen for _, seen in found)
+    assert first is not None
+    assert second is not None
+    assert torch.equal(first.states, second.states)
+
+
 def test_nobody_saw_the_thing_where_an_image_shows_others() -> None:
     frame, ball = ball_image()
     left = ball & (np.arange(ball.shape[1]) < np.median(np.nonzero(ball)[1]))

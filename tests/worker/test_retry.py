@@ -1,5 +1,8 @@
 """Waiting for a Redis that refuses: how long, for what, and that jobs lose nothing by it."""
 
+import os
+import signal
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,6 +85,30 @@ def worker(tmp_path: Path, any_redis: Redis, redis: RefusingRedis, monkeypatch: 
 def execute(worker: RegnfWorker) -> None:
     work = Work("registration", "j1", 1)
     worker.execute_job(made(work, worker.connection), Queue(work.queue_name, connection=worker.connection))
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_the_process_of_the_next_import_waits_for_it(worker: RegnfWorker, tmp_path: Path, killed: bool) -> None:
+    def note(argument: str, attempt: int, name: str) -> None:
+        (tmp_path / "ran").write_text(f"{argument} {attempt} {os.getpid()} {tempfile.gettempdir()}")
+
+    worker._functions = {"import": note, "registration": note}
+    waiting = worker._next_import = worker._forked()
+    if killed:
+        os.kill(waiting[0], signal.SIGKILL)
+        os.waitid(os.P_PID, waiting[0], os.WEXITED | os.WNOWAIT)
+    folder = worker._scratch.of_job()
+    child, ended = worker._start_child(Work("import", SHA, 2), folder)
+    assert (child == waiting[0]) == (not killed)
+    assert worker._next_import is None
+    exit_ = None
+    while exit_ is None:
+        exit_ = kernel.wait_for_exit(child, ended, 5.0)
+    os.close(ended)
+    assert exit_ != "spoken"
+    assert exit_.status == 0
+    assert (tmp_path / "ran").read_text() == f"{SHA} 2 {child} {folder}"
+    worker._scratch.remove()
 
 
 def test_a_job_taken_but_not_begun_is_left_to_the_reaper(worker: RegnfWorker, monkeypatch: pytest.MonkeyPatch) -> None:

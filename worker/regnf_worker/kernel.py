@@ -40,11 +40,13 @@ class Exit(NamedTuple):
 def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | Literal["spoken"] | None:
     """Wait for a child to end or to say something, for so many seconds at most; None when it still runs.
 
-    ``ended`` is the reading end of a pipe whose writing end only the child holds open.
+    ``ended`` is one end of a pair of sockets, or of a pipe; only the child holds the other end open.
     """
     deadline = time.monotonic() + seconds
-    if select.select([ended], [], [], seconds)[0] and os.read(ended, 1):
-        return "spoken"
+    if select.select([ended], [], [], seconds)[0]:
+        with suppress(ConnectionResetError):  # it has died before it read what it was told
+            if os.read(ended, 1):
+                return "spoken"
     while True:
         try:
             pid, status, usage = os.wait4(child, os.WNOHANG)

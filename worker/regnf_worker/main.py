@@ -46,9 +46,9 @@ _MODULES = (
     "regnf_fit.images.recorded_scene",
     "regnf_fit.images.overlay",
     "regnf_core.geometry.sim3",
-    "PIL.PngImagePlugin",
+    *(f"PIL.{kind}ImagePlugin" for kind in ("Bmp", "Gif", "Jpeg", "Png", "Ppm")),
 )
-"""What regnf_worker.engine imports where it needs it, and what Pillow does."""
+"""What regnf_worker.engine imports where it needs it, and what Pillow does when it opens the first image."""
 
 
 class PreloadError(RuntimeError):

@@ -7,10 +7,12 @@ operation itself: the forked children of a process that has hang.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import random
 import signal
+import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -27,6 +29,8 @@ from rq.timeouts import JobTimeoutException
 from rq.worker import WorkerStatus
 
 from regnf_core.importing.gate.child import LONGEST
+from regnf_core.importing.gate.gate import start_early
+from regnf_core.processes import keep_freed_memory
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis.client import WORKER_RETRIES, connect, redis_address
@@ -86,6 +90,8 @@ class RegnfWorker(ResilientWorker):
         self._finishing = Finishing()
         self._drawer = FieldDrawer(redis, context.settings, draw)
         self._because: str | None = None
+        self._expects_recordings = False
+        self._next_import: tuple[int, int] | None = None
         self._started = 0.0
         self._late = False
         self._give_back_at: float | None = None
@@ -123,6 +129,7 @@ class RegnfWorker(ResilientWorker):
                 self._drawer.go_on()
                 self._finishing.is_free()
                 self._scratch.drop_left()
+                self._prepare_import()
                 taken = self._until_available("waiting for a job", partial(self._taking.pop, _MONITOR_S))
             if taken is not None:
                 work = self._until_available("looking at what was taken", partial(self._taking.accept, taken))
@@ -154,6 +161,9 @@ class RegnfWorker(ResilientWorker):
             self._settle(work, end, kernel.oom_kills() > oom_kills)
         if work.kind == "import":
             self._if_possible("queueing what waited", lambda: self._queue.release(work.argument))
+            with suppress(RedisError, UnreadableRecordError):
+                field = self._taking.records.get_field(work.argument)
+                self._expects_recordings = field is not None and field.is_recording
         if not was_entry and self._is_unmodeled(work, otherwise=False):
             # became a library's entry too late for its import to see it, and work that runs is not queued twice
             self._if_possible("modeling an entry", lambda: self._queue.enqueue_import(work.argument, work.attempt))
@@ -166,6 +176,13 @@ class RegnfWorker(ResilientWorker):
             logger.warning("whether %s is an entry without a model is not known: %s", work.argument, error)
             return otherwise
 
+    def _prepare_import(self) -> None:
+        """After a recording, have the process of the next import wait for it: frames come one after another, somebody
+        waits for each, and to load what reads one takes several times as long as to read it."""
+        if self._expects_recordings and self._next_import is None:
+            with suppress(OSError):
+                self._next_import = self._forked(lambda: start_early("regnf_data.recordings.importing"))
+
     def _drop_entries(self, job: Any) -> None:
         """The outcome is written to the job's own record."""
         with self.connection.pipeline() as pipeline:
@@ -177,7 +194,7 @@ class RegnfWorker(ResilientWorker):
         """Fork a child for the job and wait for its end; None when it has said that the worker may go on."""
         limited = work.kind != "import"  # an import's process has limits of its own
         try:
-            child, ended = self._start_child(work, folder, limited)
+            child, ended = self._start_child(work, folder)
         except OSError as error:
             logger.error("job %s: no process could be made for it: %s", work.name, error)
             self._because = start_refused(error)
@@ -197,32 +214,44 @@ class RegnfWorker(ResilientWorker):
         os.close(ended)
         return exit_
 
-    def _start_child(self, work: Work, folder: Path, limited: bool) -> tuple[int, int]:
-        """Make the job's folder and its process: the process id, and a pipe that says when it has ended. Raises
+    def _start_child(self, work: Work, folder: Path) -> tuple[int, int]:
+        """Make the job's folder and its process: the process id, and a socket that says when it has ended. Raises
         OSError."""
         self._scratch.make(folder)
-        ended, held_by_child = os.pipe()
+        words = json.dumps([work.kind, work.argument, work.attempt, str(folder)]).encode()
+        if work.kind == "import" and self._next_import is not None:
+            (child, ended), self._next_import = self._next_import, None
+            with suppress(BrokenPipeError):
+                os.write(ended, words)
+                return child, ended
+            os.close(ended)  # it has died while it waited
+            os.waitpid(child, 0)
+        child, ended = self._forked()
+        os.write(ended, words)
+        return child, ended
+
+    def _forked(self, prepare: Callable[[], object] = lambda: None) -> tuple[int, int]:
+        """A process that calls ``prepare`` and then does the work that is written to the socket. Raises OSError."""
+        ours, its = socket.socketpair()  # the parent's end is copied once there is a child
 
         def run() -> None:
             self.setup_work_horse_signals()  # type: ignore[no-untyped-call]
             os.setpgrp()
             kernel.prefer_as_oom_victim()
-            os.close(ended)
-            pictures.hold(held_by_child)
-            if limited:
+            ours.close()
+            pictures.hold(its.fileno())
+            prepare()
+            kind, argument, attempt, folder = json.loads(its.recv(1 << 16))
+            if kind != "import":
+                keep_freed_memory()
                 self._job_limits.hold_here()
-            self._scratch.use(folder)
+            self._scratch.use(Path(folder))
             random.seed()
-            with self.death_penalty_class(self._limits[work.kind], JobTimeoutException):
-                self._functions[work.kind](work.argument, work.attempt, self.name)
+            with self.death_penalty_class(self._limits[kind], JobTimeoutException):
+                self._functions[kind](argument, attempt, self.name)
 
-        try:
-            return kernel.forked(run), ended
-        except OSError:
-            os.close(ended)
-            raise
-        finally:
-            os.close(held_by_child)
+        with ours, its:
+            return kernel.forked(run), os.dup(ours.fileno())
 
     def _let_finish(self, work: Work, child: int, ended: int, folder: Path) -> None:
         """Leave a child to itself whose result is out; the one before it is waited for, so there is one at most."""

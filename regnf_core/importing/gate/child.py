@@ -110,8 +110,16 @@ class ChildOutcome:
     cpu_seconds: float
 
 
+def start_child(command: list[str], environment: dict[str, str], folder: Path | None = None) -> subprocess.Popen[bytes]:
+    """Start ``command`` in ``folder``; it leads a process group of its own."""
+    pipe = subprocess.PIPE
+    return subprocess.Popen(
+        command, cwd=folder, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True
+    )
+
+
 def run_child(
-    command: list[str],
+    command: list[str] | subprocess.Popen[bytes],
     request: bytes,
     folder: Path,
     environment: dict[str, str],
@@ -120,21 +128,13 @@ def run_child(
     entries: int = MAX_ENTRIES,
 ) -> ChildOutcome:
     """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds by a fair clock.
+    Or a process that ``start_child`` has started, and that waits for its request.
 
     It is stopped too when it has many threads, or more than ``folder_bytes`` or ``entries`` in ``folder``. The child
     leads a process group of its own; at the end the whole group is killed, whatever became of the child.
     ``request`` must fit into a pipe (64 KiB).
     """
-    process = subprocess.Popen(
-        command,
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-        close_fds=True,
-    )
+    process = start_child(command, environment, folder) if isinstance(command, list) else command
     clock = FairClock(process.pid, wall_s)
     _inherit_priority(process.pid)
     stopped: Stopped | None = "late"

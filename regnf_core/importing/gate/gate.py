@@ -12,6 +12,7 @@ import re
 import shutil
 import signal
 import stat
+import subprocess
 import sys
 import tempfile
 import time
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 
 from regnf_core.errors import MOST_CANDIDATES, Candidate, FieldFormatError
 from regnf_core.importing.containers.safetensors_header import read_header
-from regnf_core.importing.gate.child import MAX_ENTRIES, ChildOutcome, run_child
+from regnf_core.importing.gate.child import MAX_ENTRIES, ChildOutcome, run_child, start_child
 from regnf_core.importing.gate.picture import CANDIDATE_BYTES, PICTURE_NAME, candidate_name, is_sound_picture
 from regnf_core.importing.gate.report import ImportLimits, ImportReport
 
@@ -110,7 +111,7 @@ def import_field(
     """
     limits = limits or ImportLimits.of_the_machine()
     shown = {"picture": picture, "ask_by_picture": picture or ask_by_picture}
-    request = _request(description, limits, shown, settings, cameras)
+    request = request_of(description, limits, shown, settings, cameras)
     files = [path.resolve(strict=True) for path in (upload, settings, cameras) if path is not None]
     return confined(_FIELDS, files, out_dir, request, limits, _report)
 
@@ -145,6 +146,19 @@ def confined(
         raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY") from error
 
 
+_early: dict[str, subprocess.Popen[bytes]] = {}
+"""Processes that have loaded what ``main`` of a module needs, and wait for a request with ``arguments``."""
+
+
+def start_early(module: str) -> None:
+    """Start the process of the next ``confined`` call for ``module`` now: it then has loaded what it needs."""
+    _early[module] = start_child(_command(module), _environment())
+
+
+def _command(module: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), module, *arguments]
+
+
 class _KilledError(Exception):
     """Somebody else than this side killed the child: the kernel for want of memory, or a person."""
 
@@ -163,9 +177,12 @@ def _import_once(
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
     left_s = max(0.0, limits.longest_s - (time.monotonic() - started))
     try:
-        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), module, str(work.resolve()), *map(str, files)]
-        room = limits.file_bytes + _PICTURE_BYTES
-        outcome = run_child(command, request, work, _environment(), left_s, room, entries)
+        given = [str(work.resolve()), *map(str, files)]
+        process = _early.pop(module, None)
+        if process is not None:
+            request = json.dumps(json.loads(request) | {"arguments": given}).encode()
+        start, room = process or _command(module, *given), limits.file_bytes + _PICTURE_BYTES
+        outcome = run_child(start, request, work, _environment(), left_s, room, entries)
         values = _values_of(outcome, work, limits, time.monotonic() - started)
         report = read(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
@@ -176,13 +193,14 @@ def _import_once(
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _request(
+def request_of(
     description: dict[str, Any] | None,
     limits: ImportLimits,
     shown: dict[str, bool],
-    settings: Path | None,
-    cameras: Path | None,
+    settings: Path | None = None,
+    cameras: Path | None = None,
 ) -> bytes:
+    """What a process is asked. Raises FieldFormatError (INVALID_DESCRIPTION)."""
     try:
         request = {
             "description": description,

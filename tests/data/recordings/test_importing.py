@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.gate import gate
 from regnf_core.importing.gate.report import MIB, ImportLimits
 from regnf_data.recordings.importing import import_recording
 from regnf_data.recordings.stored import read_stored
@@ -54,6 +55,20 @@ def test_an_upload_becomes_a_stored_recording(kind: str, tmp_path: Path) -> None
     if kind == "mcap":  # and once more what was stored
         again = import_recording(out / "field.safetensors", tmp_path / "again")
         assert again["frames"] == report["frames"]
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_process_that_was_started_early_imports_as_any_other(killed: bool, tmp_path: Path) -> None:
+    gate.start_early(import_recording.__module__)
+    process = gate._early[import_recording.__module__]
+    if killed:
+        process.kill()
+    report = import_recording(UPLOADS["zip of BOP"](tmp_path), tmp_path / "out")
+    assert not gate._early
+    assert (process.returncode == 0) == (not killed)
+    assert len(report["frames"]) == len(truth())
+    assert all(report["isolation"].values())
+    assert os.listdir(tmp_path / "out") == ["field.safetensors"]
 
 
 def bomb(folder: Path) -> Path:
