@@ -17,6 +17,7 @@ from regnf_core.library import register
 from regnf_core.robust.model import (
     MODEL_VERSION,
     SIGNATURE_LENGTH,
+    ObjectModel,
     model_object,
     read_object_model,
     signature,
@@ -138,7 +139,7 @@ def boards() -> AnalyticField:
 
 def on_boards(model: ObjectModel) -> tuple[Tensor, Tensor]:
     """Places on the faces of the lying board, in the model's frame, and the faces' normals."""
-    x, y = torch.meshgrid(torch.linspace(-0.45, 0.4, 18), torch.linspace(-0.35, 0.35, 15), indexing="ij")
+    x, y = torch.meshgrid(torch.linspace(-0.4, 0.25, 14), torch.linspace(-0.35, 0.35, 15), indexing="ij")
     places = [torch.stack([x, y, torch.full_like(x, z)], -1).reshape(-1, 3) for z in (0.003, 0.008)]
     normals = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]).repeat_interleave(len(places[0]), 0)
     return model.frame.into(torch.cat(places)), normals
