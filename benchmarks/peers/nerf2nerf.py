@@ -79,7 +79,7 @@ class Nerf2nerf:
         seconds = time.perf_counter() - begun
         each = 1000 * (time.process_time() - processor) / taken
         note = f"{taken} steps, {each:.1f} ms of processor time each"
-        return PeerResult(run.motion.transform().detach(), seconds, run.evaluations, note)
+        return PeerResult(run.transform(), seconds, run.evaluations, note)
 
 
 class RigidMotion:
@@ -126,6 +126,11 @@ class _Run:
     def evaluations(self) -> int:
         return self.scene.evaluations + self.obj.evaluations
 
+    def transform(self) -> Sim3:
+        """The motion now, without a graph."""
+        with torch.no_grad():
+            return self.motion.transform()
+
     def step(self, number: int, cooling: float) -> float:
         """One step of Adam, after a step of the samples when it is time. Returns the mean |residual|, object units."""
         if number and number % _EVERY == 0:
@@ -143,7 +148,7 @@ class _Run:
 
     def _move_samples(self) -> None:
         """One Metropolis-Hastings step of every sample."""
-        T = self.motion.transform().detach()
+        T = self.transform()
         shake = torch.randn(self.samples.shape, generator=self.generator).to(self.samples)
         proposed = self.samples + _PROPOSAL * self.diameter * shake
         distance = self.scene.signed_distance(proposed)
