@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,8 +17,15 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.observation import ColorFunction, field_repr
 from regnf_core.schema.kinds import MeshDescription
 
+Array = NDArray[np.float64]
 _INSIDE = 0.5
 _ON_SURFACE = 1e-9
+_TRIED = 1000
+"""Points at which normals have to say what the winding number says before they are used: they take a tenth of its time."""
+_ON_EDGE = 1e-6
+"""A share of a triangle's corner below which a point is on the opposite edge."""
+_DECIDED = 0.01
+"""Cosine to the normal below which the winding number says the side."""
 
 
 class MeshField:
@@ -42,7 +50,7 @@ class MeshField:
         inside_above: float = _INSIDE,
         colors: NDArray[np.float32] | None = None,
     ) -> None:
-        self.vertices: NDArray[np.float64] = np.ascontiguousarray(vertices, dtype=np.float64)
+        self.vertices: Array = np.ascontiguousarray(vertices, dtype=np.float64)
         self.faces: NDArray[np.int64] = np.ascontiguousarray(faces, dtype=np.int64)
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or not np.isfinite(self.vertices).all():
             raise FieldFormatError("mesh vertices are not finite (V, 3) numbers", reason="MESH_INVALID")
@@ -97,16 +105,42 @@ class MeshField:
         queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64).reshape(-1, 3)
         if len(queries) == 0:
             return torch.zeros(0), torch.zeros(0, 3)
-        nearest, winding = self._trees
+        nearest = self._trees[0]
         squared, triangles, closest = nearest.squared_distance(self.vertices, self.faces, queries)
-        inside = winding.winding_number(queries) > self._inside_above
-        sign = np.where(inside, -1.0, 1.0)
         distance = np.sqrt(squared)
+        sign = self._sign(queries, triangles.reshape(-1), closest, distance)
         with np.errstate(divide="ignore", invalid="ignore"):
             gradient = (queries - closest) * (sign / distance)[:, None]
         touching = distance < _ON_SURFACE
         gradient[touching] = self._normals_and_areas(self.faces[triangles[touching].reshape(-1)])[0]
         return _as_float32(sign * distance), _as_float32(gradient)
+
+    def _sign(self, queries: Array, triangles: NDArray[Any], closest: Array, distance: Array) -> Array:
+        """-1 inside and +1 outside (N,) at points (N, 3) with their closest points (N, 3) on triangles (N,)."""
+        if self._normals is None:
+            return self._winding_sign(queries)
+        sign, undecided = self._normals.sign(queries, triangles, closest, distance)
+        if undecided.any():
+            sign[undecided] = self._winding_sign(queries[undecided])
+        return sign
+
+    def _winding_sign(self, queries: Array) -> Array:
+        return np.where(self._trees[1].winding_number(queries) > self._inside_above, -1.0, 1.0)
+
+    @cached_property
+    def _normals(self) -> _PseudoNormals | None:
+        """None where the side does not follow from the closest point: open meshes, and parts that cross each other."""
+        normals = _PseudoNormals.of(self)
+        if normals is None:
+            return None
+        rng = np.random.default_rng(0)
+        points = self.sample_surface(_TRIED, rng)
+        points += (
+            rng.normal(size=points.shape) * np.geomspace(1e-4, 0.1, _TRIED)[:, None] * np.ptp(points, axis=0).max()
+        )
+        squared, triangles, closest = self._trees[0].squared_distance(self.vertices, self.faces, points)
+        sign, undecided = normals.sign(points, triangles.reshape(-1), closest, np.sqrt(squared))
+        return normals if (undecided | (sign == self._winding_sign(points))).all() else None
 
     def _color(self, points: Tensor, directions: Tensor) -> Tensor:
         """That of the closest point of the mesh, interpolated between the corners of its triangle."""
@@ -120,7 +154,7 @@ class MeshField:
         shares = _barycentric(closest, self.vertices[corners])
         return _as_float32(np.einsum("nk,nkc->nc", shares, self.colors[corners]).clip(0.0, 1.0))
 
-    def sample_surface(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    def sample_surface(self, count: int, rng: np.random.Generator) -> Array:
         """``count`` points (count, 3), uniform over the surface's area."""
         areas = self._normals_and_areas(self.faces)[1]
         chosen = rng.choice(len(self.faces), size=count, p=areas / areas.sum())
@@ -128,7 +162,7 @@ class MeshField:
         flip = a + b > 1.0
         a, b = np.where(flip, 1.0 - a, a), np.where(flip, 1.0 - b, b)
         corner, first, second = (self.vertices[self.faces[chosen, i]] for i in range(3))
-        points: NDArray[np.float64] = corner + a * (first - corner) + b * (second - corner)
+        points: Array = corner + a * (first - corner) + b * (second - corner)
         return points
 
     @cached_property
@@ -139,12 +173,58 @@ class MeshField:
         winding.init(self.vertices, self.faces)
         return nearest, winding
 
-    def _normals_and_areas(self, faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _normals_and_areas(self, faces: NDArray[np.int64]) -> tuple[Array, Array]:
         """Unit normals (F, 3) and areas (F,) of these triangles (F, 3)."""
         corner, first, second = (self.vertices[faces[:, i]] for i in range(3))
         cross = np.cross(first - corner, second - corner)
         norm = np.linalg.norm(cross, axis=1)
         return cross / np.maximum(norm, 1e-300)[:, None], norm / 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class _PseudoNormals:
+    """Normals whose side of a closed mesh is that of every point closest to where they stand (Baerentzen and Aanaes
+    2005): of triangles, of edges the sum of both triangles', of vertices the sum weighted by angle.
+
+    corners: (F, 3, 3) · normals: (F, 7, 3), of the triangle, of the edges opposite to its corners, of its corners.
+    """
+
+    corners: Array
+    normals: Array
+
+    @classmethod
+    def of(cls, mesh: MeshField) -> _PseudoNormals | None:
+        """None where not every edge is shared by two triangles, one in each direction, or one has no area."""
+        faces, count = mesh.faces, len(mesh.vertices)
+        first, second = np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)  # of the edge opposite to each corner
+        edges, reverse = (first * count + second).reshape(-1), (second * count + first).reshape(-1)
+        order, of_reverse = np.argsort(edges), np.argsort(reverse)
+        paired = np.array_equal(edges[order], reverse[of_reverse]) and (np.diff(edges[order]) > 0).all()
+        facing, areas = mesh._normals_and_areas(faces)
+        if not paired or areas.min() <= 0.0:
+            return None
+        across = np.empty_like(order)
+        across[of_reverse] = order // 3
+        corners = mesh.vertices[faces]
+        sides = np.roll(corners, -1, axis=1) - corners
+        sides /= np.linalg.norm(sides, axis=-1, keepdims=True)
+        angles = np.arccos(-np.einsum("fcx,fcx->fc", sides, np.roll(sides, 1, axis=1)).clip(-1.0, 1.0))
+        weighted, at_vertices = angles[..., None] * facing[:, None], np.zeros_like(mesh.vertices)
+        np.add.at(at_vertices, faces, weighted)
+        at_edges = facing[:, None] + facing[across.reshape(-1, 3)]
+        normals = np.concatenate((facing[:, None], at_edges, at_vertices[faces]), axis=1)
+        return cls(corners, normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-300))
+
+    def sign(
+        self, queries: Array, triangles: NDArray[Any], closest: Array, distance: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """-1 or +1 (N,), and where this is not decided (N,)."""
+        shares = _barycentric(closest, self.corners[triangles])
+        none = shares < _ON_EDGE  # of these corners
+        kind = np.where(none.sum(axis=1) == 1, 1 + none.argmax(axis=1), 0)  # on an edge, or within the triangle
+        kind = np.where(none.sum(axis=1) >= 2, 4 + shares.argmax(axis=1), kind)  # on a vertex
+        height = np.einsum("nx,nx->n", queries - closest, self.normals[triangles, kind])
+        return np.where(height < 0.0, -1.0, 1.0), ~(np.abs(height) >= _DECIDED * distance)
 
 
 def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None) -> MeshField:
@@ -157,7 +237,7 @@ def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor], colo
     return MeshField(vertices, faces, description.function_bounds, description.inside_above, painted)
 
 
-def _barycentric(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _barycentric(points: Array, corners: Array) -> Array:
     """Shares (N, 3) of the corners (N, 3, 3) of triangles at points (N, 3) on them; of a triangle without area, equal.
 
     The shares are those of the areas opposite to the corners.
@@ -165,7 +245,7 @@ def _barycentric(points: NDArray[np.float64], corners: NDArray[np.float64]) -> N
     sides = np.roll(corners, -1, axis=1) - points[:, None], np.roll(corners, -2, axis=1) - points[:, None]
     areas = np.linalg.norm(np.cross(*sides), axis=-1)  # (N, 3)
     whole = areas.sum(axis=1, keepdims=True)
-    shares: NDArray[np.float64] = np.where(whole > 0.0, areas / np.maximum(whole, 1e-300), 1.0 / 3.0)
+    shares: Array = np.where(whole > 0.0, areas / np.maximum(whole, 1e-300), 1.0 / 3.0)
     return shares
 
 

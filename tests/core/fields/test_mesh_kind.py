@@ -62,6 +62,57 @@ def test_a_query_looks_at_the_normals_of_touched_triangles_alone(monkeypatch: py
     assert float(gradient[-1] @ torch.nn.functional.normalize(on_surface[0], dim=0).float()) > 0.9
 
 
+def blade() -> trimesh.Trimesh:
+    """A wedge whose edge has an angle of 6 degrees: near it the normal of one face says nothing of the side."""
+    vertices = [[0, -1, 0.05], [0, -1, -0.05], [1, -1, 0], [0, 1, 0.05], [0, 1, -0.05], [1, 1, 0]]
+    faces = [[0, 1, 2], [3, 5, 4], [0, 3, 1], [3, 4, 1], [0, 2, 3], [2, 5, 3], [1, 4, 2], [4, 5, 2]]
+    return trimesh.Trimesh(vertices, faces)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        trimesh.creation.icosphere(2),
+        trimesh.creation.box([1, 2, 0.01]),
+        trimesh.creation.annulus(0.4, 0.5, 1.0),
+        blade(),
+    ],
+)
+def test_normals_of_a_closed_mesh_say_the_side(mesh: trimesh.Trimesh) -> None:
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    field = MeshField(mesh.vertices, mesh.faces)
+    assert field._normals is not None
+    points = np.random.default_rng(1).uniform(-1.2, 1.2, (4000, 3)) * mesh.extents
+    points[::2] = field.sample_surface(2000, np.random.default_rng(2)) + points[::2] * 0.01
+    inside = field.signed_distance(torch.from_numpy(points)).numpy() < 0
+    exact = np.abs(winding_number(mesh, points)) > 0.5
+    assert 20 < exact.sum() < 3980
+    np.testing.assert_array_equal(inside, exact)
+
+
+def winding_number(mesh: trimesh.Trimesh, points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The sum of the triangles' solid angles over 4 pi (van Oosterom and Strackee 1983)."""
+    a, b, c = (mesh.triangles[None, :, i] - points[:, None] for i in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+    top = np.einsum("nfx,nfx->nf", a, np.cross(b, c))
+    ab, bc, ca = ((u * v).sum(-1) for u, v in ((a, b), (b, c), (c, a)))
+    return np.arctan2(top, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi)
+
+
+def test_the_winding_number_says_the_side_where_normals_cannot() -> None:
+    crossing = trimesh.util.concatenate([trimesh.creation.box([2, 1, 1]), trimesh.creation.box([1, 2, 1])])
+    opened = trimesh.creation.box([1, 1, 1])
+    opened.update_faces(np.arange(len(opened.faces)) != 0)
+    for mesh, points in (
+        (crossing, [[0.0, 0.499, 0.0], [0.7, 0.7, 0.0]]),
+        (opened, [[0.0, 0.0, 0.0], [0.7, 0.7, 0.0]]),
+    ):
+        field = MeshField(mesh.vertices, mesh.faces)
+        assert field._normals is None
+        assert (field.signed_distance(torch.tensor(points)) < 0).tolist() == [True, False]
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
