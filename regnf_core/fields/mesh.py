@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _INSIDE = 0.5
 _ON_SURFACE = 1e-9
 _TRIED = 1000
-"""Points at which normals have to say what the winding number says before they are used: they take a tenth of its time."""
+"""Points at which normals have to agree with the winding number; else the winding number is used, ten times slower."""
 _ON_EDGE = 1e-6
 """A share of a triangle's corner below which a point is on the opposite edge."""
 _DECIDED = 0.01
