@@ -7,6 +7,7 @@ depend on the choice of angles, and distances between true and estimated surface
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+from regnf_core.fields.native import steps as compiled
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
 
@@ -56,7 +58,10 @@ class NearestNeighbors:
 
     def __init__(self, points: Tensor) -> None:
         self.points = points.detach()
-        self._tree = cKDTree(self.points.numpy()) if points.device.type == "cpu" else None
+
+    @cached_property
+    def _tree(self) -> Any:
+        return cKDTree(self.points.numpy())
 
     def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (N,) to the nearest point and its index (N,), for points (N, 3)."""
@@ -66,8 +71,13 @@ class NearestNeighbors:
     def query_several(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Distances (N, K) to the nearest points, nearest first, and their indices (N, K); K = ``count``, at most M."""
         count = min(count, len(self.points))
-        if self._tree is None:
+        if self.points.device.type != "cpu":
             return nearest_of_all(self.points, points.detach(), count)
+        # Compiled code makes its tree for each call: half of the time where the tree is not what takes it.
+        if len(points) >= len(self.points):
+            found = compiled.nearest(self.points, points.detach(), count)
+            if found is not None:
+                return found
         distance, index = self._tree.query(points.detach().cpu().numpy(), k=range(1, count + 1))
         return torch.as_tensor(distance).to(points), torch.as_tensor(index, device=points.device)
 

@@ -21,10 +21,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from regnf_core.fields.native import steps as compiled
+from regnf_core.fields.native.library import Steps
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.working_frame import Samples, UnobservedTest, WorkingField, subsample
+from regnf_core.robust.working_frame import Samples, UnobservedTest, WorkingField, WorkingObservation, subsample
 
 
 class DistanceModel(Protocol):
@@ -133,6 +135,9 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
     """
     A, B = surfaces.scene_samples, surfaces.object_samples
     T = T.to(A.points)
+    steps = compiled.steps_for(A.points, B.points, T.scale)
+    if steps is not None and (A.unobserved is None or isinstance(A.unobserved, WorkingObservation)):
+        return _compiled(steps, surfaces, T, A.unobserved, offset)
     r1, J1, cosines1 = _scene_to_object(surfaces.obj, A, T, surfaces.ahead)
     r2, J2, cosines2, unobserved = _object_to_scene(surfaces.scene, B, T, A.unobserved)
     if offset is not None:
@@ -145,6 +150,25 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
         None if unobserved is None else torch.cat([_hidden(A, cosines1), unobserved], 1),
         offset,
     )
+
+
+def _compiled(
+    steps: Steps, surfaces: SurfacePair, T: Sim3, seen: WorkingObservation | None, offset: Tensor | None
+) -> Residuals:
+    """The same by compiled code."""
+    A, B = surfaces.scene_samples, surfaces.object_samples
+    n, total = len(A), len(A) + len(B)
+    rows = compiled.Rows(steps, len(T.scale), n, total, seen is not None)
+    for of_object, one, model in ((False, A, surfaces.obj), (True, B, surfaces.scene)):
+        ahead = 0.0 if of_object else surfaces.ahead
+        parts = (T.scale, T.rotation, T.translation), (one.points, one.values, one.normals)
+        asked = compiled.samples(*parts, of_object, ahead, EVIDENCE.min_inlier_cosine)
+        known = seen.compiled() if of_object and seen is not None else None
+        rows.fill(asked, of_object, model, known, None if of_object else one.hidden)
+    if offset is not None:
+        rows.values[:, :n] -= offset[:, None].to(rows.values)
+        rows.values[:, n:] += offset[:, None].to(rows.values)
+    return Residuals(rows.values, rows.jacobian.mT, rows.cosines, n, rows.unobserved, offset)
 
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3, ahead: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,6 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from regnf_core.errors import InvalidInputError
+from regnf_core.fields.native import steps as compiled
+from regnf_core.fields.native.steps import Kept
 from regnf_core.fields.observation import Observation, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.bundle import Bundle, CopiedOnce
@@ -210,6 +212,14 @@ class WorkingObservation:
         self.of_thing = observation.of_thing
         # A point x is in the voxel floor(x turn + shift), z fastest.
         self._parts = CopiedOnce(states, counts, turn, shift, ahead)
+        self._compiled: Kept | None = None
+
+    def compiled(self) -> Kept:
+        """The same for compiled code, on the CPU."""
+        if self._compiled is None:
+            states, counts, turn, shift, ahead = self._parts.on(torch.device("cpu"))
+            self._compiled = compiled.observation(states, counts, turn, shift, float(ahead), EVIDENCE.agreement)
+        return self._compiled
 
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""

@@ -4,6 +4,7 @@
  * Points are taken in blocks of BLOCK, padded where they are fewer, so that a point's result does not depend on those
  * beside it. Within a block each feature is a plane: one row of BLOCK numbers. */
 #include "block.h"
+#include "steps.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -99,3 +100,7 @@ void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float
         out[i] = which == 2 ? sine : cosine;
     }
 }
+
+const regnf_steps REGNF_STEPS(REGNF_SET) = {
+    places, sample_residuals, grid_distances, costs, normal_equations, nearest, kernel_sums,
+};

@@ -9,31 +9,34 @@ typedef struct {
     const char *name;
     regnf_evaluate_function *evaluate;
     regnf_elementary_function *elementary;
+    const regnf_steps *steps;
     int runs; /* on this processor */
 } variant;
 
 regnf_evaluate_function regnf_evaluate_plain;
 regnf_elementary_function regnf_elementary_plain;
+extern const regnf_steps regnf_steps_plain;
 
 #if defined(__x86_64__)
 #define VARIANTS 3
 regnf_evaluate_function regnf_evaluate_avx2, regnf_evaluate_avx512;
 regnf_elementary_function regnf_elementary_avx2, regnf_elementary_avx512;
+extern const regnf_steps regnf_steps_avx2, regnf_steps_avx512;
 
 static void list_variants(variant *all) {
     __builtin_cpu_init();
     const int narrow = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
     const int wide = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
                      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
-    all[0] = (variant){"avx512", regnf_evaluate_avx512, regnf_elementary_avx512, narrow && wide};
-    all[1] = (variant){"avx2", regnf_evaluate_avx2, regnf_elementary_avx2, narrow};
-    all[2] = (variant){"plain", regnf_evaluate_plain, regnf_elementary_plain, 1};
+    all[0] = (variant){"avx512", regnf_evaluate_avx512, regnf_elementary_avx512, &regnf_steps_avx512, narrow && wide};
+    all[1] = (variant){"avx2", regnf_evaluate_avx2, regnf_elementary_avx2, &regnf_steps_avx2, narrow};
+    all[2] = (variant){"plain", regnf_evaluate_plain, regnf_elementary_plain, &regnf_steps_plain, 1};
 }
 #else
 #define VARIANTS 1
 
 static void list_variants(variant *all) {
-    all[0] = (variant){"plain", regnf_evaluate_plain, regnf_elementary_plain, 1};
+    all[0] = (variant){"plain", regnf_evaluate_plain, regnf_elementary_plain, &regnf_steps_plain, 1};
 }
 #endif
 
@@ -69,4 +72,9 @@ OFFERED regnf_evaluate_function *regnf_evaluator(int number) {
 OFFERED regnf_elementary_function *regnf_elementary(int number) {
     variant found;
     return find(number, &found) ? found.elementary : NULL;
+}
+
+OFFERED const regnf_steps *regnf_steps_of(int number) {
+    variant found;
+    return find(number, &found) ? found.steps : NULL;
 }

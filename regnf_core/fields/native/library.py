@@ -13,20 +13,39 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 LIBRARY = Path(__file__).with_name("libregnf_evaluator.so")
 SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 1
-"""Of the structure in field.h."""
+_LAYOUT = 2
+"""Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
 """Addresses of field and points, their count, addresses of distances and gradients (None: not wanted) -> 0, or 1 when
 there is no memory."""
 Elementary = Callable[[int, int, int, int], None]
 """Which function, the address of its arguments, their count, the address of its results."""
+
+
+_ADDRESS, _COUNT = ctypes.c_void_p, ctypes.c_int64
+_STEPS: dict[str, tuple[Any, ...]] = {
+    "places": (None, _ADDRESS, _ADDRESS),
+    "residuals": (None, *(_ADDRESS,) * 6),
+    "grid": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "costs": (None, _ADDRESS, _ADDRESS),
+    "equations": (None, *(_ADDRESS,) * 4),
+    "nearest": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _COUNT, _COUNT, _ADDRESS, _ADDRESS),
+    "kernel_sums": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),
+}
+
+
+class Steps(ctypes.Structure):
+    """regnf_steps of field.h, member by member."""
+
+    _fields_ = tuple((name, ctypes.CFUNCTYPE(*types)) for name, types in _STEPS.items())
 
 
 @dataclass(frozen=True)
@@ -36,6 +55,7 @@ class Variant:
     name: str
     evaluate: Evaluate
     elementary: Elementary
+    steps: Steps
 
 
 @dataclass(frozen=True)
@@ -95,4 +115,6 @@ def _variant(code: ctypes.CDLL, number: int, name: str) -> Variant:
     evaluate = ctypes.CFUNCTYPE(ctypes.c_int, pointer, pointer, count, pointer, pointer)
     elementary = ctypes.CFUNCTYPE(None, ctypes.c_int, pointer, count, pointer)
     code.regnf_evaluator.restype = code.regnf_elementary.restype = pointer
-    return Variant(name, evaluate(code.regnf_evaluator(number)), elementary(code.regnf_elementary(number)))
+    code.regnf_steps_of.restype = ctypes.POINTER(Steps)
+    steps = code.regnf_steps_of(number).contents
+    return Variant(name, evaluate(code.regnf_evaluator(number)), elementary(code.regnf_elementary(number)), steps)

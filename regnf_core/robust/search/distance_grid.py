@@ -7,10 +7,13 @@ to compare thousands of poses; the fields themselves decide afterwards.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from regnf_core.fields.native import steps as compiled
+from regnf_core.fields.native.steps import Kept
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
@@ -47,8 +50,15 @@ class DistanceGrid(Bundle):
         planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)
         return cls(planes, *(corner[:, None] for corner in (low, high, edge)))
 
+    @cached_property
+    def _compiled(self) -> Kept:
+        return compiled.planes(_CELLS, self.low, self.high, self.edge, self.planes)
+
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (M,) and gradient (M, 3) at points (M, 3): the nearest cell's, carried on to the point."""
+        steps = compiled.steps_for(points, self.planes)
+        if steps is not None:
+            return compiled.grid_distances(steps, self._compiled, points)
         places = points.T.contiguous()
         inside = torch.minimum(torch.maximum(places, self.low), self.high)
         cell = ((inside - self.low) / self.edge).int().clamp_(0, _CELLS - 1)

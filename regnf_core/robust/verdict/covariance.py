@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from regnf_core.fields.native import steps as compiled
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
@@ -61,11 +62,8 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)
     rough = (variances * nuggets).sum()
     cov: Tensor = rough * (B @ B.mT)
-    squares, turned = (part.float() for part in _squares(inliers))
-    for length, smooth in zip(COVARIANCE.lengths, (variances * (1.0 - nuggets)).sum(1), strict=True):
-        if smooth > _TINY * variances.sum():
-            # float32 is enough for the kernel's (N, N) entries, which take most of the time
-            cov = cov + smooth * (B @ _smooth(squares, turned, length).double() @ B.mT)
+    weights = (variances * (1.0 - nuggets)).sum(1)
+    cov = cov + B @ _summed(inliers, weights * (weights > _TINY * variances.sum())).double() @ B.mT
     symmetric: Tensor = (cov + cov.mT) / 2.0
     return scales[:7, None] * symmetric * scales[:7]
 
@@ -129,6 +127,21 @@ def _squares(inliers: _Inliers) -> tuple[Tensor, Tensor]:
 def _smooth(squares: Tensor, turned: Tensor, length: Tensor | float) -> Tensor:
     """The kernel at squared distances of places and of normals."""
     return (-0.5 * (squares / length**2 + turned)).exp_()
+
+
+def _summed(inliers: _Inliers, weights: Tensor) -> Tensor:
+    """(N, N) float32: the sum of the kernels of all lengths, times weights (lengths,). Their entries take most of the
+    time."""
+    lengths = torch.tensor(COVARIANCE.lengths, dtype=torch.float64)
+    lengths, weights = lengths[weights > 0.0], weights[weights > 0.0]
+    found = compiled.kernel_sums(inliers.points, inliers.normals / COVARIANCE.normals_length, lengths, weights)
+    if found is not None:
+        return found
+    squares, turned = (part.float() for part in _squares(inliers))
+    total = torch.zeros_like(squares)
+    for length, weight in zip(lengths.tolist(), weights.tolist(), strict=True):
+        total += weight * _smooth(squares, turned, length)
+    return total
 
 
 def _likely_variances(inliers: _Inliers) -> Tensor:

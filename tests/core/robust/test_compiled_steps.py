@@ -1,0 +1,189 @@
+"""The compiled inner steps: against the tensor algebra that runs where there is no library, and against scipy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from regnf_core.fields.native import steps as compiled
+from regnf_core.fields.native.library import SWITCH
+from regnf_core.fields.observation import Observation
+from regnf_core.geometry.metrics import NearestNeighbors
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.refine.loss import normal_equations, observed_weight, robust_cost
+from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
+from regnf_core.robust.verdict import covariance
+from regnf_core.robust.working_frame import Samples, WorkingFrame, WorkingObservation
+from tests.core.fields.native_builds import variants
+
+NAMES = ("avx512", "avx2", "plain")
+
+
+@pytest.fixture(params=NAMES)
+def plainly(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Work is done by the code for one set of instructions; what is given to this is called without any."""
+    found = {one.name: one for one in variants()}
+    if request.param not in found:
+        pytest.skip(f"this processor does not run {request.param}")
+    monkeypatch.setattr(compiled, "variant", lambda: found[request.param])
+
+    def without(work: Any, *arguments: Any) -> Any:
+        with monkeypatch.context() as context:
+            context.setattr(compiled, "variant", lambda: None)
+            return work(*arguments)
+
+    return without
+
+
+class Blob:
+    """A smooth function of any sign with its gradient, not of unit length."""
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        return (3.0 * points).sin().sum(-1) / 3.0, (3.0 * points).cos()
+
+
+def samples(count: int, numbers: torch.Generator, **more: Any) -> Samples:
+    points = 0.5 * normalize(torch.randn(count, 3, generator=numbers), dim=-1)
+    values = 0.01 * torch.randn(count, generator=numbers)
+    return Samples(points, values, normalize(torch.randn(count, 3, generator=numbers), dim=-1), **more)
+
+
+def poses(count: int, numbers: torch.Generator) -> Sim3:
+    step = torch.cat(
+        [0.8 * torch.randn(count, 3, generator=numbers), 0.2 * torch.randn(count, 4, generator=numbers)], 1
+    )
+    return Sim3.identity().expand(count).perturb(step.double())
+
+
+def observed(numbers: torch.Generator) -> WorkingObservation:
+    states = torch.randint(0, 3, (9, 7, 8), generator=numbers).to(torch.uint8)
+    frame = WorkingFrame(torch.tensor([0.1, 0.0, -0.1], dtype=torch.float64), 1.3)
+    return WorkingObservation(Observation(states, torch.tensor([-0.7, -0.6, -0.8], dtype=torch.float64), 0.17), frame)
+
+
+def pair(partial: bool, grid: bool, seed: int) -> tuple[SurfacePair, Sim3]:
+    numbers = torch.Generator().manual_seed(seed)
+    seen = observed(numbers) if partial else None
+    hidden = torch.rand(101, generator=numbers) < 0.4 if partial else None
+    scene, obj = samples(101, numbers, unobserved=seen, hidden=hidden), samples(67, numbers)
+    models = [distance_grid(samples(300, numbers), 0.1) if grid else Blob() for _ in range(2)]
+    return SurfacePair(models[0], models[1], scene, obj, 0.02 if partial else 0.0), poses(5, numbers)
+
+
+def alike(found: Residuals, expected: Residuals) -> None:
+    torch.testing.assert_close(found.values, expected.values, rtol=1e-5, atol=2e-6)
+    torch.testing.assert_close(found.jacobian, expected.jacobian, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found.cosines, expected.cosines, rtol=1e-5, atol=1e-5)
+    assert found.scene_count == expected.scene_count
+    assert (found.unobserved is None) == (expected.unobserved is None)
+    if found.unobserved is not None:
+        torch.testing.assert_close(found.unobserved, expected.unobserved)
+        assert 0.1 < float(found.unobserved.double().mean()) < 0.9
+
+
+@pytest.mark.parametrize("offset", [None, 0.03])
+@pytest.mark.parametrize("grid", [False, True])
+@pytest.mark.parametrize("partial", [False, True])
+def test_residuals(partial: bool, grid: bool, offset: float | None, plainly: Any) -> None:
+    surfaces, T = pair(partial, grid, seed=3)
+    offsets = None if offset is None else torch.linspace(-offset, offset, len(T.scale), dtype=torch.float64)
+    alike(residuals(surfaces, T, offsets), plainly(residuals, surfaces, T, offsets))
+
+
+@pytest.mark.parametrize("normals", [True, False])
+@pytest.mark.parametrize("partial", [False, True])
+@pytest.mark.parametrize("offset", [False, True])
+def test_cost_and_normal_equations(partial: bool, normals: bool, offset: bool, plainly: Any) -> None:
+    surfaces, T = pair(partial, grid=False, seed=4)
+    r = residuals(surfaces, T, torch.full((5,), 0.02, dtype=torch.float64) if offset else None)
+    width, weight = torch.linspace(0.02, 0.3, 5)[:, None], observed_weight(r)
+    assert (weight is None) != partial
+    given = r, width, normals, weight
+    torch.testing.assert_close(robust_cost(*given), plainly(robust_cost, *given), rtol=1e-5, atol=1e-7)
+    for found, expected in zip(normal_equations(*given), plainly(normal_equations, *given), strict=True):
+        assert found.shape[-1] == (8 if offset else 7)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_places_beyond_a_grid_and_places_that_are_not_finite(plainly: Any) -> None:
+    grid = distance_grid(samples(200, torch.Generator().manual_seed(1)), 0.1)
+    points = torch.cat([torch.linspace(-3.0, 3.0, 60).view(-1, 3), torch.tensor([[float("nan"), 0.0, 0.0]])])
+    found, expected = grid.value_and_gradient(points), plainly(grid.value_and_gradient, points)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one[:-1], other[:-1], rtol=1e-5, atol=1e-6)
+        assert bool(one[-1].isnan().any())
+
+
+def test_a_place_in_a_strange_observation_is_not_seen(plainly: Any) -> None:
+    """A pose that is not finite, or far off, reads nothing beyond the voxels."""
+    surfaces, T = pair(partial=True, grid=False, seed=5)
+    T = replace(
+        T, translation=torch.tensor([[1e30] * 3, [float("nan")] * 3, [float("inf")] * 3, [-1e9] * 3, [0.0] * 3])
+    )
+    found = residuals(surfaces, T)
+    assert found.unobserved is not None
+    assert bool(found.unobserved[:4, found.scene_count :].all())
+
+
+@pytest.mark.parametrize("count", [1, 4, 16])
+@pytest.mark.parametrize("form", ["volume", "line", "one place", "grid"])
+def test_nearest_points(form: str, count: int, plainly: Any) -> None:
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(500, 3)) * {"line": [1.0, 0.0, 0.0], "one place": 0.0}.get(form, 1.0)
+    if form == "grid":
+        points = np.round(points * 2.0)
+    places = rng.normal(size=(900, 3)) * 2.0
+    given = torch.from_numpy(points), torch.from_numpy(places), count
+    found = compiled.nearest(*given)
+    assert found is not None
+    distance, number = (part.numpy() for part in found)
+    np.testing.assert_allclose(
+        distance, cKDTree(points).query(places, k=range(1, count + 1))[0], rtol=1e-12, atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.norm(points[number] - places[:, None], axis=-1), distance, rtol=1e-12)
+    assert all(len(set(row)) == count for row in number.tolist())
+    assert plainly(compiled.nearest, *given) is None
+
+
+def test_what_is_not_finite_is_left_to_the_other_search(plainly: Any) -> None:
+    good, bad = torch.zeros(3, 3), torch.tensor([[0.0, float("nan"), 0.0]]).expand(5, 3)
+    assert compiled.nearest(bad, good, 1) is None
+    assert compiled.nearest(good, bad, 1) is None
+    search = NearestNeighbors(good)
+    for ask in (search.query, lambda places: plainly(search.query, places)):
+        with pytest.raises(ValueError, match="finite"):
+            ask(bad)
+
+
+def test_sums_of_kernels(plainly: Any) -> None:
+    numbers = torch.Generator().manual_seed(6)
+    one = samples(300, numbers)
+    inliers = covariance._Inliers(one.points.double(), one.normals.double(), *(torch.empty(300) for _ in range(4)))
+    weights = torch.rand(10, generator=numbers).double()
+    weights[::3] = 0.0
+    found, expected = covariance._summed(inliers, weights), plainly(covariance._summed, inliers, weights)
+    torch.testing.assert_close(found, expected, rtol=2e-5, atol=1e-6)
+
+
+def test_a_switch_turns_all_of_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, "0")
+    assert compiled.steps_for(torch.zeros(1)) is None
+    assert compiled.nearest(torch.zeros(2, 3), torch.zeros(2, 3), 1) is None
+    assert compiled.kernel_sums(torch.zeros(2, 3), torch.zeros(2, 3), torch.ones(1), torch.ones(1)) is None
+
+
+def test_derivatives_and_other_numbers_go_through_tensor_algebra(plainly: Any) -> None:
+    assert compiled.steps_for(torch.zeros(1)) is not None
+    assert compiled.steps_for(torch.zeros(1, requires_grad=True)) is None
+    assert compiled.steps_for(torch.zeros(1, dtype=torch.float64)) is None
+    grid = distance_grid(samples(50, torch.Generator().manual_seed(1)), 0.1)
+    assert isinstance(grid, DistanceGrid)
+    assert grid.value_and_gradient(torch.zeros(2, 3, requires_grad=True))[0].requires_grad
