@@ -191,17 +191,16 @@ def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) 
     """
     T, scores, points = T.on("cpu"), scores.cpu(), points.cpu()
     order = scores.argsort()
-    placed = T[order].inverse().apply(points.double()).mT.contiguous()  # (H, 3, N)
-    reach = (apart / T.scale[order].double()).square().tolist()
-    numbers: list[int] = order.tolist()
+    # Plain arrays: a call costs less there, and all of them are small.
+    placed = T[order].inverse().apply(points.double()).mT.contiguous().numpy()  # (H, 3, N)
+    reach = (apart / T.scale[order].double()).square().numpy()
+    numbers, left = order.numpy(), np.arange(len(order))
     chosen: list[int] = []
-    left = torch.arange(len(order))
     while len(left) and len(chosen) < limit:
-        best, others = int(left[0]), placed[1:]
-        chosen.append(numbers[best])
-        squares = (others - placed[0]).square().sum(1).amax(-1)
-        far = (~(squares < reach[best])).nonzero().squeeze(-1)
-        left, placed = left[1:][far], others[far]
+        chosen.append(int(numbers[left[0]]))
+        squares = np.square(placed[1:] - placed[0]).sum(1).max(-1)
+        far = ~(squares < reach[left[0]])
+        left, placed = left[1:][far], placed[1:][far]
     return torch.tensor(chosen, dtype=torch.long)
 
 
