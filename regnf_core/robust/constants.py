@@ -265,8 +265,8 @@ class VerdictConstants:
     max_hidden: float = 0.95
     # The same where a detection in an image says which surface is the thing's. [simulated frames]
     max_hidden_of_thing: float = 0.98
-    # The least probability there: of 157 answers, eighths of the objects left out, 1 of 59 from here on is wrong, 1 of
-    # 7 from .8 to it, and 4 of 14 from .6 to .8. [simulated frames]
+    # The least probability there: of 737 answers, eighths of the objects left out, 5 of 327 from here on are wrong, 9
+    # of 49 from .8 to it, and 21 of 53 from .6 to .8. [simulated frames]
     min_probability_of_thing: float = 0.9
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
     # better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right
