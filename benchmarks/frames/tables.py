@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from benchmarks.robust.judging import SUCCESS
 Row = dict[str, Any]
 ACCEPTED = ("registered", "ambiguous")
 _BINS = ((0.5, 1.01), (0.2, 0.5), (0.1, 0.2))
+_EDGES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 1.01)
 
 
 def success(row: Row) -> bool:
@@ -52,7 +54,24 @@ def markdown(rows: Sequence[Row]) -> str:
         f"Expected calibration error: {calibration(rows):.3f}; of the right questions {calibration(right):.3f};"
         f" of single views {calibration(single):.3f}.",
     ]
-    return "\n".join(lines) + "\n"
+    groups = {
+        "sensor": lambda row: row["sensor"],
+        "size": lambda row: "furniture" if row["furniture"] else "small things",
+        "detection": lambda row: row["detection"].split()[0],
+    }
+    lines += ["", "| by | frames | best pose right | right and accepted | of these registered | wrong | of accepted |"]
+    lines += ["|---|---|---|---|---|---|---|", *(grouped(right, by) for by in groups.values())]
+    return "\n".join([*lines, "", *_reliability([row for row in rows if row["asked"] != "altered"])]) + "\n"
+
+
+def _reliability(rows: Sequence[Row]) -> list[str]:
+    lines = ["| probability said, without altered objects | answers | mean said | right |", "|---|---|---|---|"]
+    told = [(row["probability"], row["listed_error"] <= SUCCESS) for row in rows if "probability" in row]
+    for low, high in pairwise(_EDGES):
+        said = np.array([one for one in told if low <= one[0] < high], dtype=np.float64).reshape(-1, 2)
+        mean, held = said.mean(0) if len(said) else (float("nan"), float("nan"))
+        lines.append(f"| {low:g} to {min(high, 1.0):g} | {len(said)} | {mean:.3f} | {held:.3f} |")
+    return lines
 
 
 def _counted(rows: Sequence[Row]) -> str:
@@ -82,4 +101,4 @@ def grouped(rows: Sequence[Row], by: Callable[[Row], Any]) -> str:
     """The counts of the right questions by a fact."""
     right = [row for row in rows if row["asked"] == "right"]
     keys = sorted({by(row) for row in right}, key=str)
-    return "\n".join(f"| {key} | {_counted([row for row in right if by(row) == key])} |" for key in keys) + "\n"
+    return "\n".join(f"| {key} | {_counted([row for row in right if by(row) == key])} |" for key in keys)
