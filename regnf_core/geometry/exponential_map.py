@@ -11,7 +11,9 @@ scale exp(sigma), rotation exp(skew(omega)) and translation W rho with
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.rotations import rotation_rows
@@ -24,6 +26,20 @@ def matrix_from_quaternion(q: Tensor) -> Tensor:
     x, y, z, w = q.unbind(-1)
     rows = rotation_rows(x, y, z, w)
     return torch.stack([entry for row in rows for entry in row], dim=-1).reshape(*q.shape[:-1], 3, 3)
+
+
+def _entries() -> Tensor:
+    """(16, 9): the entries of R - 1 as sums of products of the quaternion's numbers. All terms are of second degree, so
+    that they follow from the values at sums of two unit vectors."""
+    unit = np.eye(4)
+
+    def at(q: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.array(rotation_rows(*q)).reshape(9) - np.eye(3).reshape(9)
+
+    return torch.from_numpy(np.array([(at(a + b) - at(a) - at(b)) / 2.0 for a in unit for b in unit]))
+
+
+_ENTRIES = _entries()
 
 
 def quaternion_from_matrix(R: Tensor) -> Tensor:
@@ -86,7 +102,11 @@ def rotation_exp(omega: Tensor) -> Tensor:
     """Rotation vectors (..., 3) to matrices, through the quaternion: sinc has no trouble at zero."""
     angle = omega.norm(dim=-1, keepdim=True)
     vector = 0.5 * torch.sinc(angle / (2 * torch.pi)) * omega
-    return matrix_from_quaternion(torch.cat([vector, (angle / 2).cos()], dim=-1))
+    q = torch.cat([vector, (angle / 2).cos()], dim=-1)
+    # as of matrix_from_quaternion but for rounding, in five operations in place of forty
+    products = (q[..., :, None] * q[..., None, :]).flatten(-2)
+    turned: Tensor = (products @ _ENTRIES.to(q)).reshape(*q.shape[:-1], 3, 3)
+    return turned + torch.eye(3, dtype=q.dtype, device=q.device)
 
 
 def rotation_log(R: Tensor) -> Tensor:

@@ -200,7 +200,7 @@ def result_of(
         scene_samples=_surface(view.foreground, view.frame),
         object_samples=_surface(model.samples, model.frame),
         metrics={**evaluation.metrics, "field_evaluations": float(evaluations)},
-        trace=[_record(problem, number, step, winner) for number, step in enumerate(history)],
+        trace=_trace(problem, history, winner),
         residuals={},
         seed=seed,
         options=options.to_dict(),
@@ -216,22 +216,25 @@ def _surface(samples: Samples, frame: WorkingFrame) -> SurfaceSamples:
     return SurfaceSamples(frame.out_of(samples.on_surface()), samples.normals.cpu())
 
 
-def _record(problem: RegistrationProblem, iteration: int, step: Step, winner: int) -> IterationRecord:
-    """One iteration of the pose that won."""
+def _trace(problem: RegistrationProblem, history: Sequence[Step], winner: int) -> list[IterationRecord]:
+    """The iterations of the pose that won."""
     size = problem.model.frame.length
-    T = problem.in_field_frames(step.T[winner])
-    return IterationRecord(
-        iteration=iteration,
-        loss=float(step.costs[winner]),
-        residual_scene=float(step.residual_scene[winner]) * size,
-        residual_object=float(step.residual_object[winner]) * size / float(T.scale),
-        regularizer=0.0,
-        kernel_shape=_GEMAN_MCCLURE,
-        kernel_scale=step.width * size,
-        scene_samples=min(step.samples, len(problem.fit.scene_samples)),
-        object_samples=min(step.samples, len(problem.fit.object_samples)),
-        T_object_scene=T,
-    )
+    T = problem.in_field_frames(Sim3.cat([step.T[winner : winner + 1] for step in history]))
+    return [
+        IterationRecord(
+            iteration=number,
+            loss=float(step.costs[winner]),
+            residual_scene=float(step.residual_scene[winner]) * size,
+            residual_object=float(step.residual_object[winner]) * size / scale,
+            regularizer=0.0,
+            kernel_shape=_GEMAN_MCCLURE,
+            kernel_scale=step.width * size,
+            scene_samples=min(step.samples, len(problem.fit.scene_samples)),
+            object_samples=min(step.samples, len(problem.fit.object_samples)),
+            T_object_scene=T[number],
+        )
+        for number, (step, scale) in enumerate(zip(history, T.scale.tolist(), strict=True))
+    ]
 
 
 def cloud_region(detection: OrientedBox) -> Callable[[Tensor], Tensor]:

@@ -32,7 +32,7 @@ class RegistrationProblem(Bundle):
     bound: PoseBound
 
     def in_field_frames(self, T_work: Sim3) -> Sim3:
-        """A single pose between the working frames, on the CPU, as T_object_scene."""
+        """Poses between the working frames, on the CPU, as T_object_scene."""
         return self.model.frame.to_field() @ T_work @ self.view.frame.to_field().inverse()
 
     def in_working_frames(self, T_object_scene: Sim3) -> Sim3:

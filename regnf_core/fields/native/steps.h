@@ -238,11 +238,12 @@ static void normal_equations(const regnf_loss *l, const float *jacobian, double 
 /* (n, n): sums over `lengths` of weights times exp(factor |x_i - x_j|^2 - |u_i - u_j|^2 / 2); x, u: planes (3, n). */
 static void kernel_sums(const float *x, const float *u, int64_t n, const float *factors, const float *weights,
                         int64_t lengths, float *out) {
+    float *const sums = out;
     memset(out, 0, sizeof(float) * (size_t)(n * n));
     for (int64_t i = 0; i < n; i++, out += n)
-        for (int64_t first = 0; first < n; first += STRIP) {
+        for (int64_t first = 0; first <= i; first += STRIP) {
             const int64_t live = n - first < STRIP ? n - first : STRIP;
-            float places[STRIP], turned[STRIP];
+            strip places, turned;
             for (int64_t j = 0; j < live; j++) {
                 float at[3], to[3];
                 for (int k = 0; k < 3; k++) {
@@ -258,6 +259,8 @@ static void kernel_sums(const float *x, const float *u, int64_t n, const float *
                     out[first + j] += weights[l] * exp_of(power < -87.0f ? -87.0f : power);
                 }
         }
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < i; j++) sums[j * n + i] = sums[i * n + j];
 }
 
 #endif

@@ -162,12 +162,11 @@ def coarse_to_fine(
             candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
         few = surfaces.subsample(stage.points, context.generator)
         parts = []
-        for part in torch.split(torch.arange(len(candidates), device=candidates.scores.device), SEARCH.batch):
-            some = candidates[part]
+        for some in candidates.split(SEARCH.batch):
             settings = Settings(stage.widest, context.scale, context.max_offset, stage.normals, stage.keeps_scale)
             done = refined(few, some, stage, settings, context.on_step)
             parts.append(replace(done, scores=done.scores + context.penalty(done.T)))
-        candidates = PoseCandidates.cat(parts)
+        candidates = parts[0] if len(parts) == 1 else PoseCandidates.cat(parts)
         left = survivors(candidates, context.admits(candidates.T), stage, context.extremal_points)
         candidates = candidates[left.to(candidates.scores.device)]
         surfaces.require_finite()

@@ -47,6 +47,12 @@ class PoseCandidates(Bundle):
     def __len__(self) -> int:
         return int(self.scores.numel())
 
+    def split(self, size: int) -> list[PoseCandidates]:
+        """Parts of at most ``size`` poses."""
+        if len(self) <= size:
+            return [self]
+        return [self[part] for part in torch.split(torch.arange(len(self), device=self.scores.device), size)]
+
     def with_copies(self, count: int, spread: Sequence[float], generator: torch.Generator) -> PoseCandidates:
         """These, and ``count`` copies of each, moved at random: ``spread`` is the standard deviation of the rotation
         (radians), the translation and the log scale. Scores are those of the original. Drawn on the CPU."""
