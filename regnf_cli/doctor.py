@@ -215,7 +215,7 @@ def check_native() -> Iterator[Finding]:
     """One finding where the engine is installed. To be without compiled code is no fault."""
     if find_spec("torch") is None:
         return
-    from regnf_core.fields.native.library import NOT_BUILT, SWITCH, load
+    from regnf_core.native.library import NOT_BUILT, SWITCH, load
 
     found = load()
     if os.environ.get(SWITCH) == "0":

@@ -1,4 +1,4 @@
-"""Builds the native evaluator: the C files of regnf_core/fields/native as one library beside them.
+"""Builds the native evaluator: the C files of regnf_core/native as one library beside them.
 
     python scripts/native_library.py      # in a checkout; quick when nothing has changed
 
@@ -18,7 +18,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-FOLDER = Path("regnf_core/fields/native")
+FOLDER = Path("regnf_core/native")
 NAME = "libregnf_evaluator.so"
 OPTIONS = ("-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math")
 """None of them lets the compiler change the order of sums, or take NaN for a number."""

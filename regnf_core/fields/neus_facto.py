@@ -12,7 +12,7 @@ from torch import Tensor
 
 from regnf_core.fields.color_head import ColorHead, PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.native.evaluator import native_evaluator
+from regnf_core.fields.native_evaluator import native_evaluator
 from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
 from regnf_core.fields.user_fields import Evaluator, FunctionField
 from regnf_core.schema.kinds import SKIP_LAYER, NeusFactoDescription

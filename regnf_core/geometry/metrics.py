@@ -16,9 +16,9 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from regnf_core.fields.native import steps as compiled
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
 
 # Euler angles as the paper learns and reports them: roll, pitch, yaw about the fixed axes x, y, z, in that order.
 #

@@ -21,10 +21,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from regnf_core.fields.native import steps as compiled
-from regnf_core.fields.native.library import Steps
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
+from regnf_core.native.library import Steps
 from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.working_frame import Samples, UnobservedTest, WorkingField, WorkingObservation, subsample
 

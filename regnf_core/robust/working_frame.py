@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.fields.native import steps as compiled
-from regnf_core.fields.native.steps import Kept
 from regnf_core.fields.observation import Observation, SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.bundle import Bundle, CopiedOnce
 from regnf_core.geometry.metrics import NearestNeighbors, diameter
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
+from regnf_core.native.steps import Kept
 from regnf_core.robust.constants import EVIDENCE, OCCLUSION, SAMPLING
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_core.surface.requirements import MIN_POINTS, require_box_in_scene, require_surface

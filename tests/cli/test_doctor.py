@@ -11,7 +11,7 @@ import pytest
 
 from regnf_cli import doctor
 from regnf_cli.doctor import Finding
-from regnf_core.fields.native import library
+from regnf_core.native import library
 from regnf_state.settings import Settings
 from tests.cli.conftest import Run
 

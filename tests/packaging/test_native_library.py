@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from regnf_core import open_field
-from regnf_core.fields.native import library
+from regnf_core.native import library
 from scripts import native_library, wheel_hook
 from scripts.native_library import NAME, NotBuiltError, build, sources_digest
 from tests.packaging.environments import ROOT, build_wheel

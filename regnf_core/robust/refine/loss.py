@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.fields.native import steps as compiled
-from regnf_core.fields.native.steps import Kept
+from regnf_core.native import steps as compiled
+from regnf_core.native.steps import Kept
 from regnf_core.robust.constants import EVIDENCE, REFINEMENT
 from regnf_core.robust.residuals import Residuals, geman_mcclure_agreement, geman_mcclure_weight
 

@@ -12,11 +12,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from regnf_core.fields.native import steps as compiled
-from regnf_core.fields.native.steps import Kept
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
+from regnf_core.native.steps import Kept
 from regnf_core.robust.constants import FEATURES, SEARCH
 from regnf_core.robust.working_frame import Samples, on_host
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings

@@ -20,10 +20,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from regnf_core.fields.native import steps as compiled
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
 from regnf_core.robust.constants import COVARIANCE
 from regnf_core.robust.refine.loss import facing, kernel_widths, observed_weight, offset_prior, sample_weights
 from regnf_core.robust.residuals import Residuals, geman_mcclure_curvature, geman_mcclure_weight

@@ -8,7 +8,7 @@ from tempfile import mkdtemp
 
 import pytest
 
-from regnf_core.fields.native.library import LIBRARY, Library, Variant, load
+from regnf_core.native.library import LIBRARY, Library, Variant, load
 from scripts.native_library import NAME, NotBuiltError, build, sources_digest
 
 SOURCES = LIBRARY.parent

@@ -13,7 +13,7 @@ import torch
 
 from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.native.evaluator import NativeEvaluator, native_evaluator, suits
+from regnf_core.fields.native_evaluator import NativeEvaluator, native_evaluator, suits
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
 from regnf_core.schema.hash_grid_config import HashGridConfig
@@ -239,10 +239,10 @@ def test_a_field_uses_it_where_it_is_there_and_on(monkeypatch: pytest.MonkeyPatc
     (fastest, *_) = variants()
     one = random_function(1)
     field, points = NeusFactoField(one, BOUNDS), places(one)
-    monkeypatch.setattr("regnf_core.fields.native.evaluator.variant", lambda: fastest)
+    monkeypatch.setattr("regnf_core.fields.native_evaluator.variant", lambda: fastest)
     assert isinstance(native_evaluator(one), NativeEvaluator)
     value = field.signed_distance(points)
-    monkeypatch.setattr("regnf_core.fields.native.evaluator.variant", lambda: None)
+    monkeypatch.setattr("regnf_core.fields.native_evaluator.variant", lambda: None)
     assert native_evaluator(one) is None
     torch.testing.assert_close(field.signed_distance(points), value, rtol=0, atol=1e-5)
 

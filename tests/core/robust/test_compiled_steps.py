@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from regnf_core.fields.native import steps as compiled
-from regnf_core.fields.native.library import SWITCH
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
+from regnf_core.native.library import SWITCH
 from regnf_core.robust.refine.loss import normal_equations, observed_weight, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
 from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.color_head import PositionalEncoding
-from regnf_core.fields.native.library import Variant, variant
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
+from regnf_core.native.library import Variant, variant
 
 _CONTRACTIONS = {"none": 0, "linf": 1, "linf_grid": 2}
 _COUNTS = ("layers", "levels", "dense_levels", "features", "smoothstep", "directions", "degree", "contraction")

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 2 /* changes whenever a structure below does; regnf_core/fields/native/library.py has the same */
+#define REGNF_LAYOUT 2 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {

@@ -1,5 +1,5 @@
 """The inner steps by compiled code, on the CPU where the library was built: the same as the tensor algebra beside each
-of them, which runs elsewhere and which tests compare with. See regnf_core/fields/native/steps.h.
+of them, which runs elsewhere and which tests compare with. See regnf_core/native/steps.h.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from regnf_core.fields.native.library import Steps, variant
+from regnf_core.native.library import Steps, variant
 
 _MOST_NEAR = 64
 """As in near.h."""
