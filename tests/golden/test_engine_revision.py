@@ -196,7 +196,7 @@ def test_all_that_a_registration_loads_is_in_the_digest() -> None:
     missed = {name for name in done.stdout.split() if name not in engine}
     packages = {name for name in missed if ROOT.joinpath(*name.split("."), "__init__.py").exists()}
     assert missed - packages <= {"regnf_core.version"}
-    assert len([name for name in engine if "fields" in name]) > 15, "every kind of field"
+    assert len([name for name in engine if "fields" in name]) >= 15, "every kind of field"
     assert len(engine) > 50
 
 
