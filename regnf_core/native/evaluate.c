@@ -5,6 +5,7 @@
  * beside it. Within a block each feature is a plane: one row of BLOCK numbers. */
 #include "block.h"
 #include "steps.h"
+#include "discs.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -102,5 +103,5 @@ void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float
 }
 
 const regnf_steps REGNF_STEPS(REGNF_SET) = {
-    places, sample_residuals, grid_distances, costs, normal_equations, nearest, kernel_sums,
+    places, sample_residuals, grid_distances, costs, normal_equations, nearest, kernel_sums, nearest_discs,
 };

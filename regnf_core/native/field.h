@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 2 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 3 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -78,7 +78,7 @@ typedef struct {
     const uint8_t *unobserved;             /* (poses, total), or NULL */
 } regnf_loss;
 
-/* One set of the steps; see steps.h. */
+/* One set of the steps; see steps.h, near.h and discs.h. */
 typedef struct {
     void (*places)(const regnf_samples *, float *places);
     void (*residuals)(const regnf_samples *, const float *value, const float *gradient, const regnf_rows *,
@@ -90,6 +90,7 @@ typedef struct {
                    int64_t *number);
     void (*kernel_sums)(const float *x, const float *u, int64_t n, const float *factors, const float *weights,
                         int64_t lengths, float *out);
+    void (*discs)(const float *seen, const float *normals, int64_t n, int64_t size, float radius, int64_t *nearest);
 } regnf_steps;
 
 #define REGNF_JOIN(a, b) a##b

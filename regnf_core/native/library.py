@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 2
+_LAYOUT = 3
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -39,6 +39,7 @@ _STEPS: dict[str, tuple[Any, ...]] = {
     "equations": (None, *(_ADDRESS,) * 4),
     "nearest": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _COUNT, _COUNT, _ADDRESS, _ADDRESS),
     "kernel_sums": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),
+    "discs": (None, _ADDRESS, _ADDRESS, _COUNT, _COUNT, ctypes.c_float, _ADDRESS),
 }
 
 

@@ -26,6 +26,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.viewing.artifacts import write_artifacts
 from regnf_core.viewing.splats import Surfels, View, nearest_surfels, render
 from tests.core.conftest import ChairRun
+from tests.core.fields.native_builds import variants
 
 NAMES = [
     "scene_points.ply", "object_points.ply", "aligned.ply", "residuals.npz", "context_points.ply", "preview.png",
@@ -189,3 +190,21 @@ def test_a_picture_drawn_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setattr("regnf_core.viewing.splats._PIXELS_AT_ONCE", most)
         assert np.array_equal(nearest_surfels(cloud, view, 96, 0.4), whole)
     assert (whole >= 0).sum() > 1000
+
+
+@pytest.mark.parametrize(("count", "radius", "size"), [(4000, 3.0, 160), (300, 12.5, 90), (5, 40.0, 64)])
+def test_compiled_code_finds_the_same_discs(
+    count: int, radius: float, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of discs beyond the picture, and seen from the side."""
+    rng = np.random.default_rng(count)
+    normals = rng.normal(size=(count, 3))
+    surfels = Surfels(rng.normal(size=(count, 3)), normals / np.linalg.norm(normals, axis=1)[:, None], normals)
+    view = View(np.eye(3), np.zeros(3), size / 4)
+    for variant in variants():
+        monkeypatch.setattr("regnf_core.viewing.splats.variant", lambda variant=variant: variant)
+        found = nearest_surfels(surfels, view, size, radius * 4 / size)
+        monkeypatch.setattr("regnf_core.viewing.splats.variant", lambda: None)
+        expected = nearest_surfels(surfels, view, size, radius * 4 / size)
+        assert (expected >= 0).any()
+        assert (found != expected).mean() < 1e-3  # where two discs are as near, rounding decides
