@@ -35,14 +35,19 @@ _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable
 
 
 def registration_picture(result: RegistrationResult) -> Image.Image:
-    """Three panels side by side in the scene frame: at the start, at the end, and the residuals of both surfaces."""
+    """Three panels side by side: at the start, at the end, and the residuals of both surfaces. As the camera of the
+    detection's image sees them, if there is one; else upright in the scene's frame."""
     scene = _surfels(result.scene_samples, SCENE_COLOR)
     start, end = (
         _surfels(result.object_samples.transformed(T_object_scene.inverse()), OBJECT_COLOR)
         for T_object_scene in (result.T_object_scene_initial, result.T_object_scene)
     )
-    up = axis_vector(result.options["up_axis"] or "z").numpy()
-    direction = _best_direction(scene, up)
+    if result.camera is None:
+        up = axis_vector(result.options["up_axis"] or "z").numpy()
+        direction = _best_direction(scene, up)
+    else:
+        camera = result.camera.T_world_camera
+        up, direction = -camera.rotation[:, 1].numpy(), camera.translation.numpy() - scene.points.mean(0)
     edge = _PANEL * _OVERSAMPLING
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
     radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
