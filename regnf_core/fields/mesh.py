@@ -11,6 +11,8 @@ import igl
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
@@ -24,6 +26,7 @@ _TRIED = 1000
 """Points at which normals have to agree with the winding number; else the winding number is used, ten times slower."""
 _ON_EDGE = 1e-6
 """A share of a triangle's corner below which a point is on the opposite edge."""
+_MOST_PARTS = 500
 _DECIDED = 0.01
 """Cosine to the normal below which the winding number says the side."""
 
@@ -129,9 +132,14 @@ class MeshField:
 
     @cached_property
     def _normals(self) -> _PseudoNormals | None:
-        """None where the side does not follow from the closest point: open meshes, and parts that cross each other."""
+        """None where the side does not follow from the closest point: open meshes, and surface within other surface.
+
+        Parts that are close to each other, and all that differs at the points that are tried, use the winding number.
+        A part that crosses itself in less than about a thousandth of its surface may be missed: near the surface that
+        lies inside there, the sign is wrong.
+        """
         normals = _PseudoNormals.of(self)
-        if normals is None:
+        if normals is None or _boxes_meet(self.vertices, self.faces):
             return None
         rng = np.random.default_rng(0)
         points = self.sample_surface(_TRIED, rng)
@@ -186,11 +194,15 @@ class _PseudoNormals:
     """Normals whose side of a closed mesh is that of every point closest to where they stand (Baerentzen and Aanaes
     2005): of triangles, of edges the sum of both triangles', of vertices the sum weighted by angle.
 
-    corners: (F, 3, 3) · normals: (F, 7, 3), of the triangle, of the edges opposite to its corners, of its corners.
+    corners: (V, 3) · faces: (F, 3) · of_faces: (F, 3), unit normals · across: (F, 3), the triangle beyond the edge
+    opposite to each corner · of_vertices: (V, 3).
     """
 
     corners: Array
-    normals: Array
+    faces: NDArray[np.int64]
+    of_faces: Array
+    across: NDArray[np.int64]
+    of_vertices: Array
 
     @classmethod
     def of(cls, mesh: MeshField) -> _PseudoNormals | None:
@@ -209,21 +221,22 @@ class _PseudoNormals:
         sides = np.roll(corners, -1, axis=1) - corners
         sides /= np.linalg.norm(sides, axis=-1, keepdims=True)
         angles = np.arccos(-np.einsum("fcx,fcx->fc", sides, np.roll(sides, 1, axis=1)).clip(-1.0, 1.0))
-        weighted, at_vertices = angles[..., None] * facing[:, None], np.zeros_like(mesh.vertices)
-        np.add.at(at_vertices, faces, weighted)
-        at_edges = facing[:, None] + facing[across.reshape(-1, 3)]
-        normals = np.concatenate((facing[:, None], at_edges, at_vertices[faces]), axis=1)
-        return cls(corners, normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-300))
+        weighted = (angles[..., None] * facing[:, None]).reshape(-1, 3)
+        of_vertices: Array = np.stack([np.bincount(faces.reshape(-1), one, count) for one in weighted.T], axis=1)
+        return cls(mesh.vertices, faces, facing, across.reshape(-1, 3), of_vertices)
 
     def sign(
         self, queries: Array, triangles: NDArray[Any], closest: Array, distance: Array
     ) -> tuple[Array, NDArray[np.bool_]]:
         """-1 or +1 (N,), and where this is not decided (N,)."""
-        shares = _barycentric(closest, self.corners[triangles])
+        shares = _barycentric(closest, self.corners[self.faces[triangles]])
         none = shares < _ON_EDGE  # of these corners
-        kind = np.where(none.sum(axis=1) == 1, 1 + none.argmax(axis=1), 0)  # on an edge, or within the triangle
-        kind = np.where(none.sum(axis=1) >= 2, 4 + shares.argmax(axis=1), kind)  # on a vertex
-        height = np.einsum("nx,nx->n", queries - closest, self.normals[triangles, kind])
+        edge, vertex = none.sum(axis=1) == 1, none.sum(axis=1) >= 2
+        normals = self.of_faces[triangles]
+        normals[edge] += self.of_faces[self.across[triangles[edge], none[edge].argmax(axis=1)]]
+        normals[vertex] = self.of_vertices[self.faces[triangles[vertex], shares[vertex].argmax(axis=1)]]
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(min=1e-300)
+        height = np.einsum("nx,nx->n", queries - closest, normals)
         return np.where(height < 0.0, -1.0, 1.0), ~(np.abs(height) >= _DECIDED * distance)
 
 
@@ -235,6 +248,22 @@ def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor], colo
     vertices, faces = tensors["vertices"].cpu().numpy(), tensors["faces"].cpu().numpy()
     painted = None if colors is None else colors.float().cpu().numpy()
     return MeshField(vertices, faces, description.function_bounds, description.inside_above, painted)
+
+
+def _boxes_meet(vertices: Array, faces: NDArray[np.int64]) -> bool:
+    """Whether the bounding boxes of two connected parts of a mesh meet, or there are too many parts to ask."""
+    edges = (faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1))
+    graph = coo_array((np.ones(faces.size, np.bool_), edges), shape=(len(vertices), len(vertices)))
+    _, part_of = connected_components(graph, directed=False)
+    used = np.unique(faces)
+    parts, number = np.unique(part_of[used], return_inverse=True)
+    if len(parts) > _MOST_PARTS:
+        return True
+    low, high = np.full((len(parts), 3), np.inf), np.full((len(parts), 3), -np.inf)
+    np.minimum.at(low, number, vertices[used])
+    np.maximum.at(high, number, vertices[used])
+    meet = ((low[:, None] <= high) & (high[:, None] >= low)).all(-1)
+    return int(meet.sum()) > len(parts)
 
 
 def _barycentric(points: Array, corners: Array) -> Array:

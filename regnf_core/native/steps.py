@@ -73,7 +73,7 @@ def observation(states: Tensor, counts: Tensor, turn: Tensor, shift: Tensor, ahe
     """regnf_observation. states: uint8, of all voxels, z fastest · counts: (3,) · turn: (3, 3) · shift: (3,)."""
     arrays = {"turn": (_FLOAT * 9)(*turn.flatten().tolist()), "shift": (_FLOAT * 3)(*shift.tolist())}
     counted = (_I64 * 3)(*counts.tolist())
-    return Kept(_Observation, counts=counted, states=states, **arrays, ahead=ahead, agreement=agreement)
+    return Kept(_Observation, counts=counted, states=states.to(torch.uint8), **arrays, ahead=ahead, agreement=agreement)
 
 
 def planes(cells: int, low: Tensor, high: Tensor, edge: Tensor, planes: Tensor) -> Kept:
@@ -101,7 +101,10 @@ class Rows:
         count, poses = len(asked.tensors["points"]), len(asked.tensors["scale"])
         places = torch.empty(poses * count, 3)
         self._steps.places(asked.address, places.data_ptr())
-        value, gradient = (part.float().contiguous() for part in model.value_and_gradient(places))
+        value, gradient = (part.float() for part in model.value_and_gradient(places))
+        # The code trusts their sizes, and a caller's own field may have any: reshape raises RuntimeError then.
+        value, gradient = value.reshape(len(places)).contiguous(), gradient.reshape(len(places), 3).contiguous()
+        hidden = None if hidden is None else hidden.contiguous()
         arrays = {"values": self.values, "jacobian": self.jacobian, "cosines": self.cosines}
         if self.unobserved is not None:
             arrays["unobserved"] = self.unobserved
@@ -158,7 +161,7 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     """Distances (N, K) from places (N, 3) to the ``count`` nearest of points (M, 3), nearest first, and their numbers
     (N, K); None where there is no compiled code for it."""
     found = variant()
-    if found is None or points.device.type != "cpu" or count > _MOST_NEAR:
+    if found is None or points.device.type != "cpu" or not 1 <= count <= min(_MOST_NEAR, len(points)):
         return None
     if not (torch.isfinite(points).all() and torch.isfinite(places).all()):
         return None

@@ -91,6 +91,11 @@ def test_normals_of_a_closed_mesh_say_the_side(mesh: trimesh.Trimesh) -> None:
     np.testing.assert_array_equal(inside, exact)
 
 
+def together(*parts: trimesh.Trimesh) -> tuple[Any, Any]:
+    whole = trimesh.util.concatenate(list(parts))
+    return whole.vertices, whole.faces
+
+
 def winding_number(mesh: trimesh.Trimesh, points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """The sum of the triangles' solid angles over 4 pi (van Oosterom and Strackee 1983)."""
     a, b, c = (mesh.triangles[None, :, i] - points[:, None] for i in range(3))
@@ -102,6 +107,11 @@ def winding_number(mesh: trimesh.Trimesh, points: np.ndarray[Any, Any]) -> np.nd
 
 def test_the_winding_number_says_the_side_where_normals_cannot() -> None:
     crossing = trimesh.util.concatenate([trimesh.creation.box([2, 1, 1]), trimesh.creation.box([1, 2, 1])])
+    corner = trimesh.creation.box([2, 1, 1])  # of it so little lies within the other that no point tried would tell
+    corner.apply_translation([1.499, 0.999, 0.999])
+    assert MeshField(*together(trimesh.creation.box([1, 1, 1]), corner))._normals is None
+    corner.apply_translation([0.002, 0.002, 0.002])
+    assert MeshField(*together(trimesh.creation.box([1, 1, 1]), corner))._normals is not None
     opened = trimesh.creation.box([1, 1, 1])
     opened.update_faces(np.arange(len(opened.faces)) != 0)
     for mesh, points in (

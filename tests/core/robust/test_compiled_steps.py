@@ -78,7 +78,7 @@ def pair(partial: bool, grid: bool, seed: int) -> tuple[SurfacePair, Sim3]:
     return SurfacePair(models[0], models[1], scene, obj, 0.02 if partial else 0.0), poses(5, numbers)
 
 
-def alike(found: Residuals, expected: Residuals) -> None:
+def assert_alike(found: Residuals, expected: Residuals) -> None:
     torch.testing.assert_close(found.values, expected.values, rtol=1e-5, atol=2e-6)
     torch.testing.assert_close(found.jacobian, expected.jacobian, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(found.cosines, expected.cosines, rtol=1e-5, atol=1e-5)
@@ -95,7 +95,7 @@ def alike(found: Residuals, expected: Residuals) -> None:
 def test_residuals(partial: bool, grid: bool, offset: float | None, plainly: Any) -> None:
     surfaces, T = pair(partial, grid, seed=3)
     offsets = None if offset is None else torch.linspace(-offset, offset, len(T.scale), dtype=torch.float64)
-    alike(residuals(surfaces, T, offsets), plainly(residuals, surfaces, T, offsets))
+    assert_alike(residuals(surfaces, T, offsets), plainly(residuals, surfaces, T, offsets))
 
 
 @pytest.mark.parametrize("normals", [True, False])
@@ -171,6 +171,19 @@ def test_sums_of_kernels(plainly: Any) -> None:
     weights[::3] = 0.0
     found, expected = covariance._summed(inliers, weights), plainly(covariance._summed, inliers, weights)
     torch.testing.assert_close(found, expected, rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("shapes", [((5,), (404, 3)), ((404,), (403, 3)), ((404,), (404, 2))])
+def test_a_field_that_gives_too_little_is_refused(shapes: tuple[Any, Any], plainly: Any) -> None:
+    class Short:
+        def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+            return torch.zeros(shapes[0]), torch.zeros(shapes[1])
+
+    surfaces, T = pair(partial=False, grid=False, seed=7)
+    surfaces, T = replace(surfaces, obj=Short()), T[:4]  # 404 places
+    for ask in (residuals, lambda *given: plainly(residuals, *given)):
+        with pytest.raises(RuntimeError):
+            ask(surfaces, T)
 
 
 def test_a_switch_turns_all_of_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
