@@ -60,6 +60,8 @@ _CLOUDS = ("scene_points.ply", "object_points.ply", "aligned.ply", "residuals.np
 _CONTEXT, _PICTURE = "context_points.ply", "preview.png"
 PICTURES = (*_CLOUDS, _CONTEXT, _PICTURE)
 """What ``write_pictures`` may write."""
+_FAST = 1
+"""Of nine levels of compression: a file one eighth larger than at the usual one, in half the time."""
 
 
 def write_artifacts(
@@ -110,7 +112,7 @@ def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
         names.append(_CONTEXT)
     arrays: dict[str, Any] = {name: _numbers(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
-    registration_picture(result).save(directory / _PICTURE)
+    registration_picture(result).save(directory / _PICTURE, compress_level=_FAST)
     return [*names, _PICTURE]
 
 

@@ -17,14 +17,13 @@ from regnf_core.document import RegistrationResult
 from regnf_core.geometry.metrics import gaps
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.surface.sphere_tracing import axis_vector
-from regnf_core.viewing.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
+from regnf_core.viewing.splats import Floats, Surfels, nearest_surfels, paint_half, view_from
 
 SCENE_COLOR = (0.38, 0.58, 0.80)
 OBJECT_COLOR = (0.95, 0.56, 0.20)
 _BACKGROUND = np.array([0.975, 0.975, 0.97])
 _INK = (52, 56, 62)
 _PANEL = 480
-_OVERSAMPLING = 2
 _CAPTION = 52
 _ELEVATION = np.radians(28.0)
 _RAMP_TOP = 0.015  # object diameters: largest residual of an inlier, by the defaults of both presets
@@ -48,7 +47,7 @@ def registration_picture(result: RegistrationResult) -> Image.Image:
     else:
         camera = result.camera.T_world_camera
         up, direction = -camera.rotation[:, 1].numpy(), camera.translation.numpy() - scene.points.mean(0)
-    edge = _PANEL * _OVERSAMPLING
+    edge = 2 * _PANEL
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
     radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
     residual = Surfels.join(
@@ -58,13 +57,13 @@ def registration_picture(result: RegistrationResult) -> Image.Image:
     before, after = Surfels.join(scene, start), Surfels.join(scene, end)
     in_front = nearest_surfels(after, view, edge, radius)
     panels = [
-        _panel(before, nearest_surfels(before, view, edge, radius), view),
-        _panel(after, in_front, view),
-        _panel(residual, in_front, view),  # the same discs in other colors
+        paint_half(before, nearest_surfels(before, view, edge, radius), view, _BACKGROUND),
+        paint_half(after, in_front, view, _BACKGROUND),
+        paint_half(residual, in_front, view, _BACKGROUND),  # the same discs in other colors
     ]
     sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
     for number, panel in enumerate(panels):
-        sheet.paste(panel, (number * _PANEL, _CAPTION))
+        sheet.paste(Image.fromarray(panel), (number * _PANEL, _CAPTION))
     _captions(sheet, result)
     return sheet
 
@@ -99,11 +98,6 @@ def _best_direction(scene: Surfels, up: Floats) -> Floats:
     shown = np.clip(scene.normals @ candidates.T, 0.0, None).sum(0)
     best: Floats = candidates[int(shown.argmax())]
     return best
-
-
-def _panel(cloud: Surfels, nearest: NDArray[np.int64], view: View) -> Image.Image:
-    large = Image.fromarray(paint(cloud, nearest, view, _BACKGROUND))
-    return large.resize((_PANEL, _PANEL), Image.Resampling.LANCZOS)
 
 
 def _captions(sheet: Image.Image, result: RegistrationResult) -> None:
