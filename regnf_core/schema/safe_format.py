@@ -79,6 +79,12 @@ def description_to_dict(description: FieldDescription) -> dict[str, Any]:
     return values
 
 
+def prepare_kinds() -> None:
+    """Build now what checks descriptions, which takes milliseconds a kind: forked processes find it built."""
+    for described in KINDS.values():
+        _adapter(described)
+
+
 @functools.cache
 def _adapter(described: type[FieldDescription]) -> TypeAdapter[FieldDescription]:
     return TypeAdapter(described)

@@ -22,6 +22,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = "2"
 from regnf_worker.main import preload
 preload()
 import torch
+from regnf_core.schema import kinds, safe_format
+assert safe_format._adapter.cache_info().currsize == len(kinds.KINDS), "a job would build what reads a description"
 assert len(os.listdir("/proc/self/task")) == 1, "a fork would leave threads behind"
 assert not torch.cuda.is_initialized(), "a CUDA context does not survive a fork"
 child = os.fork()

@@ -1,7 +1,7 @@
 """The functions that workers run. Each runs in a process of its own, forked for one job.
 
-The arguments of jobs and imports: the job's id or the field's reference, which attempt it is, and the worker that runs
-it.
+The arguments of jobs and imports: the worker's settings, the job's id or the field's reference, which attempt it is,
+and the worker that runs it.
 """
 
 from __future__ import annotations
@@ -34,17 +34,16 @@ from regnf_worker.job_limits import JobLimits
 from regnf_worker.models import Context
 
 
-def run_registration(job_id: str, attempt: int, worker: str) -> None:
+def run_registration(settings: Settings, job_id: str, attempt: int, worker: str) -> None:
     """Run the attempt at a job that the queue handed out: its record says what it is, a registration or a rendering."""
     from regnf_worker.attempt import run_attempt
     from regnf_worker.engine import Engine
 
-    settings = Settings()
     context = Context.from_settings(settings, existing=True)
     run_attempt(context, job_id, attempt, worker, lambda: Engine.on(settings.device, settings.workers))
 
 
-def run_import(sha256: str, attempt: int, worker: str) -> None:
+def run_import(settings: Settings, sha256: str, attempt: int, worker: str) -> None:
     """Run the attempt at an import that the queue handed out, and model the object if it is a library's.
 
     For a field that became a library's entry after its import, only the model is left to be made.
@@ -55,7 +54,6 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
     from regnf_worker.job_limits import JobLimits
     from regnf_worker.models import is_unmodeled_entry, model_entry
 
-    settings = Settings()
     limits = ImportLimits(
         wall_s=settings.import_timeout_s, work_s=settings.import_work_s, memory_bytes=settings.import_memory_bytes
     )

@@ -10,6 +10,7 @@ from collections.abc import MutableMapping
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import RedisError
@@ -43,12 +44,15 @@ _MODULES = (
     "regnf_core.rendering.job",
     "regnf_data.recordings.importing",
     "regnf_data.recordings.stored",
+    "regnf_fit.images.place",
     "regnf_fit.images.recorded_scene",
     "regnf_fit.images.overlay",
     "regnf_core.geometry.sim3",
     *(f"PIL.{kind}ImagePlugin" for kind in ("Bmp", "Gif", "Jpeg", "Png", "Ppm")),
 )
 """What regnf_worker.engine imports where it needs it, and what Pillow does when it opens the first image."""
+_PREPARED = ("regnf_core.schema.safe_format:prepare_kinds", "regnf_core.native.library:variant")
+"""What is made once in a process, and takes a job milliseconds to make."""
 
 
 class PreloadError(RuntimeError):
@@ -58,10 +62,12 @@ class PreloadError(RuntimeError):
 
 
 def preload() -> None:
-    """Import what registrations need. Raises PreloadError if the process has several threads afterwards (Linux)."""
+    """Load what registrations need. Raises PreloadError if the process has several threads afterwards (Linux)."""
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     for name in _MODULES:
         import_module(name)
+    for name in _PREPARED:
+        resolve_name(name)()
     tasks = Path("/proc/self/task")
     if tasks.exists() and len(list(tasks.iterdir())) > 1:
         raise PreloadError("a library that was loaded has started threads; unset REGNF_PRELOAD")

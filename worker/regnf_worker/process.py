@@ -46,8 +46,8 @@ from regnf_worker.settle import ChildExit, settle_import, settle_registration
 
 Function = Callable[[str, int, str], None]
 """(job's id or field's reference, attempt, worker)."""
-FUNCTIONS: Mapping[Kind, Function] = {"import": jobs.run_import, "registration": jobs.run_registration}
-"""Everything that a worker runs, whatever the queue says."""
+FUNCTIONS = {"import": jobs.run_import, "registration": jobs.run_registration}
+"""Everything that a worker runs, whatever the queue says. Each is given the worker's settings first."""
 _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
 _IMPORT_MARGIN_S = 30
@@ -65,7 +65,7 @@ class RegnfWorker(ResilientWorker):
         self,
         context: Context,
         scratch: Scratch,
-        functions: Mapping[Kind, Function] = FUNCTIONS,
+        functions: Mapping[Kind, Function] | None = None,
         draw: Draw = jobs.run_drawing,
     ) -> None:
         redis = connect(redis_address(context.settings), retries=WORKER_RETRIES)
@@ -79,7 +79,8 @@ class RegnfWorker(ResilientWorker):
         )
         self._context = context
         self._scratch = scratch
-        self._functions = functions
+        usual = {kind: partial(function, context.settings) for kind, function in FUNCTIONS.items()}
+        self._functions: Mapping[Any, Function] = functions if functions is not None else usual
         self._queue = JobQueue(redis, context.settings.queue_key)
         self._taking = Taking(redis, self._queue)
         self._limits: dict[Kind, int] = {
