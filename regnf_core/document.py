@@ -301,7 +301,7 @@ class ArtifactEntry(Outgoing):
 
     name: str
     state: Literal["ready", "pending"] = Field(
-        default="ready", description="`pending`: it is still being made; a request for it is held until it is there."
+        default="ready", description="`pending`: it is not made yet; a request for it is held until it is there."
     )
     bytes: int | None = Field(description="Null while it is pending, as the digest.")
     sha256: Sha256 | None

@@ -1,8 +1,8 @@
 """The result of a job in the blob store: files under the attempt that wrote them, and a manifest that makes them count.
 
 The manifest is written after these files and never changed. It names the attempt and lists its files, and the names of
-those that are to come: pictures and clouds, which are made once the result is out. A second document, the rest, lists
-what has become of them. It is written once as well.
+those that are to come: clouds and pictures, which are made once the result is out. A second document, the rest, lists
+what has become of them. It is written once as well. So is a third, which lists what was drawn when somebody asked.
 """
 
 from __future__ import annotations
@@ -79,6 +79,8 @@ class Manifest:
     """Names of files that are still to come, if their making does not fail."""
     missing: tuple[str, ...] = ()
     """Names of files that were to come and do not."""
+    on_request: tuple[str, ...] = ()
+    """Names of files that the front end draws of the others when somebody asks for one."""
 
     def key(self, name: str) -> str:
         """Where the blob store holds a file."""
@@ -91,17 +93,23 @@ class Manifest:
     def keys(self) -> Iterable[str]:
         """Where everything that counts is held, the manifest included."""
         own = (self.key(one.name) for one in self.artifacts)
-        return (manifest_key(self.job_id), rest_key(self.job_id), *own)
+        return (manifest_key(self.job_id), rest_key(self.job_id), self.drawn_key, *own)
+
+    @property
+    def drawn_key(self) -> str:
+        """Where what was drawn is listed. Under the attempt: a drawing may outlive its job, and meet the next one."""
+        return self.key("drawn.json")
 
     def to_json(self) -> bytes:
         """The document of a result as it is published."""
-        document = {"attempt": self.attempt, "artifacts": _listed(self.artifacts)}
-        return _document(document | ({"pending": list(self.pending)} if self.pending else {}))
+        document: dict[str, Any] = {"attempt": self.attempt, "artifacts": _listed(self.artifacts)}
+        later = {"pending": list(self.pending), "on_request": list(self.on_request)}
+        return _document(document | {name: files for name, files in later.items() if files})
 
 
 @dataclass(frozen=True)
 class Rest:
-    """What has become of the files that were to come."""
+    """What has become of the files that were to come, or to be drawn."""
 
     artifacts: tuple[Artifact, ...] = ()
     missing: tuple[str, ...] = ()
@@ -118,6 +126,7 @@ class _Document:
     attempt: StrictInt = 0
     pending: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    on_request: tuple[str, ...] = ()
 
 
 _DOCUMENT = TypeAdapter(_Document)
@@ -155,11 +164,21 @@ def read_manifest(blobs: BlobStore, job_id: str) -> Manifest | None:
         return None
     if not first.attempt:
         raise UnreadableRecordError(job_id, "its manifest is damaged")
-    published = Manifest(job_id, first.attempt, first.artifacts, first.pending)
-    rest = _read(blobs, job_id, rest_key(job_id)) if first.pending else None
-    if rest is None:
-        return published
-    return replace(published, artifacts=first.artifacts + rest.artifacts, pending=(), missing=rest.missing)
+    now = Manifest(job_id, first.attempt, first.artifacts, first.pending, on_request=first.on_request)
+    rest = _read(blobs, job_id, rest_key(job_id)) if now.pending else None
+    if rest is not None:
+        now = replace(now, artifacts=now.artifacts + rest.artifacts, pending=(), missing=rest.missing)
+    if now.missing:  # and so is what would be drawn of them
+        return without_drawings(now)
+    drawn = _read(blobs, job_id, now.drawn_key) if now.on_request and not now.pending else None
+    if drawn is None:
+        return now
+    return replace(now, artifacts=now.artifacts + drawn.artifacts, missing=drawn.missing, on_request=())
+
+
+def without_drawings(manifest: Manifest) -> Manifest:
+    """The same where nothing can be drawn, since files are missing."""
+    return replace(manifest, missing=manifest.missing + manifest.on_request, on_request=())
 
 
 def _read(blobs: BlobStore, job_id: str, key: str) -> _Document | None:

@@ -14,7 +14,7 @@ from regnf_core.document import IterationRecord, RegistrationResult, json_number
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.schema.similarity import local_origin
-from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, registration_picture
+from regnf_core.viewing.registration_picture import FAST, OBJECT_COLOR, SCENE_COLOR, registration_picture
 
 # Point clouds as binary little-endian PLY, which every viewer reads.
 
@@ -56,12 +56,9 @@ def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
 # The files of one registration, written into a folder.
 
 CONTEXT_COLOR = (0.80, 0.82, 0.85)
-_CLOUDS = ("scene_points.ply", "object_points.ply", "aligned.ply", "residuals.npz")
-_CONTEXT, _PICTURE = "context_points.ply", "preview.png"
-PICTURES = (*_CLOUDS, _CONTEXT, _PICTURE)
-"""What ``write_pictures`` may write."""
-_FAST = 1
-"""Of nine levels of compression: a file one eighth larger than at the usual one, in half the time."""
+_CONTEXT, PICTURE = "context_points.ply", "preview.png"
+CLOUDS = ("scene_points.ply", "object_points.ply", "aligned.ply", "residuals.npz", _CONTEXT)
+"""What ``write_clouds`` may write."""
 
 
 def write_artifacts(
@@ -96,24 +93,28 @@ def write_result(result: RegistrationResult, directory: Path, truth: Sim3 | None
 
 
 def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
-    """What people look at, of a result with clouds.
+    """What people look at, of a result with clouds: what ``write_clouds`` writes, and preview.png."""
+    names = write_clouds(result, directory)
+    registration_picture(result).save(directory / PICTURE, compress_level=FAST)
+    return [*names, PICTURE]
 
-    scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, colored by
-    source), context_points.ply (the scene around the detection, if the result has it), residuals.npz, preview.png.
+
+def write_clouds(result: RegistrationResult, directory: Path) -> list[str]:
+    """Of a result with clouds: scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both,
+    scene frame, colored by source), residuals.npz, context_points.ply (the scene around the detection, if the result
+    has it). The picture can be drawn of them: ``regnf_core.viewing.registration_picture.stored_picture``.
     """
     scene, obj = result.scene_samples, result.object_samples
     placed = obj.transformed(result.T_scene_object)
     _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOR))
     _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOR))
     _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))
-    names = list(_CLOUDS)
-    if result.surroundings is not None and len(result.surroundings.points):
-        _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
-        names.append(_CONTEXT)
     arrays: dict[str, Any] = {name: _numbers(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
-    registration_picture(result).save(directory / _PICTURE, compress_level=_FAST)
-    return [*names, _PICTURE]
+    if result.surroundings is None or not len(result.surroundings.points):
+        return [name for name in CLOUDS if name != _CONTEXT]
+    _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
+    return list(CLOUDS)
 
 
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:

@@ -1,23 +1,29 @@
-"""preview.png: the object over the scene at the start and at the end, and the residuals of both surfaces."""
+"""preview.png: the object over the scene at the start and at the end, and the residuals of both surfaces.
+
+It is drawn of a result, or of its stored files. Torch-free: the front end draws it too.
+"""
 
 from __future__ import annotations
 
 import importlib
+import io
+import json
 import os
 import sys
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from regnf_core.document import RegistrationResult
-from regnf_core.geometry.metrics import gaps
-from regnf_core.geometry.surface_samples import SurfaceSamples
-from regnf_core.surface.sphere_tracing import axis_vector
 from regnf_core.viewing.splats import Floats, Surfels, nearest_surfels, paint_half, view_from
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from regnf_core.document import RegistrationResult
 
 SCENE_COLOR = (0.38, 0.58, 0.80)
 OBJECT_COLOR = (0.95, 0.56, 0.20)
@@ -28,6 +34,12 @@ _CAPTION = 52
 _ELEVATION = np.radians(28.0)
 _RAMP_TOP = 0.015  # object diameters: largest residual of an inlier, by the defaults of both presets
 _DISC_SHARE = 1.5  # disc radius over the typical gap of the cloud: closes the gaps
+_GAPS = 64
+"""At least so many points tell what is typical, where there are as many."""
+_RESIDUALS = ("scene_residuals", "object_residuals")
+_PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
+FAST = 1
+"""Of nine levels of PNG's compression: a file one eighth larger than at the usual one, in half the time."""
 _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable without telling red from green
     [[0.18, 0.20, 0.46], [0.19, 0.42, 0.56], [0.16, 0.62, 0.54], [0.53, 0.79, 0.34], [0.98, 0.88, 0.18]]
 )
@@ -36,25 +48,93 @@ _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable
 def registration_picture(result: RegistrationResult) -> Image.Image:
     """Three panels side by side: at the start, at the end, and the residuals of both surfaces. As the camera of the
     detection's image sees them, if there is one; else upright in the scene's frame."""
-    scene = _surfels(result.scene_samples, SCENE_COLOR)
-    start, end = (
-        _surfels(result.object_samples.transformed(T_object_scene.inverse()), OBJECT_COLOR)
-        for T_object_scene in (result.T_object_scene_initial, result.T_object_scene)
+    shown = _Shown(
+        (_numbers(result.scene_samples.points), _numbers(result.scene_samples.normals)),
+        (_numbers(result.object_samples.points), _numbers(result.object_samples.normals)),
+        [_numbers(result.residuals[name]) for name in _RESIDUALS],
+        [_numbers(T.matrix()) for T in (result.T_object_scene_initial, result.T_object_scene)],
+        None if result.camera is None else _numbers(result.camera.T_world_camera.matrix()),
+        result.options["up_axis"] or "z",
+        result.verdict,
+        result.metrics,
     )
-    if result.camera is None:
-        up = axis_vector(result.options["up_axis"] or "z").numpy()
+    return _drawn(shown)
+
+
+def _numbers(values: Tensor) -> Floats:
+    found: Floats = values.double().cpu().numpy()
+    return found
+
+
+def stored_picture(open_file: Callable[[str], BinaryIO]) -> bytes:
+    """The picture of a registration whose files are stored, as PNG. open_file: a file by its name.
+
+    Files that are none of ours raise ValueError, KeyError, TypeError or IndexError.
+    """
+
+    def read(name: str) -> bytes:
+        with open_file(name) as file:
+            return file.read()
+
+    document = json.loads(read("result.json"))
+    arrays = np.load(io.BytesIO(read("residuals.npz")), allow_pickle=False)
+    camera = document.get("camera")
+    shown = _Shown(
+        _cloud(read("scene_points.ply")),
+        _cloud(read("object_points.ply")),
+        [arrays[name].astype(np.float64) for name in _RESIDUALS],
+        [np.array(document[name]["matrix"]) for name in ("T_object_scene_initial", "T_object_scene")],
+        None if camera is None else np.array(camera["T_scene_camera"]["matrix"]),
+        document["options"]["up_axis"] or "z",
+        document["verdict"],
+        document["metrics"],
+    )
+    written = io.BytesIO()
+    _drawn(shown).save(written, "PNG", compress_level=FAST)
+    return written.getvalue()
+
+
+def _cloud(data: bytes) -> tuple[Floats, Floats]:
+    """Points and normals (N, 3) of a binary PLY file of nothing but vertices."""
+    header, _, rows = data.partition(b"end_header\n")
+    said = [line.split() for line in header.decode("ascii").splitlines()]
+    vertices = np.frombuffer(rows, np.dtype([(line[2], _PLY_TYPES[line[1]]) for line in said if line[0] == "property"]))
+
+    def columns(*names: str) -> Floats:
+        return np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
+
+    return columns("x", "y", "z"), columns("nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What a picture shows. scene, object: points and unit normals (N, 3), each in its own frame · residuals: (N,), of
+    their points · T_object_scene: 4x4, at the start and at the end · camera: 4x4, to the scene's frame."""
+
+    scene: tuple[Floats, Floats]
+    object: tuple[Floats, Floats]
+    residuals: Sequence[Floats]
+    T_object_scene: Sequence[Floats]
+    camera: Floats | None
+    up_axis: str
+    verdict: str
+    metrics: Mapping[str, float]
+
+
+def _drawn(shown: _Shown) -> Image.Image:
+    scene = _surfels(*shown.scene, SCENE_COLOR)
+    start, end = (_placed(*shown.object, np.linalg.inv(T_object_scene)) for T_object_scene in shown.T_object_scene)
+    if shown.camera is None:
+        up = np.eye(3)["xyz".index(shown.up_axis)]
         direction = _best_direction(scene, up)
     else:
-        camera = result.camera.T_world_camera
-        up, direction = -camera.rotation[:, 1].numpy(), camera.translation.numpy() - scene.points.mean(0)
+        up, direction = -shown.camera[:3, 1], shown.camera[:3, 3] - scene.points.mean(0)
     edge = 2 * _PANEL
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
-    radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
-    residual = Surfels.join(
-        replace(scene, colors=residual_colors_of(result, "scene_residuals")),
-        replace(end, colors=residual_colors_of(result, "object_residuals")),
-    )
+    radius = _DISC_SHARE * max(_typical_gap(cloud.points) for cloud in (scene, end))
     before, after = Surfels.join(scene, start), Surfels.join(scene, end)
+    top = _RAMP_TOP * shown.metrics["object_diameter"]
+    residual = replace(after, colors=residual_colors(np.abs(np.concatenate(shown.residuals)) / top))
     in_front = nearest_surfels(after, view, edge, radius)
     panels = [
         paint_half(before, nearest_surfels(before, view, edge, radius), view, _BACKGROUND),
@@ -64,7 +144,7 @@ def registration_picture(result: RegistrationResult) -> Image.Image:
     sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
     for number, panel in enumerate(panels):
         sheet.paste(Image.fromarray(panel), (number * _PANEL, _CAPTION))
-    _captions(sheet, result)
+    _captions(sheet, shown)
     return sheet
 
 
@@ -77,9 +157,21 @@ def residual_colors(shares: Floats) -> Floats:
     return colors
 
 
-def _surfels(samples: SurfaceSamples, color: tuple[float, float, float]) -> Surfels:
-    points = samples.points.double().cpu().numpy()
-    return Surfels(points, samples.normals.double().cpu().numpy(), np.broadcast_to(np.array(color), points.shape))
+def _surfels(points: Floats, normals: Floats, color: tuple[float, float, float]) -> Surfels:
+    return Surfels(points, normals, np.broadcast_to(np.array(color), points.shape))
+
+
+def _placed(points: Floats, normals: Floats, T_scene_object: NDArray[Any]) -> Surfels:
+    turned = T_scene_object[:3, :3]
+    scale = np.cbrt(np.linalg.det(turned))
+    return _surfels(points @ turned.T + T_scene_object[:3, 3], normals @ turned.T / scale, OBJECT_COLOR)
+
+
+def _typical_gap(points: Floats) -> float:
+    """The median distance of some of the points (N, 3) to their third neighbors."""
+    some = points[:: max(1, len(points) // _GAPS)]
+    third = min(3, len(points) - 1)  # the nearest is the point itself
+    return float(np.sqrt(np.median([np.partition(((points - one) ** 2).sum(1), third)[third] for one in some])))
 
 
 def residual_colors_of(result: RegistrationResult, name: str) -> Floats:
@@ -100,13 +192,13 @@ def _best_direction(scene: Surfels, up: Floats) -> Floats:
     return best
 
 
-def _captions(sheet: Image.Image, result: RegistrationResult) -> None:
+def _captions(sheet: Image.Image, shown: _Shown) -> None:
     draw = ImageDraw.Draw(sheet)
     title, small = ImageFont.load_default(size=20), ImageFont.load_default(size=14)
-    scale = float(result.T_object_scene.scale)
+    scale = np.cbrt(np.linalg.det(shown.T_object_scene[-1][:3, :3]))
     texts = [
         ("Start", "object (orange) over the scene (blue)"),
-        (result.verdict.capitalize(), f"scale {scale:.4f}, after {int(result.metrics['iterations'])} iterations"),
+        (shown.verdict.capitalize(), f"scale {scale:.4f}, after {int(shown.metrics['iterations'])} iterations"),
         ("Residual", "|S_object(T x) - s S_scene(x)|"),
     ]
     for number, (heading, note) in enumerate(texts):

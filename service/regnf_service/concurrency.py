@@ -107,6 +107,8 @@ UPLOADS = Threads("upload", 8, 2)
 """Hashing and writing uploads: a slow disk must not keep a poll waiting."""
 LOOKS = Threads("look", 4, 1)
 """Looks for held answers: hundreds of them must not either."""
+DRAWING = Threads("drawing", 1, 1)
+"""Pictures of results: a tenth of a second each, in part the interpreter's own work."""
 PROBES = Threads("probe", 4, 2)
 """Whether the service is ready: whoever asks does not wait behind its own requests."""
 in_thread = STORES.run

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import re
 import threading
+from collections.abc import Callable
 from itertools import product
-from typing import Any
+from typing import Any, BinaryIO
 
 import httpx
 import pytest
@@ -189,6 +190,67 @@ def test_pictures_whose_worker_has_died_are_missing_in_time(world: World) -> Non
     assert document["missing_artifacts"] == ["preview.png"]
     assert [entry["name"] for entry in document["artifacts"]] == ["result.json"]
     assert_refused(world.client.get(f"/jobs/{job_id}/artifacts/preview.png"), 404, "ARTIFACT_NOT_FOUND")
+
+
+@pytest.fixture
+def drawings(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """What was drawn, in place of pictures: what the clouds hold."""
+    drawn: list[bytes] = []
+
+    def picture(open_file: Callable[[str], BinaryIO]) -> bytes:
+        with open_file("aligned.ply") as file:
+            drawn.append(file.read())
+        return drawn[-1]
+
+    monkeypatch.setattr("regnf_core.viewing.registration_picture.stored_picture", picture)
+    return drawn
+
+
+def states(world: World, job_id: str) -> dict[str, str]:
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    return {entry["name"]: entry["state"] for entry in document["artifacts"]}
+
+
+def test_a_picture_is_drawn_when_it_is_first_asked_for(world: World, drawings: list[bytes]) -> None:
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, pending=["aligned.ply"], on_request=["preview.png"])
+    address = f"/jobs/{job_id}/artifacts/preview.png"
+    assert_refused(world.client.get(address, params={"wait": 0}), 409, "ARTIFACT_NOT_READY")
+    world.finish(job_id, {"aligned.ply": DATA})
+    assert (states(world, job_id)["preview.png"], drawings) == ("pending", [])
+    assert world.client.head(address).headers["content-length"] == str(len(DATA))
+    assert states(world, job_id)["preview.png"] == "ready"
+    assert world.client.get(address).content == DATA
+    assert drawings == [DATA]
+
+
+@pytest.mark.parametrize("clouds", [True, False])
+def test_a_picture_that_cannot_be_drawn_is_missing(world: World, drawings: list[bytes], clouds: bool) -> None:
+    """Since the clouds have come and do not read, or since they do not come."""
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, pending=["aligned.ply"], on_request=["preview.png"])
+    if clouds:
+        world.finish(job_id, {"scene_points.ply": DATA})
+    else:
+        world.records.ahead_s = world.settings.lost_after_s + 1
+    assert_refused(world.client.get(f"/jobs/{job_id}/artifacts/preview.png"), 404, "ARTIFACT_NOT_FOUND")
+    missing = world.client.get(f"/jobs/{job_id}/result").json()["missing_artifacts"]
+    assert missing == (["preview.png"] if clouds else ["aligned.ply", "preview.png"])
+    assert drawings == []
+
+
+def test_a_job_deleted_while_its_picture_is_drawn_leaves_nothing(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, on_request=["preview.png"])
+
+    def picture(_: object) -> bytes:
+        world.records.delete_job(job_id)
+        world.blobs.delete_prefix(f"jobs/{job_id}")
+        return b"a picture"
+
+    monkeypatch.setattr("regnf_core.viewing.registration_picture.stored_picture", picture)
+    assert_refused(world.client.get(f"/jobs/{job_id}/artifacts/preview.png"), 410, "JOB_EXPIRED")
+    assert [key for key in world.blobs.blobs if key.startswith("jobs/")] == []
 
 
 def test_there_is_no_result_before_the_end_nor_of_a_dismissed_job(world: World) -> None:

@@ -106,12 +106,12 @@ class World:
             return record
         return self.records.update_job(job_id, record.attempt, status="running", phase="loading")
 
-    def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None, pending: Sequence[str] = ()) -> None:
-        """What a worker leaves behind in the end; ``pending`` is still to come."""
+    def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None, **later: Sequence[str]) -> None:
+        """What a worker leaves behind in the end; ``pending`` is still to come, ``on_request`` to be drawn."""
         attempt = self.run(job_id).attempt
         files = {"result.json": json.dumps(RESULT).encode()} | (artifacts or {})
         listed = self._put(job_id, attempt, files)
-        document = {"attempt": attempt, "artifacts": listed} | ({"pending": list(pending)} if pending else {})
+        document = {"attempt": attempt, "artifacts": listed} | {name: list(files) for name, files in later.items()}
         self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
         verdict = json.loads(files["result.json"]).get("verdict")
         self.records.update_job(job_id, attempt, status="successful", verdict=verdict)

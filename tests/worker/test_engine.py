@@ -38,7 +38,8 @@ def test_the_request_reaches_the_engine(
     made = Engine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
     ((scene, obj, box, options, seed, _, initial, model, clouds),) = calls
     assert (scene, obj, seed, model, clouds) == ("scene", "object", 3, "the model", False)
-    assert (made.names, "preview.png" in made.to_come) == (["result.json"], pictures)
+    assert (made.names, "aligned.ply" in made.to_come) == (["result.json"], pictures)
+    assert made.on_request == (("preview.png",) if pictures else ())
     assert written == [{"scene": notes["scene"], "object": FieldNotes()}]
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
@@ -57,7 +58,7 @@ def test_a_search_makes_clouds_for_its_pictures_alone(
     monkeypatch.setattr("regnf_core.document.ranking_document", lambda *_: [])
     monkeypatch.setattr("regnf_core.viewing.artifacts.write_result", lambda *_, **__: ["result.json"])
     monkeypatch.setattr("regnf_core.library.with_late_clouds", lambda result, *given: given[:2])
-    monkeypatch.setattr("regnf_core.viewing.artifacts.write_pictures", lambda result, _: list(result))
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_clouds", lambda result, _: list(result))
     request = registration_request("a" * 64, None, options=RegistrationOptions(), pictures=pictures)
     several = [Candidate(sha256 * 64, partial(Path, sha256), "a model") for sha256 in "bc"]
     made = Engine("cpu").search(Path("scene"), several, request, lambda phase, share: None, tmp_path, {})

@@ -351,7 +351,8 @@ def _work(
         made = register(context, engine, request, fields, scene, objects, heartbeat, folder)
     heartbeat.confirm()
     stored = store_artifacts(context.blobs, record.id, record.attempt, folder, made.names)
-    manifest = Manifest(record.id, record.attempt, stored, tuple(made.to_come))
+    later = {"pending": tuple(made.to_come), "on_request": tuple(made.on_request)}
+    manifest = Manifest(record.id, record.attempt, stored, **later)
     heartbeat.confirm()
     if publish(context.blobs, manifest):
         return Published(manifest, made, folder)

@@ -35,12 +35,13 @@ Raises FieldFormatError."""
 class Made:
     """What the engine has written of a result, by name, and what it has yet to write when ``finish`` is called.
 
-    ``finish`` returns the names of what it wrote: ``to_come`` or fewer.
+    ``finish`` returns the names of what it wrote: ``to_come`` or fewer. ``on_request``: what can be drawn of all that.
     """
 
     names: Sequence[str]
     to_come: Sequence[str] = ()
     finish: Callable[[], Sequence[str]] = tuple
+    on_request: Sequence[str] = ()
 
 
 Notes = Mapping[str, FieldNotes]
@@ -97,7 +98,7 @@ class Engine:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.sim3 import Sim3
         from regnf_core.library import register, with_late_clouds
-        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
+        from regnf_core.viewing.artifacts import CLOUDS, PICTURE, write_clouds, write_result
 
         _one_thread()
         start, truth = request.initial_transform, request.ground_truth
@@ -113,9 +114,9 @@ class Engine:
 
         def finish() -> list[str]:
             shown = result if truth else with_late_clouds(result, *fields, box, options)
-            return [*place.draw(result, thing, folder), *write_pictures(shown, folder)]
+            return [*place.draw(result, thing, folder), *write_clouds(shown, folder)]
 
-        return Made(names, (*place.pictures, *PICTURES), finish) if request.pictures else Made(names)
+        return Made(names, (*place.pictures, *CLOUDS), finish, (PICTURE,)) if request.pictures else Made(names)
 
     def search(
         self,
@@ -130,7 +131,7 @@ class Engine:
         from regnf_core.document import ranking_document
         from regnf_core.fields.build import open_field
         from regnf_core.library import LibraryObject, search_library, with_late_clouds
-        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
+        from regnf_core.viewing.artifacts import CLOUDS, PICTURE, write_clouds, write_result
 
         _one_thread()
 
@@ -156,9 +157,9 @@ class Engine:
         def finish() -> list[str]:
             thing = objects[winner].field()
             shown = with_late_clouds(result, place.field, thing, box, options)
-            return [*place.draw(result, thing, folder), *write_pictures(shown, folder)]
+            return [*place.draw(result, thing, folder), *write_clouds(shown, folder)]
 
-        return Made(names, (*place.pictures, *PICTURES), finish) if request.pictures else Made(names)
+        return Made(names, (*place.pictures, *CLOUDS), finish, (PICTURE,)) if request.pictures else Made(names)
 
     def render(
         self,

@@ -10,7 +10,7 @@ from typing import Any
 
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.manifest import Manifest, read_manifest, read_result
+from regnf_state.manifest import Manifest, read_manifest, read_result, without_drawings
 from regnf_state.ownership import reference_of
 from regnf_state.reasons import whole_problem
 from regnf_state.records import ACTIVE, JobRecord, UnreadableRecordError
@@ -50,7 +50,7 @@ def _without_overdue(services: Services, record: JobRecord, manifest: Manifest) 
     waited_s = services.records.now() - (record.finished or record.updated)
     if waited_s < services.settings.lost_after_s:
         return manifest
-    return replace(manifest, pending=(), missing=manifest.pending)
+    return without_drawings(replace(manifest, pending=(), missing=manifest.pending))
 
 
 def result_of(services: Services, manifest: Manifest) -> dict[str, Any]:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from PIL import Image
 
 from regnf_core.document import (
     Alternative,
+    CameraView,
     Candidate,
     ObjectSymmetry,
     ResultDocument,
@@ -24,7 +28,8 @@ from regnf_core.document import (
 from regnf_core.errors import VERDICT_REASONS
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.viewing.artifacts import write_artifacts
-from regnf_core.viewing.splats import Surfels, View, nearest_surfels, render
+from regnf_core.viewing.registration_picture import stored_picture
+from regnf_core.viewing.splats import Surfels, View, nearest_surfels, paint, paint_half, render
 from tests.core.conftest import ChairRun
 from tests.core.fields.native_builds import variants
 
@@ -147,6 +152,43 @@ def test_the_picture_shows_both_surfaces_and_small_residuals(folder: Path) -> No
     assert min(bluish, orange) > 2000
     yellow = (residual[..., 0] > 180) & (residual[..., 2] < 100)
     assert yellow.sum() < 0.02 * (residual.sum(-1) < 600).sum()
+
+
+def test_the_picture_can_be_drawn_of_the_stored_files(folder: Path) -> None:
+    with Image.open(folder / "preview.png") as first, Image.open(BytesIO(stored_picture(opened(folder)))) as image:
+        apart = np.asarray(first).astype(int) - np.asarray(image)
+    assert (np.abs(apart) > 8).mean() < 0.001, "clouds are stored in single precision"
+
+
+def test_of_a_detection_in_an_image_too(chair_run: ChairRun, tmp_path: Path) -> None:
+    matrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, -4.0], [0.0, -1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]
+    write_artifacts(replace(chair_run.result, camera=CameraView("0", Sim3.from_matrix(matrix))), tmp_path)
+    with Image.open(tmp_path / "preview.png") as first, Image.open(BytesIO(stored_picture(opened(tmp_path)))) as image:
+        apart = np.asarray(first).astype(int) - np.asarray(image)
+    assert (np.abs(apart) > 8).mean() < 0.001
+
+
+def test_files_that_are_damaged_are_refused(folder: Path, tmp_path: Path) -> None:
+    for name in NAMES:
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    cloud = (tmp_path / "scene_points.ply").read_bytes()
+    (tmp_path / "scene_points.ply").write_bytes(cloud[:-5])
+    with pytest.raises(ValueError, match="multiple"):
+        stored_picture(opened(tmp_path))
+
+
+def opened(folder: Path) -> Callable[[str], BinaryIO]:
+    return lambda name: (folder / name).open("rb")
+
+
+def test_pixels_of_half_the_size_are_means_of_four() -> None:
+    points = np.array([[0.2, 0.1, 0.0], [-0.3, -0.2, 0.4]])
+    normals, colors = np.array([[0.0, 0.0, 1.0]] * 2), np.array([[0.9, 0.2, 0.1], [0.1, 0.4, 0.8]])
+    cloud, view, background = Surfels(points, normals, colors), View(np.eye(3), np.zeros(3), 20.0), np.ones(3)
+    nearest = nearest_surfels(cloud, view, 32, 0.3)
+    whole = paint(cloud, nearest, view, background).astype(float).reshape(16, 2, 16, 2, 3).mean((1, 3))
+    assert len(np.unique(whole)) > 9
+    np.testing.assert_allclose(paint_half(cloud, nearest, view, background), whole, atol=0.5)
 
 
 def test_every_pixel_shows_the_disc_nearest_to_the_viewer() -> None:

@@ -9,11 +9,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_core.document import ResultDocument
-from regnf_service.concurrency import blocking
+from regnf_service.concurrency import DRAWING, blocking
 from regnf_service.http.body import CallerDep, PrefixDep, ServicesDep, wait_for
 from regnf_service.http.ranges import IfNoneMatchDep, IfRangeHeader, RangeHeader, file_answer, parse_range
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
 from regnf_service.http.schemas.scenes import RenderResultDocument
+from regnf_service.jobs.drawing import drawn
 from regnf_service.jobs.edits import find_job, manifest_of, result_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
@@ -45,7 +46,8 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
     """A failed job has no result: the member `error` of the 409 is the job's own problem.
 
-    The result is there before its pictures and clouds, which are listed as `pending` until they are made.
+    The result is there before its pictures and clouds, which are listed as `pending` until they are made: clouds in a
+    moment, `preview.png` once it is asked for.
     """
     manifest = _manifest(services, id, caller)
     document = result_of(services, manifest)
@@ -55,7 +57,10 @@ def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: Prefix
             name: {"state": "ready", "bytes": one.bytes, "sha256": one.sha256}
             for name, one in manifest.served().items()
         },
-        **{name: {"state": "pending", "bytes": None, "sha256": None} for name in manifest.pending},
+        **{
+            name: {"state": "pending", "bytes": None, "sha256": None}
+            for name in (*manifest.pending, *manifest.on_request)
+        },
     }
     listed = [
         known.get(name, {}) | {"name": name, "url": f"{prefix}/jobs/{id}/artifacts/{name}"} | one
@@ -100,13 +105,20 @@ async def get_artifact(
     if_range: IfRangeHeader = None,
     wait: ArtifactWaitQuery = _ARTIFACT_WAIT_S,
 ) -> Response:
-    """The names are those of the result's `artifacts` list. The answer is held back while the file is still to come."""
+    """The names are those of the result's `artifacts` list. The answer is held back while the file is still to come.
+
+    `preview.png` is drawn of the clouds when it is asked for the first time.
+    """
     caller = request.state.caller
-    manifest = await wait_for(
-        lambda: _manifest(services, id, caller), lambda now: name not in now.pending, wait, services, caller
-    )
-    if name in manifest.pending:
+
+    def is_settled(now: Manifest) -> bool:
+        return not now.pending or name not in (*now.pending, *now.on_request)
+
+    manifest = await wait_for(lambda: _manifest(services, id, caller), is_settled, wait, services, caller)
+    if not is_settled(manifest):
         raise Problem("ARTIFACT_NOT_READY", headers={"Retry-After": "1"})
+    if name in manifest.on_request:
+        manifest = await DRAWING.run(drawn, services, manifest)
     artifact = manifest.served().get(name)
     if artifact is None:
         raise Problem("ARTIFACT_NOT_FOUND")
