@@ -6,7 +6,7 @@
 Two services, one as it is by default and one without REGNF_PRELOAD, or with --before one of an older checkout, as it is
 by default. Each has one worker of one thread and the same small fields. Jobs, each with a seed of its own, go to them
 in turn, one at a time: the ratio holds on a busy machine too. The engine's seconds are those that the result tells of
-(`seconds_*`). Processor seconds are those of all processes of the service, the engine's and the pictures' included.
+(`seconds_*`). Processor seconds are those of all processes of the service, the engine's and the clouds' included.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Service:
     """Until a child has taken the job up."""
     engine: list[float] = field(default_factory=list)
     processor: list[float] = field(default_factory=list)
-    """Of all processes of the service, until the pictures are made."""
+    """Of all processes of the service, until the clouds are made."""
 
     def run(self, seed: int) -> None:
         """One job, from its POST to its result."""
@@ -66,8 +66,8 @@ class Service:
             job = self.client.get(f"/jobs/{job['id']}", params={"wait": 30}).json()
         result = self.client.get(f"/jobs/{job['id']}/result").json()
         seconds = time.monotonic() - begun
-        while self.client.get(f"/jobs/{job['id']}/artifacts/preview.png").status_code == httpx.codes.CONFLICT:
-            pass  # held for a while each time, until the pictures are made
+        while self.client.get(f"/jobs/{job['id']}/artifacts/aligned.ply").status_code == httpx.codes.CONFLICT:
+            pass  # held for a while each time, until the clouds are made
         engine = sum(value for name, value in result["metrics"].items() if name.startswith("seconds_"))
         created, started, finished = (
             datetime.fromisoformat(job[f"{at}_at"]) for at in ("created", "started", "finished")

@@ -142,7 +142,7 @@ def test_a_thing_in_an_image_is_registered_where_the_camera_saw_it(scene: Path, 
     truth = shots(2)[1].T_camera_object
     assert error_m(told["camera"]["T_camera_object"]["matrix"], truth) < 0.01
     assert "overlay.png" in made.to_come
-    assert {"overlay.png", "preview.png"} <= set(made.finish())
+    assert {"overlay.png", "aligned.ply"} <= set(made.finish())
     assert (tmp_path / "overlay.png").read_bytes().startswith(b"\x89PNG")
 
 
