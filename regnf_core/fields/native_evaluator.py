@@ -36,8 +36,9 @@ class NativeEvaluator:
 
     def __init__(self, function: NeusFactoFunction, variant: Variant) -> None:
         """function: one of those that :func:`suits` takes."""
-        self._function, self._variant = function, variant
+        self._function = function
         self._field, self._kept = _described(function)
+        self.ask, self.address = variant.evaluate, ctypes.addressof(self._field)
 
     def value(self, points: Tensor) -> Tensor:
         return self._evaluate(points, None)
@@ -51,8 +52,7 @@ class NativeEvaluator:
         assert points.dtype == torch.float32
         assert points.shape[1:] == (3,)
         to = None if gradient is None else gradient.data_ptr()
-        address = ctypes.addressof(self._field)
-        if self._variant.evaluate(address, points.data_ptr(), len(points), distance.data_ptr(), to):
+        if self.ask(self.address, points.data_ptr(), len(points), distance.data_ptr(), to):
             raise MemoryError("no memory for the evaluation of a field")
         return distance
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library_entries import shown_number
+from regnf_core.native.steps import NativeModel, native_model
 from regnf_core.schema.description import SURFACE, UNSEEN, ObservationGrid
 
 # What every field offers, whatever made it: signed distance, its gradient, its bounds.
@@ -249,6 +250,10 @@ class ObservedField(FieldView):
     def observation(self) -> Observation | None:
         return self._observation
 
+    def native_model(self) -> NativeModel | None:
+        """The field's own, where it has one: its values are those of this field."""
+        return native_model(self.field)
+
     def to(self, device: torch.device | str) -> ObservedField:
         """The same field with its parameters on another device; the observation stays on the CPU."""
         return ObservedField(self.field.to(device), self._observation)
@@ -274,6 +279,14 @@ class CountingField(FieldView):
     def __init__(self, field: SdfField) -> None:
         self.field = field
         self.evaluations = 0
+
+    def native_model(self) -> NativeModel | None:
+        """The field's own, whose points are counted."""
+        found = native_model(self.field)
+        return None if found is None else found.counting(self._count)
+
+    def _count(self, points: int) -> None:
+        self.evaluations += points
 
     def to(self, device: torch.device | str) -> CountingField:
         moved = CountingField(self.field.to(device))

@@ -103,7 +103,7 @@ def confirm_symmetries(
     settings = Settings(scale=SAME_SCALE, normals=False)
     start = proposed.T.on(B.points.device)
     refined = minimize(SurfacePair(obj, obj, few, few), start, MODEL.confirming_widths, settings)
-    deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1).cpu()
+    deviation = (refined.sizes > MODEL.max_deviation).float().mean(1).cpu()
     found = refined.T.on("cpu")
     kept = _distinct_symmetries(found, deviation, extremal_points)
     T, deviation = found[kept], deviation[kept]

@@ -16,7 +16,7 @@ from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.native import steps as compiled
-from regnf_core.native.steps import Kept
+from regnf_core.native.steps import Kept, NativeModel
 from regnf_core.robust.constants import FEATURES, SEARCH
 from regnf_core.robust.working_frame import Samples, on_host
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
@@ -53,6 +53,11 @@ class DistanceGrid(Bundle):
     @cached_property
     def _compiled(self) -> Kept:
         return compiled.planes(_CELLS, self.low, self.high, self.edge, self.planes)
+
+    def native_model(self) -> NativeModel | None:
+        """The same for compiled code, where it works."""
+        steps = compiled.steps_for(self.planes)
+        return None if steps is None else NativeModel(steps.grid, self._compiled, checked=False)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (M,) and gradient (M, 3) at points (M, 3): the nearest cell's, carried on to the point."""
