@@ -65,7 +65,7 @@ class TransformedField(FieldView):
     def bounds(self) -> Tensor:
         low, high = self.field.bounds
         corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))  # (8, 3)
-        moved = self.T_field_frame.inverse().apply(corners)
+        moved = self.T_field_frame.apply_inverse(corners)
         return torch.stack([moved.amin(0), moved.amax(0)])
 
     @property

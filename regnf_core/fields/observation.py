@@ -165,13 +165,13 @@ class Observation:
         ends = torch.stack([voxels.amin(0), voxels.amax(0) + 1]).double() * self.voxel + self.low.double()
         corners = torch.cartesian_prod(*ends.T)
         if self.T_grid_frame is not None:
-            corners = self.T_grid_frame.inverse().apply(corners)
+            corners = self.T_grid_frame.apply_inverse(corners)
         return torch.stack([corners.amin(0), corners.amax(0)])
 
     def measured(self) -> Tensor:
         """(V, 3) float64: the middles of the voxels in which a surface was measured, in the points' frame."""
         points = ((self.states == SURFACE).nonzero().double() + 0.5) * self.voxel + self.low.double()
-        return points if self.T_grid_frame is None else self.T_grid_frame.inverse().apply(points)
+        return points if self.T_grid_frame is None else self.T_grid_frame.apply_inverse(points)
 
     def stored(self) -> tuple[ObservationGrid, NDArray[np.int32]]:
         """The grid and the tensor that a file keeps, both of the grid's own frame."""

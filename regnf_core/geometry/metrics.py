@@ -123,14 +123,14 @@ def rotation_error(estimate: Sim3, truth: Sim3) -> float:
 
 def _apart(estimate: Sim3, truth: Sim3, points: Tensor) -> Tensor:
     """(...,) distances between the estimated and the true place of object points (..., 3), object units."""
-    away: Tensor = (estimate.inverse().apply(points) - truth.inverse().apply(points)).norm(dim=-1)
+    away: Tensor = (estimate.apply_inverse(points) - truth.apply_inverse(points)).norm(dim=-1)
     return float(truth.scale) * away
 
 
 def add_s(estimate: Sim3, truth: Sim3, points: Tensor) -> float:
     """ADD-S: mean distance from true to the nearest estimated surface point, object points (N, 3), object units."""
-    placed = estimate.inverse().apply(points.double())
-    distance, _ = NearestNeighbors(placed).query(truth.inverse().apply(points.double()))
+    placed = estimate.apply_inverse(points.double())
+    distance, _ = NearestNeighbors(placed).query(truth.apply_inverse(points.double()))
     return float(truth.scale) * float(distance.mean())
 
 
@@ -178,7 +178,7 @@ def displacement(T: Sim3, reference: Sim3, points: Tensor) -> Tensor:
 
     (H,): how far apart two poses place the object, measured in the frame it is placed in and scaled to its own units.
     """
-    placed, other = T.inverse().apply(points.double()), reference.inverse().apply(points.double())
+    placed, other = T.apply_inverse(points.double()), reference.apply_inverse(points.double())
     apart: Tensor = reference.scale * (placed - other).norm(dim=-1).amax(-1)
     return apart
 
@@ -192,7 +192,7 @@ def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) 
     T, scores, points = T.on("cpu"), scores.cpu(), points.cpu()
     order = scores.argsort()
     # Plain arrays: a call costs less there, and all of them are small.
-    placed = T[order].inverse().apply(points.double()).mT.contiguous().numpy()  # (H, 3, N)
+    placed = T[order].apply_inverse(points.double()).mT.contiguous().numpy()  # (H, 3, N)
     reach = (apart / T.scale[order].double()).square().numpy()
     numbers, left = order.numpy(), np.arange(len(order))
     chosen: list[int] = []

@@ -3,7 +3,10 @@
 #ifndef REGNF_NEAR_H
 #define REGNF_NEAR_H
 
+#include <math.h>
 #include <stdlib.h>
+
+#include "block.h"
 
 #define LEAF 8
 #define MOST_NEAR 64 /* points asked for at each place */

@@ -30,9 +30,7 @@ _Model: Any = _structure(
     "Model", ask=_ADDRESS, described=_ADDRESS, at_once=_I64, as_it_is=_I32, turn=_DOUBLE * 9, shift=_DOUBLE * 3,
     factor=_DOUBLE,
 )  # fmt: skip
-_Poses: Any = _structure(
-    "Poses", count=_I64, scale=_ADDRESS, rotation=_ADDRESS, translation=_ADDRESS, offset=_ADDRESS
-)
+_Poses: Any = _structure("Poses", count=_I64, scale=_ADDRESS, rotation=_ADDRESS, translation=_ADDRESS, offset=_ADDRESS)
 _Rows: Any = _structure("Rows", values=_ADDRESS, jacobian=_ADDRESS, cosines=_ADDRESS, unobserved=_ADDRESS)
 _Observation: Any = _structure(
     "Observation", counts=_I64 * 3, states=_ADDRESS, turn=_FLOAT * 9, shift=_FLOAT * 3, ahead=_FLOAT, agreement=_FLOAT
@@ -221,8 +219,8 @@ class Pair:
         self, steps: Steps, scene_samples: Sequence[Tensor], object_samples: Sequence[Tensor], scene: Any, obj: Any,
         seen: Kept | None, hidden: Tensor | None, ahead: float, min_cosine: float,
     ) -> None:  # fmt: skip
-        """samples: points (N, 3), values (N,), normals (N, 3) · scene, obj: what each surface's distances are asked of ·
-        seen: regnf_observation, of the scene · hidden: (N,) bool, see
+        """samples: points (N, 3), values (N,), normals (N, 3) · scene, obj: what each surface's distances are asked
+        of · seen: regnf_observation, of the scene · hidden: (N,) bool, see
         :class:`regnf_core.robust.working_frame.Samples`."""
         self.scene_count, self.total = len(scene_samples[1]), len(scene_samples[1]) + len(object_samples[1])
         self.partial = seen is not None
@@ -320,9 +318,9 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     found = variant()
     if found is None or points.device.type != "cpu" or not 1 <= count <= min(_MOST_NEAR, len(points)):
         return None
-    if not (torch.isfinite(points).all() and torch.isfinite(places).all()):
-        return None
     of, at = points.double().contiguous(), places.cpu().double().contiguous()
+    if not all(np.isfinite(one.numpy()).all() for one in (of, at)):
+        return None
     distance, number = torch.empty(len(at), count, dtype=torch.float64), torch.empty(len(at), count, dtype=torch.int64)
     if found.steps.nearest(
         of.data_ptr(), len(of), at.data_ptr(), len(at), count, distance.data_ptr(), number.data_ptr()

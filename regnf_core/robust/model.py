@@ -18,6 +18,7 @@ from regnf_core.document import ObjectSymmetry
 from regnf_core.errors import FieldFormatError, atomic_path
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.bundle import Bundle
+from regnf_core.geometry.exponential_map import rotation_log
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
@@ -58,7 +59,7 @@ class SelfSymmetry(Bundle):
     def group(self) -> ObjectSymmetry:
         """The symmetries that the object's field confirms. On the CPU."""
         exact = self.T[self.deviation <= MODEL.max_deviating_share]
-        omega = exact.log()[:, :3]
+        omega = rotation_log(exact.rotation)
         if self.axis is not None:
             across = int((~_about(exact, self.axis)).sum())
             return ObjectSymmetry(1 + min(across, 1), _tuple(self.axis), True)
@@ -130,7 +131,7 @@ def _rigid(rotations: Tensor) -> Sim3:
 def _continuous_axis(itself: SurfacePair, T: Sim3, max_score: float) -> Tensor | None:
     """An axis (3,) about which every turn is a symmetry, if one of the proposals' axes is such."""
     low, high = MODEL.axis_angles
-    for omega in T.log()[:, :3]:
+    for omega in rotation_log(T.rotation):
         angle = float(omega.norm())
         if angle < low or angle > high:
             continue

@@ -153,9 +153,7 @@ def search_poses(
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds  # a wrong box must not end the search
     grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples, view.ahead)
-    context = RefinementContext(
-        model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
-    )
+    context = RefinementContext(model.extremal_points, generator, bound.scale, bound=bound)
     return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
 
 
@@ -168,7 +166,7 @@ def refine_poses(
     """
     bound, offset = problem.bound, problem.view.max_offset
     context = RefinementContext(
-        problem.model.extremal_points, generator, bound.scale, offset, on_step, bound.admits, bound.penalty, True
+        problem.model.extremal_points, generator, bound.scale, offset, on_step, bound, with_history=True
     )
     start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
     found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)

@@ -172,11 +172,10 @@ def native_pair(surfaces: SurfacePair, T: Sim3) -> compiled.Pair | None:
     if steps is None or not (seen is None or isinstance(seen, WorkingObservation)):
         return None
     known = None if seen is None else seen.compiled()
-    samples = [(one.points, one.values, one.normals) for one in (A, B)]
+    of_scene, of_object = ((one.points, one.values, one.normals) for one in (A, B))
     hidden = None if seen is None else A.hidden
-    return compiled.Pair(
-        steps, *samples, surfaces.scene, surfaces.obj, known, hidden, surfaces.ahead, EVIDENCE.min_inlier_cosine
-    )
+    parts = of_scene, of_object, surfaces.scene, surfaces.obj, known, hidden
+    return compiled.Pair(steps, *parts, surfaces.ahead, EVIDENCE.min_inlier_cosine)
 
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3, ahead: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -182,7 +182,11 @@ class WorkingField:
     def native_model(self) -> NativeModel | None:
         """The same for compiled code, where the field has such."""
         found = native_model(self.field)
-        return None if found is None else found.seen_by(self.frame.length * np.eye(3), self.frame.center, 1.0 / self.frame.length)
+        return (
+            None
+            if found is None
+            else found.seen_by(self.frame.length * np.eye(3), self.frame.center, 1.0 / self.frame.length)
+        )
 
     def require_finite(self) -> None:
         """Raises InvalidInputError (FIELD_NOT_FINITE) where a value since the last call was not finite."""

@@ -6,14 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import EVIDENCE, REFINEMENT, SEARCH, Stage
 from regnf_core.native.steps import Pair
+from regnf_core.robust.constants import EVIDENCE, REFINEMENT, SEARCH, Stage
 from regnf_core.robust.refine.loss import (
     adaptive_width,
     disagreement,
@@ -24,7 +25,7 @@ from regnf_core.robust.refine.loss import (
 )
 from regnf_core.robust.refine.pose_candidates import Iterations, PoseCandidates
 from regnf_core.robust.residuals import Residuals, SurfacePair, native_pair, residuals
-from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBound
+from regnf_core.robust.search.bounds import ANY_SCALE, PoseBound, ScaleBound
 from regnf_core.robust.working_frame import not_finite, on_host
 
 
@@ -103,9 +104,9 @@ def minimize(
         less, more = damping / REFINEMENT.damping_decrease, damping * REFINEMENT.damping_increase
         damping = torch.where(better, less, more).clamp(*REFINEMENT.damping_range)
         if settings.with_history:
-            means = now.means(now.values.abs())
-            parts = (torch.where(better, tried_costs, costs)[:, None], *(part[:, None] for part in means))
-            history.append(Iterations(T[:, None], *parts, (lowest,), (_samples(surfaces),)))
+            now_costs, (of_scene, of_object) = torch.where(better, tried_costs, costs), now.means(now.values.abs())
+            columns = now_costs[:, None], of_scene[:, None], of_object[:, None]
+            history.append(Iterations(T[:, None], *columns, (lowest,), (_samples(surfaces),)))
         on_step()
     kept = reduce(Iterations.then, history) if history else None
     return Minimum(T, now.offset, disagreement(now, settings.score_width), now.values.abs(), kept)
@@ -196,8 +197,8 @@ class RefinementContext:
 
     extremal_points: (E, 3) of the object, by which two poses are compared · generator: draws each stage's samples ·
     scale: what it may be, and is at the start · max_offset: of the surfaces, object diameters · on_step: called once an
-    iteration · admits: which poses (H,) may go on, (H,) bool; where it admits none, all may · penalty: (H,) what is
-    added to the scores of poses (H,) · with_history: whether the iterations are kept.
+    iteration · bound: what is known of the poses: those that it does not admit end, unless it admits none, and its
+    penalty is added to their scores · with_history: whether the iterations are kept.
     """
 
     extremal_points: Tensor
@@ -205,8 +206,7 @@ class RefinementContext:
     scale: ScaleBound = ANY_SCALE
     max_offset: float = REFINEMENT.max_offset
     on_step: Callable[[], None] = lambda: None
-    admits: Callable[[Sim3], Tensor] = lambda T: torch.ones_like(T.scale, dtype=torch.bool)
-    penalty: Callable[[Sim3], Tensor] = lambda T: torch.zeros_like(T.scale)
+    bound: PoseBound | None = None
     with_history: bool = False
 
     def settings(self, stage: Stage) -> Settings:
@@ -231,24 +231,29 @@ def coarse_to_fine(
             history = some.history
             if found.history is not None:
                 history = found.history if history is None else history.then(found.history)
-            scores = found.scores + context.penalty(found.T)
-            parts.append(PoseCandidates(found.T, scores, found.offset, history))
+            parts.append(PoseCandidates(found.T, found.scores, found.offset, history))
         candidates = parts[0] if len(parts) == 1 else PoseCandidates.cat(parts)
-        left = survivors(candidates, context.admits(candidates.T), stage, context.extremal_points)
+        admitted = None
+        if context.bound is not None:
+            admitted, penalty = context.bound.judged(candidates.T)
+            candidates = replace(candidates, scores=candidates.scores + penalty)
+        left = survivors(candidates, admitted, stage, context.extremal_points)
         candidates = candidates[left.to(candidates.scores.device)]
         surfaces.require_finite()
     return candidates
 
 
-def survivors(candidates: PoseCandidates, admitted: Tensor, stage: Stage, extremal_points: Tensor) -> Tensor:
+def survivors(candidates: PoseCandidates, admitted: Tensor | None, stage: Stage, extremal_points: Tensor) -> Tensor:
     """Numbers of the candidates that go on, best first, on the CPU, where they are chosen: one copy a stage.
 
-    admitted: (H,) bool, which may go on; where it is none, all may.
+    admitted: (H,) bool, which may go on; where it is None or none is, all may.
     """
-    admitted = admitted.cpu()
-    may = (admitted if bool(admitted.any()) else ~admitted).nonzero().squeeze(-1)
-    scores = candidates.scores.cpu()[may]
+    scores, T = candidates.scores.cpu(), candidates.T.on("cpu")
+    allowed = np.ones(len(scores), bool) if admitted is None else admitted.cpu().numpy()
+    may = torch.from_numpy(np.flatnonzero(allowed if allowed.any() else ~allowed))
+    scores = scores[may]
     if stage.min_distance == 0.0:
         return may[scores.argsort()[: stage.keep]]
-    kept = distinct(candidates.T.on("cpu")[may], scores, extremal_points, stage.min_distance, stage.keep)
-    return may[kept[scores[kept] <= scores[kept[0]] + stage.margin]]
+    kept = distinct(T[may], scores, extremal_points, stage.min_distance, stage.keep)
+    near = scores[kept].numpy()
+    return may[kept[: np.count_nonzero(near <= near[0] + stage.margin)]]  # they are in order

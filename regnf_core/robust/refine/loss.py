@@ -77,8 +77,9 @@ def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True, weigh
     cost = 0.5 * (of_scene + of_object)
     if r.offset is None:
         return cost
-    prior: Tensor = 0.5 * offset_prior(r.unobserved is not None) * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
-    return cost + prior
+    prior = 0.5 * offset_prior(r.unobserved is not None)
+    of_offset: Tensor = prior * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
+    return cost + of_offset
 
 
 def sample_weights(r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None) -> Tensor:

@@ -26,9 +26,10 @@ class Iterations(Bundle):
 
     def then(self, more: Iterations) -> Iterations:
         """These, and the same poses' next ones."""
-        numbers = self.widths + more.widths, self.samples + more.samples
         columns = ((one.T, one.costs, one.residual_scene, one.residual_object) for one in (self, more))
-        return Iterations(*over_tensors(lambda *parts: torch.cat(parts, 1), *columns), *numbers)
+        T, costs, of_scene, of_object = over_tensors(lambda *parts: torch.cat(parts, 1), *columns)
+        widths, samples = self.widths + more.widths, self.samples + more.samples
+        return Iterations(T, costs, of_scene, of_object, widths, samples)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -95,14 +95,14 @@ MINIMIZATIONS = [
 ]
 
 
-def assert_bundles_alike(found: Any, expected: Any, tolerance: dict[str, float]) -> None:
+def assert_bundles_alike(found: Any, expected: Any, rtol: float, atol: float) -> None:
     """All their tensors, and those of what they hold."""
     assert vars(found).keys() == vars(expected).keys()
     for name, one in vars(expected).items():
         if isinstance(one, Tensor):
-            torch.testing.assert_close(vars(found)[name], one, **tolerance)
+            torch.testing.assert_close(vars(found)[name], one, rtol=rtol, atol=atol)
         elif isinstance(one, Bundle):
-            assert_bundles_alike(vars(found)[name], one, tolerance)
+            assert_bundles_alike(vars(found)[name], one, rtol, atol)
         else:
             assert vars(found)[name] == one
 
@@ -138,15 +138,14 @@ def test_minimization(partial: bool, settings: Settings, offset: float | None, s
     settings = replace(settings, max_offset=offset or 0.0, with_history=True)
     given = surfaces, settings.scale.limited_poses(T), (0.3, 0.2, 0.1, 0.05)[:steps], settings, start
     found, expected = minimize(*given), plainly(minimize, *given)
-    tolerance = {"rtol": 1e-3, "atol": 1e-4} if steps > 1 else {"rtol": 2e-5, "atol": 2e-5}
-    assert_bundles_alike(found, expected, tolerance)
+    assert_bundles_alike(found, expected, *((1e-3, 1e-4) if steps > 1 else (2e-5, 2e-5)))
     assert (found.history is None) == (steps == 0)
     if found.history is not None:
         assert found.history.T.scale.shape == (5, steps)
         assert torch.equal(found.history.T.translation[:, -1], found.T.translation)
 
 
-def voxel_grid(values: Tensor, sign: int = 1) -> SdfField:
+def voxel_grid(values: Tensor, sign: Literal[1, -1] = 1) -> SdfField:
     low, spacing = (-0.6, -0.5, -0.7), (0.1, 0.12, 0.09)
     description = VoxelGridDescription(
         kind="voxel_grid", bounds=((-0.6, -0.5, -0.7), (0.5, 0.46, 0.47)), origin=low, spacing=spacing, sign=sign
@@ -155,7 +154,7 @@ def voxel_grid(values: Tensor, sign: int = 1) -> SdfField:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_fields_with_compiled_code_through_all_that_they_are_seen_by(sign: int, plainly: Any) -> None:
+def test_fields_with_compiled_code_through_all_that_they_are_seen_by(sign: Literal[1, -1], plainly: Any) -> None:
     """Working frame, counting, another frame, another unit, an observation: what they give together, beyond the grid
     as well, and how many points are counted."""
     numbers = torch.Generator().manual_seed(8)
@@ -182,12 +181,12 @@ def test_values_that_are_not_finite_are_refused(plainly: Any) -> None:
     surfaces, T = pair(partial=False, grid=False, seed=5)
     bad = WorkingField(voxel_grid(values), WorkingFrame(torch.zeros(3).double(), 1.0))
     assert native_model(bad) is not None
-    for side in ("scene", "obj"):
-        for ask in (residuals, minimize):
-            more = ((0.1,),) if ask is minimize else ()
-            for way in (lambda work, *given: work(*given), plainly):
-                with pytest.raises(InvalidInputError, match="not finite"):
-                    way(ask, replace(surfaces, **{side: bad}), T, *more)
+    for given in (replace(surfaces, scene=bad), replace(surfaces, obj=bad)):
+        for way in (lambda work, *given: work(*given), plainly):
+            with pytest.raises(InvalidInputError, match="not finite"):
+                way(residuals, given, T)
+            with pytest.raises(InvalidInputError, match="not finite"):
+                way(minimize, given, T, (0.1,))
 
 
 def test_values_in_float16_and_fields_that_check_their_own_values_have_no_compiled_code() -> None:

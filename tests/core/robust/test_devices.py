@@ -118,7 +118,7 @@ def test_a_problem_is_moved_whole(neural: RegistrationProblem) -> None:
     T = poses(3)
     points = torch.zeros(50, 3, device=ELSEWHERE)
     with Border() as border:
-        assert neural.bound.admits(T).device == neural.bound.penalty(T).device == ELSEWHERE
+        assert {one.device for one in neural.bound.judged(T)} == {ELSEWHERE}
         value, gradient = neural.model.distance_grid.value_and_gradient(points)
     assert (value.shape, gradient.shape) == ((50,), (50, 3))
     assert value.device == gradient.device == ELSEWHERE

@@ -224,9 +224,13 @@ def test_the_minimum_on_the_bound_is_that_of_the_poses_on_it(allowed: float) -> 
     larger = Sim3(torch.full_like(start.scale, 1.3), start.rotation, start.translation)
     widths = [0.2] * 25
     wider = [0.2 * 1.3 / allowed] * 25
-    from_above = minimize(surfaces, larger, wider, Settings(scale=ScaleBound(allowed, 2.0), normals=False, with_history=True))
+    from_above = minimize(
+        surfaces, larger, wider, Settings(scale=ScaleBound(allowed, 2.0), normals=False, with_history=True)
+    )
     on_it = Sim3(torch.full_like(start.scale, allowed), start.rotation, start.translation)
-    along = minimize(surfaces, on_it, widths, Settings(scale=ScaleBound(allowed, allowed), normals=False, with_history=True))
+    along = minimize(
+        surfaces, on_it, widths, Settings(scale=ScaleBound(allowed, allowed), normals=False, with_history=True)
+    )
     torch.testing.assert_close(along.T.scale, torch.full_like(start.scale, allowed))
     torch.testing.assert_close(from_above.T.scale, along.T.scale, atol=1e-4, rtol=0.0)
     assert from_above.history is not None
