@@ -31,7 +31,7 @@ from regnf_core.fields.observation import (
     stored_observation,
 )
 from regnf_core.fields.onnx.graph import build_onnx
-from regnf_core.fields.user_fields import BoxExtension, FunctionField
+from regnf_core.fields.user_fields import BoxExtension, Evaluator, FunctionField
 from regnf_core.fields.voxel_blocks import (
     build_voxel_blocks,
     corner_offsets,
@@ -172,6 +172,9 @@ class VoxelGridField(FunctionField[BoxExtension[VoxelGridFunction]]):
             return None
         described = compiled.voxels(grid.values.shape, box.low, box.high, grid.spacing, box.outward, grid.values)
         return NativeModel(steps.voxels, described)
+
+    def _evaluator(self) -> Evaluator:
+        return self.native_model() or self.function
 
 
 def build_voxel_grid(

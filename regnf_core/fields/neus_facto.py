@@ -27,8 +27,7 @@ class NeusFactoField(FunctionField[NeusFactoFunction]):
 
     def native_model(self) -> NativeModel | None:
         """For compiled code, where it knows this form of network."""
-        found = native_evaluator(self.function)
-        return None if found is None else NativeModel(found.ask, found)
+        return native_evaluator(self.function)
 
 
 def build_neus_facto(

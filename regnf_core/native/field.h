@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 4 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 5 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -125,6 +125,8 @@ typedef struct {
     regnf_ask *grid, *voxels;
     int (*nearest)(const double *points, int64_t n, const double *places, int64_t m, int64_t count, double *distance,
                    int64_t *number);
+    int (*nearest_to_cells)(const double *points, int64_t n, const double *low, const double *edge, int64_t cells,
+                            double *distance, int64_t *number);
     void (*kernel_sums)(const float *x, const float *u, int64_t n, const float *factors, const float *weights,
                         int64_t lengths, float *out);
     void (*discs)(const float *seen, const float *normals, int64_t n, int64_t size, float radius, int64_t *nearest);

@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 4
+_LAYOUT = 5
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -37,6 +37,7 @@ _STEPS: dict[str, tuple[Any, ...]] = {
     "grid": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "voxels": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "nearest": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _COUNT, _COUNT, _ADDRESS, _ADDRESS),
+    "nearest_to_cells": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "kernel_sums": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),
     "discs": (None, _ADDRESS, _ADDRESS, _COUNT, _COUNT, ctypes.c_float, _ADDRESS),
 }

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -103,14 +103,6 @@ def voxels(counts: Sequence[int], low: Tensor, high: Tensor, spacing: Tensor, ou
     return Kept(_Voxels, counts=(_I64 * 3)(*counts), **given, outward=outward, values=values)
 
 
-def grid_distances(steps: Steps, grid: Kept, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance (M,) and gradient (M, 3) at points (M, 3)."""
-    points = points.contiguous()
-    value, gradient = torch.empty(len(points)), torch.empty(len(points), 3)
-    steps.grid(grid.address, points.data_ptr(), len(points), value.data_ptr(), gradient.data_ptr())
-    return value, gradient
-
-
 # A model of distances that compiled code asks.
 
 
@@ -134,11 +126,32 @@ class NativeModel:
         """factor g(turn x + shift) where this is g. turn: (3, 3) · shift: (3,)."""
         inner = np.array(self.turn).reshape(3, 3)
         turned, moved = inner @ np.asarray(turn, np.float64), inner @ np.asarray(shift, np.float64) + self.shift
-        return replace(self, turn=tuple(turned.ravel()), shift=tuple(moved), factor=self.factor * factor)
+        return self._with(turn=tuple(turned.ravel()), shift=tuple(moved), factor=self.factor * factor)
 
     def counting(self, count: Callable[[int], None]) -> NativeModel:
         """The same, whose points are counted."""
-        return replace(self, counted=(*self.counted, count))
+        return self._with(counted=(*self.counted, count))
+
+    def _with(self, **changes: Any) -> NativeModel:
+        return NativeModel(**{**vars(self), **changes})
+
+    def value(self, points: Tensor) -> Tensor:
+        """f (N,) itself, without the map, at points (N, 3) float32 on the CPU."""
+        return self._asked(points, None)
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """f (N,) itself and its gradient (N, 3)."""
+        gradient = torch.empty(len(points), 3)
+        return self._asked(points, gradient), gradient
+
+    def _asked(self, points: Tensor, gradient: Tensor | None) -> Tensor:
+        points, value = points.contiguous(), torch.empty(len(points))
+        assert points.dtype == torch.float32
+        assert points.shape[1:] == (3,)
+        to = None if gradient is None else gradient.data_ptr()
+        if self.ask(self.described.address, points.data_ptr(), len(points), value.data_ptr(), to):
+            raise MemoryError("no memory for the evaluation of a field")
+        return value
 
     def structure(self) -> Any:
         """regnf_model; it holds addresses of this model's parts."""
@@ -327,6 +340,24 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     ):
         raise MemoryError("no memory for a search of neighbors")
     return distance.to(places), number.to(places.device)
+
+
+def nearest_to_cells(points: Tensor, low: Tensor, edge: Tensor, cells: int) -> tuple[Tensor, Tensor] | None:
+    """Distance (C,) from the center of each cell of a cubic grid, z fastest, to the nearest of points (N, 3), N >= 1,
+    and its number (C,); None where there is no compiled code for it. low, edge: (3,), the grid's corner and a cell's
+    edges · cells: along an axis."""
+    found = variant()
+    if found is None or points.device.type != "cpu" or len(points) == 0:
+        return None
+    of, corner, edges = (part.double().contiguous() for part in (points, low, edge))
+    if not all(np.isfinite(one.numpy()).all() for one in (of, corner, edges)):
+        return None
+    distance, number = torch.empty(cells**3, dtype=torch.float64), torch.empty(cells**3, dtype=torch.int64)
+    if found.steps.nearest_to_cells(
+        of.data_ptr(), len(of), corner.data_ptr(), edges.data_ptr(), cells, distance.data_ptr(), number.data_ptr()
+    ):
+        raise MemoryError("no memory for a search of neighbors")
+    return distance.to(points), number
 
 
 def kernel_sums(places: Tensor, normals: Tensor, lengths: Tensor, weights: Tensor) -> Tensor | None:

@@ -266,6 +266,22 @@ def test_nearest_points(form: str, count: int, plainly: Any) -> None:
     assert plainly(compiled.nearest, *given) is None
 
 
+@pytest.mark.parametrize("count", [1, 5, 700])
+@pytest.mark.parametrize("cells", [1, 5, 16])
+def test_nearest_points_to_cells(cells: int, count: int, plainly: Any) -> None:
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(count)).double()
+    low, edge = torch.tensor([-2.0, -1.5, -3.0]).double(), torch.tensor([4.0, 3.0, 6.5]).double() / cells
+    found = compiled.nearest_to_cells(points, low, edge, cells)
+    assert found is not None
+    axes = [low[k] + (torch.arange(cells).double() + 0.5) * edge[k] for k in range(3)]
+    centers = torch.cartesian_prod(*axes)
+    distance, _ = cKDTree(points.numpy()).query(centers.numpy())
+    np.testing.assert_allclose(found[0], distance, rtol=1e-12)
+    np.testing.assert_allclose((points[found[1]] - centers).norm(dim=-1), distance, rtol=1e-12)
+    assert plainly(compiled.nearest_to_cells, points, low, edge, cells) is None
+    assert compiled.nearest_to_cells(points * float("nan"), low, edge, cells) is None
+
+
 def test_what_is_not_finite_is_left_to_the_other_search(plainly: Any) -> None:
     good, bad = torch.zeros(3, 3), torch.tensor([[0.0, float("nan"), 0.0]]).expand(5, 3)
     assert compiled.nearest(bad, good, 1) is None
