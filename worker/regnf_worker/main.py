@@ -60,11 +60,13 @@ class PreloadError(RuntimeError):
 def preload() -> None:
     """Import what registrations need. Raises PreloadError if the process has several threads afterwards (Linux)."""
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    gc.disable()  # what loads stays
     for name in _MODULES:
         import_module(name)
     tasks = Path("/proc/self/task")
     if tasks.exists() and len(list(tasks.iterdir())) > 1:
         raise PreloadError("a library that was loaded has started threads; unset REGNF_PRELOAD")
+    gc.enable()
     gc.freeze()  # a collection in a child would otherwise copy the pages of everything that was loaded
 
 
