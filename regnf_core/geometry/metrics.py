@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, QhullError, cKDTree
-from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from regnf_core.geometry.exponential_map import skew
@@ -61,6 +59,8 @@ class NearestNeighbors:
 
     @cached_property
     def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.points.numpy())
 
     def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,6 +102,9 @@ def gaps(points: Tensor) -> Tensor:
 
 def diameter(points: Tensor) -> float:
     """The largest distance between any two of the points (N, 3), N >= 1; found among the convex hull's corners."""
+    from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial.distance import pdist
+
     array = points.detach().double().cpu().numpy()
     if array.shape[0] < 2:
         return 0.0

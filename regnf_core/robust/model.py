@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from regnf_core.document import ObjectSymmetry
@@ -184,6 +183,8 @@ class Hull(Bundle):
     @classmethod
     def of(cls, points: Tensor) -> Hull:
         """The hull of points (N, 3). Points in one plane have none."""
+        from scipy.spatial import ConvexHull, QhullError
+
         try:
             equations = torch.from_numpy(np.unique(ConvexHull(points.double().cpu().numpy()).equations, axis=0)).float()
         except QhullError:
