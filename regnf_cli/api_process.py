@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import socket
 import sys
 
-from regnf_service.server import Server
-from regnf_state.logs import configure_logging
-from regnf_state.settings import Settings
-
 
 def main(descriptor: int) -> None:
+    gc.disable()  # what loads stays; the server, once it has started, collects again
+    from regnf_service.server import Server
+    from regnf_state.logs import configure_logging
+    from regnf_state.settings import Settings
+
     settings = Settings()
     configure_logging(settings.log_format)
     server = Server(settings)

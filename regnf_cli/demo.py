@@ -19,14 +19,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from regnf_cli.guard import require
 from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, fail, out, reporting, show_pose, tell
 from regnf_cli.serve import demo_folder
-from regnf_client import Client, Result
+
+if TYPE_CHECKING:
+    from regnf_client import Result
 
 # A private service for scripts and notebooks: `regnf serve` on a free port, stopped at the end.
 
@@ -139,6 +141,8 @@ def _register(address: str) -> Result:
     truth = json.loads((data / "truth.json").read_text(encoding="utf-8"))["T_object_scene"]["matrix"]
     box = json.loads((data / "detection.json").read_text(encoding="utf-8"))
     room, chair = data / "mix-room.safetensors", data / "armchair.safetensors"
+    from regnf_client import Client
+
     with Client(address) as client, reporting("uploading") as report:
         job = client.submit(room, chair, box, more={"ground_truth": {"T_object_scene": truth}}, progress=report)
         client.wait(job, report)

@@ -10,9 +10,6 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from redis import Redis
-from redis.exceptions import RedisError
-
 from regnf_core.errors import RegnfError
 from regnf_service.http.hosts import HostsError, allowed_hosts, cors_origins
 from regnf_service.tokens import TokensError, read_callers
@@ -75,6 +72,9 @@ def server_command(socket: Path, data_dir: Path) -> list[str]:
 
 def answers(url: str) -> bool:
     """Whether the server takes commands: it does not while it loads a long history."""
+    from redis import Redis
+    from redis.exceptions import RedisError
+
     with Redis.from_url(url, socket_timeout=2.0) as redis:
         try:
             return bool(redis.ping())

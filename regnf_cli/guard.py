@@ -7,8 +7,11 @@ The kernel is told to kill this process with its parent, and the command takes i
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 
 from regnf_core.errors import MissingExtraError
@@ -48,6 +51,17 @@ def require(*extras: str) -> None:
     lacking = [extra for extra, names in missing.items() if names]
     if lacking:
         raise MissingExtraError.of([name for names in missing.values() for name in names], lacking)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """For imports of the engine: what they make stays, so no garbage is looked for meanwhile, nor among it later."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 if __name__ == "__main__":

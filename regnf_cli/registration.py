@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from regnf_cli.guard import loading
 from regnf_cli.report import exit_code, reporting, show, tell
 from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.detections.images import AnyDetection, image_detection_in_field, read_detection
@@ -92,15 +93,16 @@ class Files:
 
         more: writes into the folder too.
         """
-        from regnf_core.viewing.artifacts import write_artifacts
-        from regnf_core.viewing.recording import write_recording
-
         if self.output is not None:
+            from regnf_core.viewing.artifacts import write_artifacts
+
             with filled_folder(self.output) as folder:
                 write_artifacts(result, folder, **said)
                 if more is not None:
                     more(folder)
         if self.recording is not None:
+            from regnf_core.viewing.recording import write_recording
+
             write_recording(result, self.recording, box, said["object_name"])
 
     def tell(self) -> None:
@@ -119,11 +121,12 @@ def register_here(
     scene: FieldSource | Recording, objects: Objects, request: dict[str, Any], files: Files
 ) -> dict[str, Any]:
     """The result document, once the files are written."""
-    from regnf_core.document import ranking_document, result_document
-    from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.library import register, search_library
-    from regnf_core.loading import import_smallest_first, load_field
-    from regnf_core.object_models import object_model
+    with loading():
+        from regnf_core.document import ranking_document, result_document
+        from regnf_core.geometry.sim3 import Sim3
+        from regnf_core.library import register, search_library
+        from regnf_core.loading import import_smallest_first, load_field
+        from regnf_core.object_models import object_model
 
     options, seed = RegistrationOptions.from_dict(request["options"]), request["seed"]
     detection = read_detection(request["detection"])

@@ -22,12 +22,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from redis.exceptions import RedisError
-
 from regnf_cli.embedded_redis import StartError, address_of, answers, open_socket, server_command
-from regnf_state.journal.journal import StorageMismatchError, claim_storage
 from regnf_state.settings import SECRETS, Settings, variables
-from regnf_state.stores import open_stores
 
 # One process that the supervisor keeps running.
 
@@ -228,6 +224,11 @@ _WAIT_S = 10.0
 
 def check_storage(settings: Settings) -> None:
     """Raises StartError (STORAGE_MISMATCH). While Redis or the storage is away nobody can tell; the API looks again."""
+    from redis.exceptions import RedisError
+
+    from regnf_state.journal.journal import StorageMismatchError, claim_storage
+    from regnf_state.stores import open_stores
+
     stores = open_stores(settings, retries=None, storage_wait_s=_WAIT_S)
     try:
         claim_storage(stores.redis, stores.records.journal.storage_id(), settings.adopt_storage or None)
@@ -240,6 +241,8 @@ def check_storage(settings: Settings) -> None:
 
 
 _LOOK_EVERY_S = 0.2
+_ASK_EVERY_S = 0.01
+"""Of Redis, which takes some hundredths of a second. The API's socket is open before it: a request waits there."""
 _START_DEADLINE_S = 60.0
 _STOP_S = 10.0
 """For the API and for Redis; for workers after their own grace."""
@@ -248,7 +251,7 @@ logger = logging.getLogger(__name__)
 
 
 class Supervisor:
-    """Starts the children in their order, keeps them running, and stops them in the opposite order.
+    """Starts the children, keeps them running, and stops them: the API first, Redis last.
 
     Run it in the main thread: signals arrive there, and the kernel ties the children's lives to it.
     """
@@ -272,9 +275,15 @@ class Supervisor:
             address = address_of(listener)
             lock.note(address=address)
             stack.callback(self._stop_children)
-            url = self._settings.redis_url or self._start_redis(lock)
+            url, redis = (self._settings.redis_url, None) if self._settings.redis_url else self._start_redis(lock)
+            environment = self._environment(url, listener)
+            workers: list[Child] = []  # they stop after the API
+            self._children.append(workers)
+            api = self._start_api(environment, listener)
+            if redis is not None:
+                self._until(lambda: answers(url), redis, "Redis")
             check_storage(self._settings.model_copy(update={"redis_url": url}))
-            api = self._start_rest(url, listener)
+            self._start_workers(workers, environment)
             if self._until(lambda: _api_answers(address), api, "the API"):
                 ready(address)
             while not self._stop.wait(_LOOK_EVERY_S):
@@ -282,19 +291,18 @@ class Supervisor:
                     child.keep_running()
             logger.info("stopping")
 
-    def _start_redis(self, lock: StateLock) -> str:
+    def _start_redis(self, lock: StateLock) -> tuple[str, Child]:
+        """Its address, at which it will answer, and its process."""
         path = lock.make_socket_dir() / "redis.sock"
         command = server_command(path, self._settings.state_dir / "redis")
         redis = Child("redis", command, _without_secrets(os.environ), _STOP_S)
         self._children.append([redis])
-        url = f"unix://{path}"
-        self._until(lambda: answers(url), redis, "Redis")
-        return url
+        return f"unix://{path}", redis
 
-    def _start_rest(self, redis_url: str, listener: socket.socket) -> Child:
-        """Start the API, which is returned, and the workers."""
+    def _environment(self, redis_url: str, listener: socket.socket) -> dict[str, str]:
+        """What the API and the workers are told."""
         settings = self._settings
-        told = variables(
+        return os.environ | variables(
             redis_url=redis_url,
             state_dir=settings.state_dir,
             host=settings.host,
@@ -302,17 +310,19 @@ class Supervisor:
             workers=settings.workers,
             **({"demo_dir": settings.demo_dir} if settings.demo_dir is not None else {}),
         )
-        environment = os.environ | told
+
+    def _start_api(self, environment: Mapping[str, str], listener: socket.socket) -> Child:
+        """Started while Redis starts: by the time it has loaded, Redis answers."""
         descriptor = listener.fileno()
-        workers: list[Child] = []
-        self._children.append(workers)
         command = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
         api = Child("api", command, environment, _STOP_S, passed=[descriptor])
         self._children.append([api])
-        command, grace_s = [sys.executable, "-m", "regnf_worker.main"], settings.shutdown_grace_s + _STOP_S
-        for number in range(1, settings.workers + 1):
-            workers.append(Child(f"worker {number}", command, _without_secrets(environment), grace_s))
         return api
+
+    def _start_workers(self, workers: list[Child], environment: Mapping[str, str]) -> None:
+        command, grace_s = [sys.executable, "-m", "regnf_worker.main"], self._settings.shutdown_grace_s + _STOP_S
+        for number in range(1, self._settings.workers + 1):
+            workers.append(Child(f"worker {number}", command, _without_secrets(environment), grace_s))
 
     def _until(self, look: Callable[[], bool], child: Child, what: str) -> bool:
         """Wait for a child to answer; False when a signal came first. Raises StartError when it ends or is late."""
@@ -324,7 +334,7 @@ class Supervisor:
                 raise StartError(f"{what} ended while it was starting; the log above says why")
             if time.monotonic() > deadline:
                 raise StartError(f"{what} did not start within {_START_DEADLINE_S:.0f} s")
-            self._stop.wait(0.05)
+            self._stop.wait(_ASK_EVERY_S)
         return False
 
     def _stop_children(self) -> None:

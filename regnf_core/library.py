@@ -20,7 +20,6 @@ from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.paper import pipeline as paper
 from regnf_core.progress import Run
 from regnf_core.robust.constants import LIBRARY
 from regnf_core.robust.model import ObjectModel, model_object, read_object_model, signature, write_object_model
@@ -185,6 +184,8 @@ def register(
     if options.preset == "robust":
         result = register_robust(scene, obj, detection, options, seed, run, initial_transform, object_model)
     else:
+        from regnf_core.paper import pipeline as paper
+
         result = paper.register_paper(scene, obj, detection, options, seed, run)
     if clouds:
         with run.phase("exporting"):
@@ -196,5 +197,8 @@ def with_late_clouds(
     result: RegistrationResult, scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions
 ) -> RegistrationResult:
     """The result of ``register`` without clouds as it returns it with them, but for the seconds of this phase."""
-    region = cloud_region(detection) if options.preset == "robust" else paper.cloud_region(detection, options)
-    return with_clouds(result, scene, obj, detection, region)
+    if options.preset == "robust":
+        return with_clouds(result, scene, obj, detection, cloud_region(detection))
+    from regnf_core.paper import pipeline as paper
+
+    return with_clouds(result, scene, obj, detection, paper.cloud_region(detection, options))

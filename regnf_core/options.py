@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
-from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.errors import InvalidOptionsError, nearest_name
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 Unit = Literal["auto", "m", "cm", "mm", "in", "free"]
 METERS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -205,8 +208,12 @@ class RegistrationOptions(_Group):
 
         Raises InvalidOptionsError naming the first faulty option.
         """
+        if not values:
+            return cls()
+        from pydantic import ValidationError
+
         try:
-            read = _ADAPTER.validate_python(values, strict=False)
+            read = _adapter().validate_python(values, strict=False)
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"])
@@ -218,8 +225,7 @@ class RegistrationOptions(_Group):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of every option, defaults included, in a fixed order."""
-        values: dict[str, Any] = _ADAPTER.dump_python(self)
-        return values
+        return asdict(self)
 
     def require_robust(self, feature: str, reason: str = InvalidOptionsError.reason) -> None:
         """Raises InvalidOptionsError with ``reason`` under another preset. feature: what only `robust` can do."""
@@ -294,4 +300,11 @@ def _names() -> dict[tuple[str, ...], list[str]]:
 
 UNKNOWN_OPTION = "unexpected_keyword_argument"
 """The type of pydantic's error about an unknown option."""
-_ADAPTER = TypeAdapter(RegistrationOptions)
+
+
+@cache
+def _adapter() -> TypeAdapter[RegistrationOptions]:
+    """Made when options are read: that takes .04 s, and the defaults need none."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(RegistrationOptions)

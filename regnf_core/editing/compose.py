@@ -72,7 +72,7 @@ def _voxels_of(known: Observation, box: OrientedBox) -> Tensor:
 def _middles(known: Observation, index: Tensor) -> Tensor:
     """(M, 3) float64, the voxels' middles in the scene's frame."""
     points = known.low + known.voxel * (index.double() + 0.5)
-    return points if known.T_grid_frame is None else known.T_grid_frame.inverse().apply(points)
+    return points if known.T_grid_frame is None else known.T_grid_frame.apply_inverse(points)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from safetensors import safe_open
 from torch import Tensor
@@ -30,7 +31,7 @@ from regnf_core.fields.observation import (
     stored_observation,
 )
 from regnf_core.fields.onnx.graph import build_onnx
-from regnf_core.fields.user_fields import BoxExtension, FunctionField
+from regnf_core.fields.user_fields import BoxExtension, Evaluator, FunctionField
 from regnf_core.fields.voxel_blocks import (
     build_voxel_blocks,
     corner_offsets,
@@ -39,6 +40,8 @@ from regnf_core.fields.voxel_blocks import (
     interpolate_with_derivative,
 )
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native import steps as compiled
+from regnf_core.native.steps import NativeModel, native_model
 from regnf_core.schema.description import OBSERVATION, VALUES, FieldDescription, NetworkColor, split_color
 from regnf_core.schema.kinds import (
     MeshDescription,
@@ -82,6 +85,11 @@ class ScaledField(FieldView):
     def inverse_deviation(self) -> float | None:
         inverse = inverse_deviation_of(self.field)
         return None if inverse is None else inverse / self.scale
+
+    def native_model(self) -> NativeModel | None:
+        """For compiled code, where the field has such."""
+        found, scale = native_model(self.field), self.scale
+        return None if found is None else found.seen_by(np.eye(3) / scale, np.zeros(3), self.sign * scale)
 
     def to(self, device: torch.device | str) -> ScaledField:
         return ScaledField(self.field.to(device), self.scale, self.sign)
@@ -153,9 +161,25 @@ class VoxelGridFunction(OnDevice):
         return index, (position - cell).T
 
 
+class VoxelGridField(FunctionField[BoxExtension[VoxelGridFunction]]):
+    """A :class:`VoxelGridFunction` as an SdfField."""
+
+    def native_model(self) -> NativeModel | None:
+        """For compiled code; values in float16 have none."""
+        box, grid = self.function, self.function.function
+        steps = compiled.steps_for(grid.values)
+        if steps is None or not grid.values.is_contiguous():
+            return None
+        described = compiled.voxels(grid.values.shape, box.low, box.high, grid.spacing, box.outward, grid.values)
+        return NativeModel(steps.voxels, described)
+
+    def _evaluator(self) -> Evaluator:
+        return self.native_model() or self.function
+
+
 def build_voxel_grid(
     description: VoxelGridDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None
-) -> FunctionField[BoxExtension[VoxelGridFunction]]:
+) -> VoxelGridField:
     """The field of ``description`` with its values in ``tensors``, extended beyond the grid. colors: of the nodes.
 
     The tensors keep their device and type; they must have passed :meth:`VoxelGridDescription.check_tensors`.
@@ -167,7 +191,7 @@ def build_voxel_grid(
     origin, spacing, high = (corner.to(device=values.device, dtype=torch.float32) for corner in (origin, spacing, high))
     colors = None if colors is None else colors.contiguous()
     function = BoxExtension(VoxelGridFunction(values, origin, spacing, colors), origin, high, float(description.sign))
-    return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
+    return VoxelGridField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
 
 
 def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> SdfField:

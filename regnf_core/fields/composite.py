@@ -21,6 +21,7 @@ from regnf_core.fields.observation import (
     observation_of,
 )
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.native.steps import NativeModel, native_model
 from regnf_core.schema.similarity import local_origin
 
 
@@ -64,7 +65,7 @@ class TransformedField(FieldView):
     def bounds(self) -> Tensor:
         low, high = self.field.bounds
         corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))  # (8, 3)
-        moved = self.T_field_frame.inverse().apply(corners)
+        moved = self.T_field_frame.apply_inverse(corners)
         return torch.stack([moved.amin(0), moved.amax(0)])
 
     @property
@@ -76,6 +77,12 @@ class TransformedField(FieldView):
     def inverse_deviation(self) -> float | None:
         inverse = inverse_deviation_of(self.field)
         return None if inverse is None else inverse * float(self.T_field_frame.scale)
+
+    def native_model(self) -> NativeModel | None:
+        """For compiled code, where the field has such."""
+        found, T = native_model(self.field), self.T_field_frame
+        scale = float(T.scale)
+        return None if found is None else found.seen_by(scale * T.rotation.numpy(), T.translation.numpy(), 1.0 / scale)
 
     def to(self, device: torch.device | str) -> TransformedField:
         return TransformedField(self.field.to(device), self.T_field_frame)

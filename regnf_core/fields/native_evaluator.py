@@ -15,6 +15,7 @@ from torch import Tensor
 from regnf_core.fields.color_head import PositionalEncoding
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.native.library import Variant, variant
+from regnf_core.native.steps import NativeModel
 
 _CONTRACTIONS = {"none": 0, "linf": 1, "linf_grid": 2}
 _COUNTS = ("layers", "levels", "dense_levels", "features", "smoothstep", "directions", "degree", "contraction")
@@ -31,30 +32,20 @@ class _Field(ctypes.Structure):
     )
 
 
-class NativeEvaluator:
-    """A function's present parameters, which are read where they are: it is made anew for each call."""
+class NativeEvaluator(NativeModel):
+    """A function's present parameters, which are read where they are: it is made for each call."""
 
     def __init__(self, function: NeusFactoFunction, variant: Variant) -> None:
         """function: one of those that :func:`suits` takes."""
-        self._function, self._variant = function, variant
+        super().__init__(variant.evaluate, _Described(function))
+
+
+class _Described:
+    """The structure of a function, and what must live as long as it: it holds addresses."""
+
+    def __init__(self, function: NeusFactoFunction) -> None:
         self._field, self._kept = _described(function)
-
-    def value(self, points: Tensor) -> Tensor:
-        return self._evaluate(points, None)
-
-    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        gradient = torch.empty(len(points), 3)
-        return self._evaluate(points, gradient), gradient
-
-    def _evaluate(self, points: Tensor, gradient: Tensor | None) -> Tensor:
-        points, distance = points.contiguous(), torch.empty(len(points))
-        assert points.dtype == torch.float32
-        assert points.shape[1:] == (3,)
-        to = None if gradient is None else gradient.data_ptr()
-        address = ctypes.addressof(self._field)
-        if self._variant.evaluate(address, points.data_ptr(), len(points), distance.data_ptr(), to):
-            raise MemoryError("no memory for the evaluation of a field")
-        return distance
+        self.address = ctypes.addressof(self._field)
 
 
 def suits(function: NeusFactoFunction) -> bool:

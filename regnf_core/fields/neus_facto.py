@@ -15,6 +15,7 @@ from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.fields.native_evaluator import native_evaluator
 from regnf_core.fields.neus_facto_function import GeometryMlp, NeusFactoFunction
 from regnf_core.fields.user_fields import Evaluator, FunctionField
+from regnf_core.native.steps import NativeModel
 from regnf_core.schema.kinds import SKIP_LAYER, NeusFactoDescription
 
 
@@ -23,6 +24,10 @@ class NeusFactoField(FunctionField[NeusFactoFunction]):
 
     def _evaluator(self) -> Evaluator:
         return native_evaluator(self.function) or self.function
+
+    def native_model(self) -> NativeModel | None:
+        """For compiled code, where it knows this form of network."""
+        return native_evaluator(self.function)
 
 
 def build_neus_facto(

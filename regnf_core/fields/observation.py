@@ -17,6 +17,7 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library_entries import shown_number
+from regnf_core.native.steps import NativeModel, native_model
 from regnf_core.schema.description import SURFACE, UNSEEN, ObservationGrid
 
 # What every field offers, whatever made it: signed distance, its gradient, its bounds.
@@ -164,13 +165,13 @@ class Observation:
         ends = torch.stack([voxels.amin(0), voxels.amax(0) + 1]).double() * self.voxel + self.low.double()
         corners = torch.cartesian_prod(*ends.T)
         if self.T_grid_frame is not None:
-            corners = self.T_grid_frame.inverse().apply(corners)
+            corners = self.T_grid_frame.apply_inverse(corners)
         return torch.stack([corners.amin(0), corners.amax(0)])
 
     def measured(self) -> Tensor:
         """(V, 3) float64: the middles of the voxels in which a surface was measured, in the points' frame."""
         points = ((self.states == SURFACE).nonzero().double() + 0.5) * self.voxel + self.low.double()
-        return points if self.T_grid_frame is None else self.T_grid_frame.inverse().apply(points)
+        return points if self.T_grid_frame is None else self.T_grid_frame.apply_inverse(points)
 
     def stored(self) -> tuple[ObservationGrid, NDArray[np.int32]]:
         """The grid and the tensor that a file keeps, both of the grid's own frame."""
@@ -249,6 +250,10 @@ class ObservedField(FieldView):
     def observation(self) -> Observation | None:
         return self._observation
 
+    def native_model(self) -> NativeModel | None:
+        """The field's own, where it has one: its values are those of this field."""
+        return native_model(self.field)
+
     def to(self, device: torch.device | str) -> ObservedField:
         """The same field with its parameters on another device; the observation stays on the CPU."""
         return ObservedField(self.field.to(device), self._observation)
@@ -274,6 +279,14 @@ class CountingField(FieldView):
     def __init__(self, field: SdfField) -> None:
         self.field = field
         self.evaluations = 0
+
+    def native_model(self) -> NativeModel | None:
+        """The field's own, whose points are counted."""
+        found = native_model(self.field)
+        return None if found is None else found.counting(self._count)
+
+    def _count(self, points: int) -> None:
+        self.evaluations += points
 
     def to(self, device: torch.device | str) -> CountingField:
         moved = CountingField(self.field.to(device))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.observation import ColorFunction, FieldView, OnDevice, SdfField, field_repr
+from regnf_core.fields.recorded_kernels import RecordedEvaluation
 
 PointFunction = Callable[[Tensor], Any]
 """Signed distance (N,) or (N, 1) at points (N, 3) float32: a tensor or a numpy array of real numbers."""
@@ -261,6 +262,7 @@ class FunctionField(Generic[F]):
         if isinstance(function, ColoredFunction) and function.has_color:
             self.color = partial(_chunked_color, function, chunk, function.device)
         self._bounds = torch.as_tensor(bounds, dtype=torch.float64, device="cpu")
+        self._recorded = RecordedEvaluation(function.value_and_gradient) if function.device.type == "cuda" else None
 
     def __repr__(self) -> str:
         return field_repr(self)
@@ -288,9 +290,10 @@ class FunctionField(Generic[F]):
 
     @torch.no_grad()
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        distance, gradient, evaluator = self._empty(len(points)), self._empty(len(points), 3), self._evaluator()
+        distance, gradient = self._empty(len(points)), self._empty(len(points), 3)
+        evaluate = self._recorded or self._evaluator().value_and_gradient
         for at, part in _chunks(points, self.chunk, self.device):
-            distance[at], gradient[at] = evaluator.value_and_gradient(part)
+            distance[at], gradient[at] = evaluate(part)
         return distance, gradient
 
     def _evaluator(self) -> Evaluator:

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, QhullError, cKDTree
-from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from regnf_core.geometry.exponential_map import skew
@@ -61,6 +59,8 @@ class NearestNeighbors:
 
     @cached_property
     def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.points.numpy())
 
     def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,6 +102,9 @@ def gaps(points: Tensor) -> Tensor:
 
 def diameter(points: Tensor) -> float:
     """The largest distance between any two of the points (N, 3), N >= 1; found among the convex hull's corners."""
+    from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial.distance import pdist
+
     array = points.detach().double().cpu().numpy()
     if array.shape[0] < 2:
         return 0.0
@@ -123,14 +126,14 @@ def rotation_error(estimate: Sim3, truth: Sim3) -> float:
 
 def _apart(estimate: Sim3, truth: Sim3, points: Tensor) -> Tensor:
     """(...,) distances between the estimated and the true place of object points (..., 3), object units."""
-    away: Tensor = (estimate.inverse().apply(points) - truth.inverse().apply(points)).norm(dim=-1)
+    away: Tensor = (estimate.apply_inverse(points) - truth.apply_inverse(points)).norm(dim=-1)
     return float(truth.scale) * away
 
 
 def add_s(estimate: Sim3, truth: Sim3, points: Tensor) -> float:
     """ADD-S: mean distance from true to the nearest estimated surface point, object points (N, 3), object units."""
-    placed = estimate.inverse().apply(points.double())
-    distance, _ = NearestNeighbors(placed).query(truth.inverse().apply(points.double()))
+    placed = estimate.apply_inverse(points.double())
+    distance, _ = NearestNeighbors(placed).query(truth.apply_inverse(points.double()))
     return float(truth.scale) * float(distance.mean())
 
 
@@ -178,7 +181,7 @@ def displacement(T: Sim3, reference: Sim3, points: Tensor) -> Tensor:
 
     (H,): how far apart two poses place the object, measured in the frame it is placed in and scaled to its own units.
     """
-    placed, other = T.inverse().apply(points.double()), reference.inverse().apply(points.double())
+    placed, other = T.apply_inverse(points.double()), reference.apply_inverse(points.double())
     apart: Tensor = reference.scale * (placed - other).norm(dim=-1).amax(-1)
     return apart
 
@@ -192,7 +195,7 @@ def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) 
     T, scores, points = T.on("cpu"), scores.cpu(), points.cpu()
     order = scores.argsort()
     # Plain arrays: a call costs less there, and all of them are small.
-    placed = T[order].inverse().apply(points.double()).mT.contiguous().numpy()  # (H, 3, N)
+    placed = T[order].apply_inverse(points.double()).mT.contiguous().numpy()  # (H, 3, N)
     reach = (apart / T.scale[order].double()).square().numpy()
     numbers, left = order.numpy(), np.arange(len(order))
     chosen: list[int] = []

@@ -4,7 +4,10 @@
  * Points are taken in blocks of BLOCK, padded where they are fewer, so that a point's result does not depend on those
  * beside it. Within a block each feature is a plane: one row of BLOCK numbers. */
 #include "block.h"
+#include "distances.h"
 #include "steps.h"
+#include "minimize.h"
+#include "near.h"
 #include "discs.h"
 
 #include <stdlib.h>
@@ -67,12 +70,13 @@ static void one_block(const regnf_field *f, const plane *x, scratch s, int want,
         for (int p = 0; p < BLOCK; p++) by_point[axis][p] += by_grid[axis][p];
 }
 
-int REGNF_EVALUATE(REGNF_SET)(const regnf_field *f, const float *points, int64_t count, float *distance, float *gradient) {
-    if (count <= 0) return 0;
+int REGNF_EVALUATE(REGNF_SET)(const void *field, const float *points, int64_t count, float *distance, float *gradient) {
+    const regnf_field *f = field;
+    if (count <= 0) return REGNF_DONE;
     const int64_t wide = widest(f), inputs = f->widths[0], grid = (int64_t)f->levels * f->features;
     const int64_t rows = 2 * inputs + 2 * wide + slope_rows(f) + 3 * grid;
     plane *memory = aligned_alloc(64, (size_t)rows * sizeof(plane));
-    if (memory == NULL) return 1;
+    if (memory == NULL) return REGNF_NO_MEMORY;
     scratch s = {.inputs = memory};
     s.by_input = s.inputs + inputs;
     s.hidden = s.by_input + inputs;
@@ -88,7 +92,7 @@ int REGNF_EVALUATE(REGNF_SET)(const regnf_field *f, const float *points, int64_t
         if (gradient != NULL) write_gradient(gradient, first, live, by_point);
     }
     free(memory);
-    return 0;
+    return REGNF_DONE;
 }
 
 void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float *out) {
@@ -103,5 +107,6 @@ void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float
 }
 
 const regnf_steps REGNF_STEPS(REGNF_SET) = {
-    places, sample_residuals, grid_distances, costs, normal_equations, nearest, kernel_sums, nearest_discs,
+    pair_residuals, minimize,         grid_distances, voxel_distances,
+    nearest,        nearest_to_cells, kernel_sums,    nearest_discs,
 };

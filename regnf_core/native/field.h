@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 3 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 5 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -29,29 +29,39 @@ typedef struct {
     const uint32_t *offsets;    /* (levels): first row */
 } regnf_field;
 
-/* Signed distance (count) at points (count, 3), and its gradient (count, 3) by them unless gradient is NULL.
- * Returns 0, or 1 when there is no memory. */
-typedef int regnf_evaluate_function(const regnf_field *field, const float *points, int64_t count, float *distance,
-                                    float *gradient);
+/* Distances (count) at points (count, 3) of what `self` describes, and gradients (count, 3) unless they are NULL.
+ * Returns 0 (REGNF_DONE) or a fault. */
+typedef int regnf_ask(const void *self, const float *points, int64_t count, float *value, float *gradient);
+
+enum { REGNF_DONE = 0, REGNF_NO_MEMORY = 1, REGNF_ASKED_IN_VAIN = 2, REGNF_NOT_FINITE = 3, REGNF_STOPPED = 4 };
 
 /* For tests: exp, log(1 + x), sin and cos of numbers (count), for which = 0, 1, 2, 3. */
 typedef void regnf_elementary_function(int which, const float *x, int64_t count, float *out);
 
-/* Samples of one surface at poses T (poses): y = scale R x + t. */
+/* A model of distances: factor f(turn x + shift), with the gradient factor turn^T g. */
 typedef struct {
-    int64_t poses, count;
-    int32_t of_object;    /* 1: samples of the object, asked of the scene; 0: the other way */
-    float ahead;          /* in front of the scene's samples: where the object is asked, units of the scene's frame */
-    float min_cosine;     /* of an inlier's normals */
-    const float *scale, *rotation, *translation; /* (poses), (poses, 3, 3), (poses, 3) */
-    const float *points, *values, *normals;      /* (count, 3), (count), (count, 3) */
+    regnf_ask *ask;
+    const void *self;
+    int64_t at_once;  /* points that it is asked for at most; 0: all that there are */
+    int32_t as_it_is; /* 1: f(x), whatever it is; 0: a value that is not finite is a fault */
+    double turn[9], shift[3], factor;
+} regnf_model;
+
+typedef struct {
+    int64_t count;
+    const float *points, *values, *normals; /* (count, 3), (count), (count, 3) */
 } regnf_samples;
 
-/* Where residuals go: rows of `total` samples, from the `first` on. */
+/* Poses T (count): y = scale R x + t; with an offset of the surfaces, or NULL. */
 typedef struct {
-    int64_t total, first;
-    float *values, *jacobian, *cosines; /* (poses, total), (poses, 7, total), (poses, total) */
-    uint8_t *unobserved;                /* (poses, total), or NULL: all was observed */
+    int64_t count;
+    double *scale, *rotation, *translation, *offset; /* (count), (count, 3, 3), (count, 3), (count) */
+} regnf_poses;
+
+/* Residuals of poses, one row each, scene samples first. */
+typedef struct {
+    float *values, *jacobian, *cosines; /* (rows, total), (rows, 7, total) or NULL, (rows, total) */
+    uint8_t *unobserved;                /* (rows, total), or NULL: all was observed */
 } regnf_rows;
 
 /* A point x is in the voxel floor(x turn + shift), the last axis fastest. */
@@ -68,26 +78,55 @@ typedef struct {
     const float *planes;
 } regnf_planes;
 
-/* Residuals and what they weigh. */
+/* Values at the nodes of a regular grid, trilinear between them; beyond, the distance to the grid is added. */
 typedef struct {
-    int64_t poses, total, scene_count;
-    int32_t normals, with_offset; /* whether normals count; whether an offset is the eighth unknown */
-    float unobserved_width, min_cosine;
-    const float *values, *cosines;         /* (poses, total) */
-    const float *widths, *observed_weights; /* (poses); (poses) or NULL */
-    const uint8_t *unobserved;             /* (poses, total), or NULL */
-} regnf_loss;
+    int64_t counts[3];
+    float low[3], high[3], spacing[3], outward; /* outward: -1 where values are negative in free space */
+    const float *values;                        /* z fastest */
+} regnf_voxels;
 
-/* One set of the steps; see steps.h, near.h and discs.h. */
+/* Two surfaces: samples of both, and what each is asked of. */
 typedef struct {
-    void (*places)(const regnf_samples *, float *places);
-    void (*residuals)(const regnf_samples *, const float *value, const float *gradient, const regnf_rows *,
-                      const regnf_observation *, const uint8_t *hidden);
-    void (*grid)(const regnf_planes *, const float *points, int64_t count, float *value, float *gradient);
-    void (*costs)(const regnf_loss *, double *costs);
-    void (*equations)(const regnf_loss *, const float *jacobian, double *H, double *b);
+    regnf_samples scene_samples, object_samples;
+    const regnf_model *scene, *object;
+    const regnf_observation *seen; /* of the scene, or NULL: all of it */
+    const uint8_t *hidden;         /* scene samples that nobody saw from their front, or NULL */
+    float ahead;                   /* in front of the scene's samples: where the object is asked, units of the scene */
+    float min_cosine;              /* of an inlier's normals */
+} regnf_pair;
+
+/* How to minimize, see regnf_core/robust/refine. */
+typedef struct {
+    int64_t iterations;
+    const double *widths;          /* (iterations) */
+    double widest;                 /* 0: the widths stay as they are */
+    double low, high;              /* of the scale */
+    double max_offset;
+    int32_t normals, keeps_scale;
+    double damping_start, damping_low, damping_high, damping_decrease, damping_increase;
+    double min_damping, relative_damping, fixed_damping, max_step;
+    double spread_quantile, spread_factor;
+    double unobserved_width, min_observed_share, unobserved_loss, offset_prior, score_width;
+    int (*on_iteration)(void); /* or NULL; what is not 0 ends the minimization */
+} regnf_settings;
+
+/* The iterations so far: (poses, iterations) each; NULL: they are not kept. */
+typedef struct {
+    double *scale, *rotation, *translation;
+    float *costs, *of_scene, *of_object; /* means of |r| */
+} regnf_history;
+
+/* One set of the steps; see steps.h, minimize.h, distances.h, near.h and discs.h. */
+typedef struct {
+    int (*residuals)(const regnf_pair *, const regnf_poses *, const regnf_rows *);
+    /* Poses are changed in place; scores (poses) and |residuals| (poses, total) at the end. */
+    int (*minimize)(const regnf_pair *, regnf_poses *, const regnf_settings *, float *scores, float *sizes,
+                    const regnf_history *);
+    regnf_ask *grid, *voxels;
     int (*nearest)(const double *points, int64_t n, const double *places, int64_t m, int64_t count, double *distance,
                    int64_t *number);
+    int (*nearest_to_cells)(const double *points, int64_t n, const double *low, const double *edge, int64_t cells,
+                            double *distance, int64_t *number);
     void (*kernel_sums)(const float *x, const float *u, int64_t n, const float *factors, const float *weights,
                         int64_t lengths, float *out);
     void (*discs)(const float *seen, const float *normals, int64_t n, int64_t size, float radius, int64_t *nearest);

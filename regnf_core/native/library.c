@@ -7,19 +7,19 @@
 
 typedef struct {
     const char *name;
-    regnf_evaluate_function *evaluate;
+    regnf_ask *evaluate;
     regnf_elementary_function *elementary;
     const regnf_steps *steps;
     int runs; /* on this processor */
 } variant;
 
-regnf_evaluate_function regnf_evaluate_plain;
+regnf_ask regnf_evaluate_plain;
 regnf_elementary_function regnf_elementary_plain;
 extern const regnf_steps regnf_steps_plain;
 
 #if defined(__x86_64__)
 #define VARIANTS 3
-regnf_evaluate_function regnf_evaluate_avx2, regnf_evaluate_avx512;
+regnf_ask regnf_evaluate_avx2, regnf_evaluate_avx512;
 regnf_elementary_function regnf_elementary_avx2, regnf_elementary_avx512;
 extern const regnf_steps regnf_steps_avx2, regnf_steps_avx512;
 
@@ -64,7 +64,7 @@ OFFERED const char *regnf_variant(int number) {
 }
 
 /* Its functions. */
-OFFERED regnf_evaluate_function *regnf_evaluator(int number) {
+OFFERED regnf_ask *regnf_evaluator(int number) {
     variant found;
     return find(number, &found) ? found.evaluate : NULL;
 }

@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 3
+_LAYOUT = 5
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -32,12 +32,12 @@ Elementary = Callable[[int, int, int, int], None]
 
 _ADDRESS, _COUNT = ctypes.c_void_p, ctypes.c_int64
 _STEPS: dict[str, tuple[Any, ...]] = {
-    "places": (None, _ADDRESS, _ADDRESS),
-    "residuals": (None, *(_ADDRESS,) * 6),
-    "grid": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
-    "costs": (None, _ADDRESS, _ADDRESS),
-    "equations": (None, *(_ADDRESS,) * 4),
+    "residuals": (ctypes.c_int, *(_ADDRESS,) * 3),
+    "minimize": (ctypes.c_int, *(_ADDRESS,) * 6),
+    "grid": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "voxels": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "nearest": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _COUNT, _COUNT, _ADDRESS, _ADDRESS),
+    "nearest_to_cells": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "kernel_sums": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),
     "discs": (None, _ADDRESS, _ADDRESS, _COUNT, _COUNT, ctypes.c_float, _ADDRESS),
 }

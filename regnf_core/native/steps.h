@@ -1,17 +1,27 @@
-/* The inner steps of search and refinement on the samples of one surface, at a batch of poses: what
- * regnf_core/robust/residuals.py, search/distance_grid.py and refine/loss.py say in tensor algebra, in one pass each. */
+/* Residuals of a pair of surfaces at a batch of poses, and sums of kernels: what regnf_core/robust/residuals.py and
+ * verdict/covariance.py say in tensor algebra, in one pass over the samples. */
 #ifndef REGNF_STEPS_H
 #define REGNF_STEPS_H
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "block.h"
-#include "near.h"
+#include "distances.h"
 
 enum { STATE_UNSEEN = 0, STATE_FREE = 1, STATE_SURFACE = 2 }; /* as in regnf_core/schema/description.py */
 
-INLINE float dot3(const float *a, const float *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+typedef struct {
+    float s, R[9], t[3], offset;
+} pose;
+
+INLINE pose pose_of(const regnf_poses *T, int64_t h) {
+    pose p = {.s = (float)T->scale[h], .offset = T->offset ? (float)T->offset[h] : 0.0f};
+    for (int k = 0; k < 9; k++) p.R[k] = (float)T->rotation[9 * h + k];
+    for (int k = 0; k < 3; k++) p.t[k] = (float)T->translation[3 * h + k];
+    return p;
+}
 
 INLINE void turn3(const float *R, const float *x, float *y) {
     for (int i = 0; i < 3; i++) y[i] = dot3(R + 3 * i, x);
@@ -22,31 +32,17 @@ INLINE void turn_back3(const float *R, const float *x, float *y) {
 }
 
 /* What follows from a pose for one of the scene's samples: y - t, and the normal in the object's frame. */
-INLINE void carry_scene(const regnf_samples *a, int64_t h, int64_t i, float *arm, float *normal) {
-    turn3(a->rotation + 9 * h, a->points + 3 * i, arm);
-    for (int k = 0; k < 3; k++) arm[k] *= a->scale[h];
-    turn3(a->rotation + 9 * h, a->normals + 3 * i, normal);
+INLINE void carry_scene(const regnf_samples *a, const pose *T, int64_t i, float *arm, float *normal) {
+    turn3(T->R, a->points + 3 * i, arm);
+    for (int k = 0; k < 3; k++) arm[k] *= T->s;
+    turn3(T->R, a->normals + 3 * i, normal);
 }
 
 /* For one of the object's samples: z - t, and w. */
-INLINE void carry_object(const regnf_samples *a, int64_t h, int64_t i, float *arm, float *w) {
-    for (int k = 0; k < 3; k++) arm[k] = a->points[3 * i + k] - a->translation[3 * h + k];
-    turn_back3(a->rotation + 9 * h, arm, w);
-    for (int k = 0; k < 3; k++) w[k] /= a->scale[h];
-}
-
-static void places(const regnf_samples *a, float *out) {
-    for (int64_t h = 0; h < a->poses; h++)
-        for (int64_t i = 0; i < a->count; i++, out += 3) {
-            float arm[3], other[3];
-            if (a->of_object) {
-                carry_object(a, h, i, arm, out);
-                continue;
-            }
-            carry_scene(a, h, i, arm, other);
-            const float step = a->ahead * a->scale[h];
-            for (int k = 0; k < 3; k++) out[k] = arm[k] + a->translation[3 * h + k] + step * other[k];
-        }
+INLINE void carry_object(const regnf_samples *a, const pose *T, int64_t i, float *arm, float *w) {
+    for (int k = 0; k < 3; k++) arm[k] = a->points[3 * i + k] - T->t[k];
+    turn_back3(T->R, arm, w);
+    for (int k = 0; k < 3; k++) w[k] /= T->s;
 }
 
 /* [arm x g, g, lever] of a sample, in planes `total` apart. */
@@ -83,157 +79,119 @@ INLINE int front_unobserved(const regnf_observation *seen, const float *p, const
     return 1;
 }
 
-static void sample_residuals(const regnf_samples *a, const float *value, const float *gradient, const regnf_rows *out,
-                             const regnf_observation *seen, const uint8_t *hidden) {
-    for (int64_t h = 0; h < a->poses; h++) {
-        const float *R = a->rotation + 9 * h, s = a->scale[h];
-        for (int64_t i = 0; i < a->count; i++) {
-            const int64_t from = h * a->count + i, to = h * out->total + out->first + i;
-            float *J = out->jacobian + 7 * h * out->total + out->first + i;
-            const float *g = gradient + 3 * from;
-            float arm[3], other[3], v = value[from];
-            if (!a->of_object) {
-                carry_scene(a, h, i, arm, other);
-                v -= a->ahead * s * dot3(g, other);
-                out->values[to] = v - s * a->values[i];
-                write_row(J, out->total, arm, g, dot3(g, arm) - v);
-                out->cosines[to] = cosine_of(g, other);
-                if (out->unobserved) out->unobserved[to] = hidden && hidden[i] && out->cosines[to] < a->min_cosine;
-                continue;
-            }
-            float turned[3], away[3], normal[3];
-            carry_object(a, h, i, arm, other);
-            turn3(R, g, turned);
-            for (int k = 0; k < 3; k++) away[k] = -turned[k];
-            const float r = s * v - a->values[i];
-            out->values[to] = r;
-            write_row(J, out->total, arm, away, a->values[i] - dot3(turned, arm));
-            out->cosines[to] = cosine_of(turned, a->normals + 3 * i);
-            if (!seen) continue;
-            const int state = state_at(seen, other);
-            int blind = state == STATE_UNSEEN || (state == STATE_SURFACE && fabsf(r) > seen->agreement);
-            if (!blind && out->cosines[to] < a->min_cosine) {
-                turn_back3(R, a->normals + 3 * i, normal);
-                blind = front_unobserved(seen, other, normal);
-            }
-            out->unobserved[to] = (uint8_t)blind;
-        }
+/* A pose's row: its values, Jacobian (or NULL), cosines and flags (or NULL). */
+typedef struct {
+    float *values, *jacobian, *cosines;
+    uint8_t *unobserved;
+} row;
+
+INLINE row row_of(const regnf_rows *rows, int64_t number, int64_t total) {
+    row found = {.values = rows->values + number * total, .cosines = rows->cosines + number * total};
+    if (rows->jacobian) found.jacobian = rows->jacobian + 7 * number * total;
+    if (rows->unobserved) found.unobserved = rows->unobserved + number * total;
+    return found;
+}
+
+static void scene_places(const regnf_pair *pair, const pose *T, float *out) {
+    const regnf_samples *a = &pair->scene_samples;
+    const float step = pair->ahead * T->s;
+    for (int64_t i = 0; i < a->count; i++, out += 3) {
+        float arm[3], normal[3];
+        carry_scene(a, T, i, arm, normal);
+        for (int k = 0; k < 3; k++) out[k] = arm[k] + T->t[k] + step * normal[k];
     }
 }
 
-static void grid_distances(const regnf_planes *grid, const float *points, int64_t count, float *value, float *gradient) {
-    const int64_t cells = grid->cells;
-    for (int64_t p = 0; p < count; p++, points += 3, gradient += 3) {
-        float inside[3], beyond[3], squares = 0.0f;
-        int64_t cell[3];
-        for (int k = 0; k < 3; k++) {
-            const float low = grid->low[k], high = grid->high[k], x = points[k];
-            inside[k] = x < low ? low : x > high ? high : x;
-            const float c = (inside[k] - low) / grid->edge[k];
-            cell[k] = c >= (float)cells ? cells - 1 : c > 0.0f ? (int64_t)c : 0; /* of NaN, too */
-            beyond[k] = x - inside[k];
-            squares += beyond[k] * beyond[k];
-        }
-        const float *plane = grid->planes + 4 * ((cell[0] * cells + cell[1]) * cells + cell[2]);
-        memcpy(gradient, plane + 1, 3 * sizeof(float));
-        value[p] = plane[0] + dot3(plane + 1, inside);
-        if (squares == 0.0f) continue;
-        const float distance = sqrtf(squares);
-        value[p] += distance;
-        for (int k = 0; k < 3; k++) gradient[k] = beyond[k] / (distance < 1e-9f ? 1e-9f : distance);
+static void object_places(const regnf_pair *pair, const pose *T, float *out) {
+    for (int64_t i = 0; i < pair->object_samples.count; i++, out += 3) {
+        float arm[3];
+        carry_object(&pair->object_samples, T, i, arm, out);
     }
+}
+
+static void scene_rows(const regnf_pair *pair, const pose *T, const float *value, const float *g, row to) {
+    const regnf_samples *a = &pair->scene_samples;
+    const int64_t total = a->count + pair->object_samples.count;
+    for (int64_t i = 0; i < a->count; i++, g += 3) {
+        float arm[3], normal[3];
+        carry_scene(a, T, i, arm, normal);
+        const float v = value[i] - pair->ahead * T->s * dot3(g, normal);
+        to.values[i] = v - T->s * a->values[i] - T->offset;
+        if (to.jacobian) write_row(to.jacobian + i, total, arm, g, dot3(g, arm) - v);
+        to.cosines[i] = cosine_of(g, normal);
+        if (to.unobserved) to.unobserved[i] = pair->hidden && pair->hidden[i] && to.cosines[i] < pair->min_cosine;
+    }
+}
+
+static void object_rows(const regnf_pair *pair, const pose *T, const float *value, const float *g, row to) {
+    const regnf_samples *a = &pair->object_samples;
+    const int64_t first = pair->scene_samples.count, total = first + a->count;
+    for (int64_t i = 0; i < a->count; i++, g += 3) {
+        float arm[3], place[3], turned[3], away[3], normal[3];
+        carry_object(a, T, i, arm, place);
+        turn3(T->R, g, turned);
+        for (int k = 0; k < 3; k++) away[k] = -turned[k];
+        const float r = T->s * value[i] - a->values[i], cosine = cosine_of(turned, a->normals + 3 * i);
+        to.values[first + i] = r + T->offset;
+        if (to.jacobian) write_row(to.jacobian + first + i, total, arm, away, a->values[i] - dot3(turned, arm));
+        to.cosines[first + i] = cosine;
+        if (!to.unobserved) continue;
+        const int state = state_at(pair->seen, place);
+        int blind = state == STATE_UNSEEN || (state == STATE_SURFACE && fabsf(r) > pair->seen->agreement);
+        if (!blind && cosine < pair->min_cosine) {
+            turn_back3(T->R, a->normals + 3 * i, normal);
+            blind = front_unobserved(pair->seen, place, normal);
+        }
+        to.unobserved[first + i] = (uint8_t)blind;
+    }
+}
+
+/* One direction of so many poses from the first on; memory: 7 numbers a sample of each of them. */
+static int one_direction(const regnf_pair *pair, int of_object, const regnf_poses *T, int64_t first, int64_t poses,
+                         const regnf_rows *rows, const int64_t *numbers, float *memory) {
+    const int64_t n = pair->scene_samples.count, m = pair->object_samples.count, count = of_object ? m : n;
+    float *places = memory, *value = places + 3 * poses * count, *gradient = value + poses * count;
+    for (int64_t h = 0; h < poses; h++) {
+        const pose at = pose_of(T, first + h);
+        (of_object ? object_places : scene_places)(pair, &at, places + 3 * h * count);
+    }
+    const int fault = ask_model(of_object ? pair->scene : pair->object, places, poses * count, value, gradient);
+    if (fault != REGNF_DONE) return fault;
+    for (int64_t h = 0; h < poses; h++) {
+        const pose at = pose_of(T, first + h);
+        const row to = row_of(rows, numbers ? numbers[first + h] : first + h, n + m);
+        (of_object ? object_rows : scene_rows)(pair, &at, value + h * count, gradient + 3 * h * count, to);
+    }
+    return REGNF_DONE;
+}
+
+/* Residuals of all poses; that of pose h in row numbers[h], or h. */
+static int rows_of(const regnf_pair *pair, const regnf_poses *T, const regnf_rows *rows, const int64_t *numbers) {
+    for (int of_object = 0; of_object < 2; of_object++) {
+        const int64_t count = of_object ? pair->object_samples.count : pair->scene_samples.count;
+        const int64_t limit = (of_object ? pair->scene : pair->object)->at_once;
+        int64_t step = T->count;
+        if (limit > 0 && step * count > limit) step = count >= limit ? 1 : limit / count;
+        float *memory = malloc((size_t)(7 * step * count + 1) * sizeof(float));
+        if (memory == NULL) return REGNF_NO_MEMORY;
+        int fault = REGNF_DONE;
+        for (int64_t first = 0; first < T->count && fault == REGNF_DONE; first += step) {
+            const int64_t poses = T->count - first < step ? T->count - first : step;
+            fault = one_direction(pair, of_object, T, first, poses, rows, numbers, memory);
+        }
+        free(memory);
+        if (fault != REGNF_DONE) return fault;
+    }
+    return REGNF_DONE;
+}
+
+static int pair_residuals(const regnf_pair *pair, const regnf_poses *T, const regnf_rows *rows) {
+    return rows_of(pair, T, rows, NULL);
 }
 
 #define STRIP 256 /* samples at once: what is worked out of them stays in the nearest cache */
 
 typedef float strip[STRIP] __attribute__((aligned(64)));
-
-/* Of samples `first` on of pose h: the kernel's agreement, how well the normals agree, the kernel's width as a part of
- * that of others, and the share in the mean over both surfaces; 0 beyond the last sample. */
-typedef struct {
-    strip agreement, facing, rate, share;
-} judged;
-
-static void judge(const regnf_loss *l, int64_t h, int64_t first, int64_t live, judged *out) {
-    const float *values = l->values + h * l->total + first, *cosines = l->cosines + h * l->total + first;
-    const uint8_t *blind = l->unobserved ? l->unobserved + h * l->total + first : NULL;
-    const float width = l->widths[h], narrow = l->unobserved_width;
-    const float of_scene = 1.0f / (float)l->scene_count, of_object = 1.0f / (float)(l->total - l->scene_count);
-    const float observed = l->observed_weights ? l->observed_weights[h] : 1.0f;
-    for (int64_t i = 0; i < STRIP; i++) {
-        out->rate[i] = 1.0f;
-        out->share[i] = i >= live ? 0.0f : first + i < l->scene_count ? of_scene : observed * of_object;
-    }
-    if (blind)
-        for (int64_t i = 0; i < live; i++) {
-            out->rate[i] = blind[i] ? narrow : 1.0f;
-            const float as_others = first + i < l->scene_count ? of_scene : of_object;
-            out->share[i] = blind[i] ? as_others : out->share[i];
-        }
-    for (int64_t i = 0; i < live; i++) {
-        const float own = out->rate[i] * width, squares = own * own;
-        out->agreement[i] = squares / (values[i] * values[i] + squares);
-        const float facing = cosines[i] / l->min_cosine;
-        out->facing[i] = facing < 0.0f ? 0.0f : facing > 1.0f ? 1.0f : facing;
-    }
-    for (int64_t i = live; i < STRIP; i++) out->agreement[i] = out->facing[i] = 0.0f;
-    if (!l->normals)
-        for (int64_t i = 0; i < STRIP; i++) out->facing[i] = 1.0f;
-}
-
-/* The sum of products. In vectors, as the compiler may not change the order of sums. */
-INLINE float strip_dot(const float *a, const float *b) {
-    vector sums = {0};
-    for (int i = 0; i < STRIP; i += WIDE) {
-        vector x, y;
-        memcpy(&x, a + i, sizeof x);
-        memcpy(&y, b + i, sizeof y);
-        sums += x * y;
-    }
-    float total = 0.0f;
-    for (int k = 0; k < WIDE; k++) total += sums[k];
-    return total;
-}
-
-static void costs(const regnf_loss *l, double *cost) {
-    judged one;
-    strip loss;
-    for (int64_t h = 0; h < l->poses; h++) {
-        cost[h] = 0.0;
-        for (int64_t first = 0; first < l->total; first += STRIP) {
-            judge(l, h, first, l->total - first < STRIP ? l->total - first : STRIP, &one);
-            for (int i = 0; i < STRIP; i++)
-                loss[i] = (1.0f - one.agreement[i] * one.facing[i]) * (one.rate[i] * one.rate[i]);
-            cost[h] += 0.5 * (double)strip_dot(one.share, loss);
-        }
-    }
-}
-
-static void normal_equations(const regnf_loss *l, const float *jacobian, double *H, double *b) {
-    const int size = l->with_offset ? 8 : 7;
-    judged one;
-    strip rows[9], weighted[8]; /* the unknowns, then the residuals */
-    memset(H, 0, sizeof(double) * (size_t)(l->poses * size * size));
-    memset(b, 0, sizeof(double) * (size_t)(l->poses * size));
-    for (int64_t h = 0; h < l->poses; h++, H += size * size, b += size)
-        for (int64_t first = 0; first < l->total; first += STRIP) {
-            const int64_t live = l->total - first < STRIP ? l->total - first : STRIP;
-            judge(l, h, first, live, &one);
-            if (live < STRIP) memset(rows, 0, sizeof rows);
-            for (int k = 0; k < 7; k++)
-                memcpy(rows[k], jacobian + (7 * h + k) * l->total + first, (size_t)live * sizeof(float));
-            memcpy(rows[8], l->values + h * l->total + first, (size_t)live * sizeof(float));
-            for (int64_t i = 0; i < live; i++) rows[7][i] = first + i < l->scene_count ? -1.0f : 1.0f;
-            for (int i = 0; i < STRIP; i++) one.share[i] *= one.agreement[i] * one.agreement[i] * one.facing[i];
-            for (int k = 0; k < size; k++) {
-                for (int i = 0; i < STRIP; i++) weighted[k][i] = one.share[i] * rows[k][i];
-                for (int j = 0; j <= k; j++) H[k * size + j] += (double)strip_dot(weighted[k], rows[j]);
-                b[k] += (double)strip_dot(weighted[k], rows[8]);
-            }
-            for (int k = 0; k < size; k++)
-                for (int j = 0; j < k; j++) H[j * size + k] = H[k * size + j];
-        }
-}
 
 /* (n, n): sums over `lengths` of weights times exp(factor |x_i - x_j|^2 - |u_i - u_j|^2 / 2); x, u: planes (3, n). */
 static void kernel_sums(const float *x, const float *u, int64_t n, const float *factors, const float *weights,

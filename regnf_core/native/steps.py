@@ -1,13 +1,15 @@
 """The inner steps by compiled code, on the CPU where the library was built: the same as the tensor algebra beside each
-of them, which runs elsewhere and which tests compare with. See regnf_core/native/steps.h.
+of them, which runs elsewhere and which tests compare with. See regnf_core/native/steps.h and minimize.h.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,22 +24,44 @@ def _structure(name: str, **members: Any) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": tuple(members.items())})
 
 
-_Samples: Any = _structure(
-    "Samples", poses=_I64, count=_I64, of_object=_I32, ahead=_FLOAT, min_cosine=_FLOAT, scale=_ADDRESS,
-    rotation=_ADDRESS, translation=_ADDRESS, points=_ADDRESS, values=_ADDRESS, normals=_ADDRESS,
+_DOUBLE = ctypes.c_double
+_Samples: Any = _structure("Samples", count=_I64, points=_ADDRESS, values=_ADDRESS, normals=_ADDRESS)
+_Model: Any = _structure(
+    "Model", ask=_ADDRESS, described=_ADDRESS, at_once=_I64, as_it_is=_I32, turn=_DOUBLE * 9, shift=_DOUBLE * 3,
+    factor=_DOUBLE,
 )  # fmt: skip
-_Rows: Any = _structure(
-    "Rows", total=_I64, first=_I64, values=_ADDRESS, jacobian=_ADDRESS, cosines=_ADDRESS, unobserved=_ADDRESS
-)
+_Poses: Any = _structure("Poses", count=_I64, scale=_ADDRESS, rotation=_ADDRESS, translation=_ADDRESS, offset=_ADDRESS)
+_Rows: Any = _structure("Rows", values=_ADDRESS, jacobian=_ADDRESS, cosines=_ADDRESS, unobserved=_ADDRESS)
 _Observation: Any = _structure(
     "Observation", counts=_I64 * 3, states=_ADDRESS, turn=_FLOAT * 9, shift=_FLOAT * 3, ahead=_FLOAT, agreement=_FLOAT
 )
 _Planes: Any = _structure("Planes", cells=_I64, low=_FLOAT * 3, high=_FLOAT * 3, edge=_FLOAT * 3, planes=_ADDRESS)
-_Loss: Any = _structure(
-    "Loss", poses=_I64, total=_I64, scene_count=_I64, normals=_I32, with_offset=_I32, unobserved_width=_FLOAT,
-    min_cosine=_FLOAT, values=_ADDRESS, cosines=_ADDRESS, widths=_ADDRESS, observed_weights=_ADDRESS,
-    unobserved=_ADDRESS,
+_Voxels: Any = _structure(
+    "Voxels", counts=_I64 * 3, low=_FLOAT * 3, high=_FLOAT * 3, spacing=_FLOAT * 3, outward=_FLOAT, values=_ADDRESS
+)
+_Pair: Any = _structure(
+    "Pair", scene_samples=_Samples, object_samples=_Samples, scene=_ADDRESS, obj=_ADDRESS, seen=_ADDRESS,
+    hidden=_ADDRESS, ahead=_FLOAT, min_cosine=_FLOAT,
 )  # fmt: skip
+_NUMBERS = (
+    "damping_start", "damping_low", "damping_high", "damping_decrease", "damping_increase", "min_damping",
+    "relative_damping", "fixed_damping", "max_step", "spread_quantile", "spread_factor", "unobserved_width",
+    "min_observed_share", "unobserved_loss", "offset_prior", "score_width",
+)  # fmt: skip
+_Settings: Any = _structure(
+    "Settings", iterations=_I64, widths=_ADDRESS, widest=_DOUBLE, low=_DOUBLE, high=_DOUBLE, max_offset=_DOUBLE,
+    normals=_I32, keeps_scale=_I32, **dict.fromkeys(_NUMBERS, _DOUBLE), on_iteration=_ADDRESS,
+)  # fmt: skip
+_History: Any = _structure(
+    "History", scale=_ADDRESS, rotation=_ADDRESS, translation=_ADDRESS, costs=_ADDRESS, of_scene=_ADDRESS,
+    of_object=_ADDRESS,
+)  # fmt: skip
+_ASK = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _I64, _ADDRESS, _ADDRESS)
+_CALLED = ctypes.CFUNCTYPE(ctypes.c_int)
+_DONE, _NO_MEMORY, _ASKED_IN_VAIN, _NOT_FINITE, _STOPPED = range(5)
+"""As in field.h."""
+_AT_ONCE = 2048
+"""Points that a compiled model is asked for at once: what is worked out of them stays in a core's own cache."""
 
 
 def steps_for(*tensors: Tensor) -> Steps | None:
@@ -58,17 +82,6 @@ class Kept:
         self.address = ctypes.addressof(self._structure)
 
 
-def samples(
-    poses: Sequence[Tensor], points: Sequence[Tensor], of_object: bool, ahead: float, min_cosine: float
-) -> Kept:
-    """regnf_samples. poses: scale (H,), rotation (H, 3, 3), translation (H, 3) · points: those (N, 3), values (N,),
-    normals (N, 3)."""
-    parts = dict(zip(("scale", "rotation", "translation"), poses, strict=True))
-    parts |= dict(zip(("points", "values", "normals"), points, strict=True))
-    counts = {"poses": len(poses[0]), "count": len(points[0]), "of_object": of_object}
-    return Kept(_Samples, **counts, ahead=ahead, min_cosine=min_cosine, **parts)
-
-
 def observation(states: Tensor, counts: Tensor, turn: Tensor, shift: Tensor, ahead: float, agreement: float) -> Kept:
     """regnf_observation. states: uint8, of all voxels, z fastest · counts: (3,) · turn: (3, 3) · shift: (3,)."""
     arrays = {"turn": (_FLOAT * 9)(*turn.flatten().tolist()), "shift": (_FLOAT * 3)(*shift.tolist())}
@@ -83,78 +96,233 @@ def planes(cells: int, low: Tensor, high: Tensor, edge: Tensor, planes: Tensor) 
     return Kept(_Planes, cells=cells, **given, planes=planes)
 
 
-class Rows:
-    """Room for the residuals of H poses at N + M samples, and what fills it."""
+def voxels(counts: Sequence[int], low: Tensor, high: Tensor, spacing: Tensor, outward: float, values: Tensor) -> Kept:
+    """regnf_voxels."""
+    corners = {"low": low, "high": high, "spacing": spacing}
+    given = {name: (_FLOAT * 3)(*one.flatten().tolist()) for name, one in corners.items()}
+    return Kept(_Voxels, counts=(_I64 * 3)(*counts), **given, outward=outward, values=values)
 
-    def __init__(self, steps: Steps, poses: int, scene_count: int, total: int, partial: bool) -> None:
-        """partial: not all was observed."""
-        self._steps, self._scene_count, self._total = steps, scene_count, total
-        self.values, self.cosines = torch.empty(2, poses, total)
-        self.jacobian = torch.empty(poses, 7, total)
-        self.unobserved = torch.empty(poses, total, dtype=torch.bool) if partial else None
 
-    def fill(
-        self, asked: Kept, of_object: bool, model: Any, seen: Kept | None = None, hidden: Tensor | None = None
-    ) -> None:
-        """The residuals of the samples ``asked`` in ``model``. seen: what tells what was not observed there · hidden:
-        (N,) bool, see :class:`regnf_core.robust.working_frame.Samples`."""
-        count, poses = len(asked.tensors["points"]), len(asked.tensors["scale"])
-        places = torch.empty(poses * count, 3)
-        self._steps.places(asked.address, places.data_ptr())
-        value, gradient = (part.float() for part in model.value_and_gradient(places))
-        # The code trusts their sizes, and a caller's own field may have any: reshape raises RuntimeError then.
-        value, gradient = value.reshape(len(places)).contiguous(), gradient.reshape(len(places), 3).contiguous()
-        hidden = None if hidden is None else hidden.contiguous()
-        arrays = {"values": self.values, "jacobian": self.jacobian, "cosines": self.cosines}
-        if self.unobserved is not None:
-            arrays["unobserved"] = self.unobserved
-        rows = Kept(_Rows, total=self._total, first=self._scene_count if of_object else 0, **arrays)
-        self._steps.residuals(
-            asked.address, value.data_ptr(), gradient.data_ptr(), rows.address, None if seen is None else seen.address,
-            None if hidden is None else hidden.data_ptr(),
+# A model of distances that compiled code asks.
+
+
+@dataclass(frozen=True)
+class NativeModel:
+    """A function of points in compiled code, seen through a linear map: factor f(turn x + shift).
+
+    ask: a regnf_ask · described: what it is given, with an ``address`` · turn: (9,) · shift: (3,) · checked: whether a
+    value that is not finite is a fault · counted: called with the number of points that it was asked for.
+    """
+
+    ask: Any
+    described: Any
+    turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    shift: tuple[float, ...] = (0.0, 0.0, 0.0)
+    factor: float = 1.0
+    checked: bool = True
+    counted: tuple[Callable[[int], None], ...] = ()
+
+    def seen_by(self, turn: Any, shift: Any, factor: float) -> NativeModel:
+        """factor g(turn x + shift) where this is g. turn: (3, 3) · shift: (3,)."""
+        inner = np.array(self.turn).reshape(3, 3)
+        turned, moved = inner @ np.asarray(turn, np.float64), inner @ np.asarray(shift, np.float64) + self.shift
+        return self._with(turn=tuple(turned.ravel()), shift=tuple(moved), factor=self.factor * factor)
+
+    def counting(self, count: Callable[[int], None]) -> NativeModel:
+        """The same, whose points are counted."""
+        return self._with(counted=(*self.counted, count))
+
+    def _with(self, **changes: Any) -> NativeModel:
+        return NativeModel(**{**vars(self), **changes})
+
+    def value(self, points: Tensor) -> Tensor:
+        """f (N,) itself, without the map, at points (N, 3) float32 on the CPU."""
+        return self._asked(points, None)
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """f (N,) itself and its gradient (N, 3)."""
+        gradient = torch.empty(len(points), 3)
+        return self._asked(points, gradient), gradient
+
+    def _asked(self, points: Tensor, gradient: Tensor | None) -> Tensor:
+        points, value = points.contiguous(), torch.empty(len(points))
+        assert points.dtype == torch.float32
+        assert points.shape[1:] == (3,)
+        to = None if gradient is None else gradient.data_ptr()
+        if self.ask(self.described.address, points.data_ptr(), len(points), value.data_ptr(), to):
+            raise MemoryError("no memory for the evaluation of a field")
+        return value
+
+    def structure(self) -> Any:
+        """regnf_model; it holds addresses of this model's parts."""
+        return _Model(
+            ask=ctypes.cast(self.ask, _ADDRESS).value, described=self.described.address, at_once=_AT_ONCE,
+            as_it_is=not self.checked, turn=(_DOUBLE * 9)(*self.turn), shift=(_DOUBLE * 3)(*self.shift),
+            factor=self.factor,
         )  # fmt: skip
 
 
-def grid_distances(steps: Steps, grid: Kept, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance (M,) and gradient (M, 3) at points (M, 3)."""
-    points = points.contiguous()
-    value, gradient = torch.empty(len(points)), torch.empty(len(points), 3)
-    steps.grid(grid.address, points.data_ptr(), len(points), value.data_ptr(), gradient.data_ptr())
-    return value, gradient
+def native_model(of: Any) -> NativeModel | None:
+    """What compiled code asks in place of a field or a model of distances; None: it has nothing of the kind."""
+    found = getattr(of, "native_model", None)
+    model: NativeModel | None = None if found is None or variant() is None else found()
+    return model
 
 
-def loss(
-    values: Tensor, cosines: Tensor, scene_count: int, unobserved: Tensor | None, widths: Tensor,
-    observed_weights: Tensor | None, normals: bool, with_offset: bool, unobserved_width: float, min_cosine: float,
-) -> Kept:  # fmt: skip
-    """regnf_loss. values, cosines, unobserved: (H, N + M) · widths, observed_weights: (H,)."""
-    given = {"values": values, "cosines": cosines, "widths": widths}
-    for name, one in (("unobserved", unobserved), ("observed_weights", observed_weights)):
-        if one is not None:
-            given[name] = one
-    poses, total = values.shape
-    return Kept(
-        _Loss, poses=poses, total=total, scene_count=scene_count, normals=normals, with_offset=with_offset,
-        unobserved_width=unobserved_width, min_cosine=min_cosine, **given,
-    )  # fmt: skip
+class Called:
+    """Functions of Python that compiled code calls, and the first error in one of them."""
+
+    def __init__(self) -> None:
+        self._functions: list[Any] = []
+        self._error: BaseException | None = None
+
+    def on_iteration(self, function: Callable[[], None]) -> int:
+        """The address of a function that calls this one."""
+
+        def called() -> int:
+            return self._guarded(function, _STOPPED)
+
+        return self._address(_CALLED(called))
+
+    def model(self, of: Any) -> Any:
+        """regnf_model of what has a ``value_and_gradient``."""
+
+        def asked(_described: int, points: int, count: int, value: int, gradient: int) -> int:
+            return self._guarded(lambda: _answer(of, points, count, value, gradient), _ASKED_IN_VAIN)
+
+        return _Model(ask=self._address(_ASK(asked)), as_it_is=True)
+
+    def require(self, fault: int) -> bool:
+        """Whether all was finite. Raises what a function raised, or MemoryError."""
+        if self._error is not None:
+            raise self._error
+        if fault == _NO_MEMORY:
+            raise MemoryError("no memory for a registration's residuals")
+        assert fault in (_DONE, _NOT_FINITE)
+        return bool(fault == _DONE)
+
+    def _guarded(self, function: Callable[[], None], fault: int) -> int:
+        try:
+            function()
+        except BaseException as error:  # noqa: BLE001 -- compiled code is in between; it is raised after it
+            self._error = error
+            return fault
+        return _DONE
+
+    def _address(self, function: Any) -> int:
+        self._functions.append(function)
+        found: int = ctypes.cast(function, _ADDRESS).value or 0
+        return found
 
 
-def costs(steps: Steps, of: Kept) -> Tensor:
-    """(H,)."""
-    found = torch.empty(len(of.tensors["values"]), dtype=torch.float64)
-    steps.costs(of.address, found.data_ptr())
-    return found.float()
+def _answer(model: Any, points: int, count: int, value: int, gradient: int) -> None:
+    places = torch.empty(count, 3)
+    ctypes.memmove(places.data_ptr(), points, 12 * count)
+    distance, slope = (part.float() for part in model.value_and_gradient(places))
+    # The code trusts their sizes, and a caller's own field may have any: reshape raises RuntimeError then.
+    distance, slope = distance.reshape(count).contiguous(), slope.reshape(count, 3).contiguous()
+    ctypes.memmove(value, distance.data_ptr(), 4 * count)
+    ctypes.memmove(gradient, slope.data_ptr(), 12 * count)
 
 
-def equations(steps: Steps, of: Kept, jacobian: Tensor, unknowns: int) -> tuple[Tensor, Tensor]:
-    """J^T W J (H, K, K) and J^T W r (H, K), float64. jacobian: (H, 7, N + M), in one piece."""
-    poses = len(of.tensors["values"])
-    H, b = (
-        torch.empty(poses, unknowns, unknowns, dtype=torch.float64),
-        torch.empty(poses, unknowns, dtype=torch.float64),
-    )
-    steps.equations(of.address, jacobian.data_ptr(), H.data_ptr(), b.data_ptr())
-    return H, b
+class Pair:
+    """Two surfaces for compiled code."""
+
+    def __init__(
+        self, steps: Steps, scene_samples: Sequence[Tensor], object_samples: Sequence[Tensor], scene: Any, obj: Any,
+        seen: Kept | None, hidden: Tensor | None, ahead: float, min_cosine: float,
+    ) -> None:  # fmt: skip
+        """samples: points (N, 3), values (N,), normals (N, 3) · scene, obj: what each surface's distances are asked
+        of · seen: regnf_observation, of the scene · hidden: (N,) bool, see
+        :class:`regnf_core.robust.working_frame.Samples`."""
+        self.scene_count, self.total = len(scene_samples[1]), len(scene_samples[1]) + len(object_samples[1])
+        self.partial = seen is not None
+        self._steps, self._called = steps, Called()
+        self._kept: list[Any] = [seen]
+        self._counted = [(self.total - self.scene_count, native_model(scene)), (self.scene_count, native_model(obj))]
+        models = [
+            self._called.model(one) if native is None else native.structure()
+            for one, (_, native) in zip((scene, obj), self._counted, strict=True)
+        ]
+        self._kept += [scene, obj, models]
+        self._structure = _Pair(
+            scene_samples=self._samples(scene_samples), object_samples=self._samples(object_samples),
+            scene=ctypes.addressof(models[0]), obj=ctypes.addressof(models[1]),
+            seen=None if seen is None else seen.address, hidden=None if hidden is None else self._of(hidden),
+            ahead=ahead, min_cosine=min_cosine,
+        )  # fmt: skip
+
+    def _of(self, tensor: Tensor) -> int:
+        """Its address. It lives as long as the pair."""
+        self._kept.append(tensor.contiguous())
+        found: int = self._kept[-1].data_ptr()
+        return found
+
+    def _samples(self, parts: Sequence[Tensor]) -> Any:
+        points, values, normals = map(self._of, parts)
+        return _Samples(count=len(parts[1]), points=points, values=values, normals=normals)
+
+    def residuals(self, poses: Sequence[Tensor], offset: Tensor | None) -> tuple[list[Tensor | None], bool]:
+        """Values (H, N + M), Jacobians (H, 7, N + M), cosines and, where not all was observed, flags (H, N + M); and
+        whether all was finite. poses: scale (H,), rotation (H, 3, 3), translation (H, 3) · offset: (H,)."""
+        count, total = len(poses[0]), self.total
+        values, cosines = torch.empty(2, count, total)
+        jacobian = torch.empty(count, 7, total)
+        flags = torch.empty(count, total, dtype=torch.bool) if self.partial else None
+        given = {"values": values, "jacobian": jacobian, "cosines": cosines}
+        rows = Kept(_Rows, **given, **({} if flags is None else {"unobserved": flags}))
+        of, at = self._poses(poses, offset), ctypes.addressof
+        finite = self._called.require(self._steps.residuals(at(self._structure), of.address, rows.address))
+        self._count(count)
+        return [values, jacobian, cosines, flags], finite
+
+    def minimize(
+        self, poses: Sequence[Tensor], offset: Tensor | None, widths: Sequence[float], numbers: dict[str, Any],
+        on_iteration: Callable[[], None], with_history: bool,
+    ) -> Minimized:  # fmt: skip
+        """poses, offset: see `residuals`; copies of them are moved · numbers: of regnf_settings, by name."""
+        count, steps = len(poses[0]), len(widths)
+        of = self._poses([one.clone() for one in poses], None if offset is None else offset.clone())
+        scores, sizes = torch.empty(count), torch.empty(count, self.total)
+        along = torch.tensor(widths, dtype=torch.float64)
+        called = self._called.on_iteration(on_iteration)
+        settings = Kept(_Settings, iterations=steps, widths=along, on_iteration=called, **numbers)
+        history: Kept | None = None
+        if with_history:
+            T = {"scale": (), "rotation": (3, 3), "translation": (3,)}
+            parts = {name: torch.empty(count, steps, *shape, dtype=torch.float64) for name, shape in T.items()}
+            rest = {name: torch.empty(count, steps) for name in ("costs", "of_scene", "of_object")}
+            history = Kept(_History, **parts, **rest)
+        fault = self._steps.minimize(
+            ctypes.addressof(self._structure), of.address, settings.address, scores.data_ptr(), sizes.data_ptr(),
+            None if history is None else history.address,
+        )  # fmt: skip
+        finite = self._called.require(fault)
+        self._count(count * (steps + 1))
+        return Minimized(of.tensors, scores, sizes, {} if history is None else history.tensors, finite)
+
+    def _poses(self, poses: Sequence[Tensor], offset: Tensor | None) -> Kept:
+        parts = dict(zip(("scale", "rotation", "translation"), poses, strict=True))
+        if offset is not None:
+            parts["offset"] = offset
+        return Kept(_Poses, count=len(poses[0]), **{name: one.double() for name, one in parts.items()})
+
+    def _count(self, times: int) -> None:
+        for samples, native in self._counted:
+            for counted in () if native is None else native.counted:
+                counted(times * samples)
+
+
+@dataclass(frozen=True, eq=False)
+class Minimized:
+    """poses: by name, ``offset`` among them where there is one · scores: (H,) · sizes: (H, N + M) of the residuals ·
+    history: by name, (H, iterations) each · finite: whether all that the fields said was."""
+
+    poses: dict[str, Tensor]
+    scores: Tensor
+    sizes: Tensor
+    history: dict[str, Tensor]
+    finite: bool
 
 
 def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor] | None:
@@ -163,15 +331,33 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     found = variant()
     if found is None or points.device.type != "cpu" or not 1 <= count <= min(_MOST_NEAR, len(points)):
         return None
-    if not (torch.isfinite(points).all() and torch.isfinite(places).all()):
-        return None
     of, at = points.double().contiguous(), places.cpu().double().contiguous()
+    if not all(np.isfinite(one.numpy()).all() for one in (of, at)):
+        return None
     distance, number = torch.empty(len(at), count, dtype=torch.float64), torch.empty(len(at), count, dtype=torch.int64)
     if found.steps.nearest(
         of.data_ptr(), len(of), at.data_ptr(), len(at), count, distance.data_ptr(), number.data_ptr()
     ):
         raise MemoryError("no memory for a search of neighbors")
     return distance.to(places), number.to(places.device)
+
+
+def nearest_to_cells(points: Tensor, low: Tensor, edge: Tensor, cells: int) -> tuple[Tensor, Tensor] | None:
+    """Distance (C,) from the center of each cell of a cubic grid, z fastest, to the nearest of points (N, 3), N >= 1,
+    and its number (C,); None where there is no compiled code for it. low, edge: (3,), the grid's corner and a cell's
+    edges · cells: along an axis."""
+    found = variant()
+    if found is None or points.device.type != "cpu" or len(points) == 0:
+        return None
+    of, corner, edges = (part.double().contiguous() for part in (points, low, edge))
+    if not all(np.isfinite(one.numpy()).all() for one in (of, corner, edges)):
+        return None
+    distance, number = torch.empty(cells**3, dtype=torch.float64), torch.empty(cells**3, dtype=torch.int64)
+    if found.steps.nearest_to_cells(
+        of.data_ptr(), len(of), corner.data_ptr(), edges.data_ptr(), cells, distance.data_ptr(), number.data_ptr()
+    ):
+        raise MemoryError("no memory for a search of neighbors")
+    return distance.to(points), number
 
 
 def kernel_sums(places: Tensor, normals: Tensor, lengths: Tensor, weights: Tensor) -> Tensor | None:

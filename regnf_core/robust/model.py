@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from regnf_core.document import ObjectSymmetry
 from regnf_core.errors import FieldFormatError, atomic_path
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.bundle import Bundle
+from regnf_core.geometry.exponential_map import rotation_log
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
@@ -58,7 +58,7 @@ class SelfSymmetry(Bundle):
     def group(self) -> ObjectSymmetry:
         """The symmetries that the object's field confirms. On the CPU."""
         exact = self.T[self.deviation <= MODEL.max_deviating_share]
-        omega = exact.log()[:, :3]
+        omega = rotation_log(exact.rotation)
         if self.axis is not None:
             across = int((~_about(exact, self.axis)).sum())
             return ObjectSymmetry(1 + min(across, 1), _tuple(self.axis), True)
@@ -103,7 +103,7 @@ def confirm_symmetries(
     settings = Settings(scale=SAME_SCALE, normals=False)
     start = proposed.T.on(B.points.device)
     refined = minimize(SurfacePair(obj, obj, few, few), start, MODEL.confirming_widths, settings)
-    deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1).cpu()
+    deviation = (refined.sizes > MODEL.max_deviation).float().mean(1).cpu()
     found = refined.T.on("cpu")
     kept = _distinct_symmetries(found, deviation, extremal_points)
     T, deviation = found[kept], deviation[kept]
@@ -130,7 +130,7 @@ def _rigid(rotations: Tensor) -> Sim3:
 def _continuous_axis(itself: SurfacePair, T: Sim3, max_score: float) -> Tensor | None:
     """An axis (3,) about which every turn is a symmetry, if one of the proposals' axes is such."""
     low, high = MODEL.axis_angles
-    for omega in T.log()[:, :3]:
+    for omega in rotation_log(T.rotation):
         angle = float(omega.norm())
         if angle < low or angle > high:
             continue
@@ -183,6 +183,8 @@ class Hull(Bundle):
     @classmethod
     def of(cls, points: Tensor) -> Hull:
         """The hull of points (N, 3). Points in one plane have none."""
+        from scipy.spatial import ConvexHull, QhullError
+
         try:
             equations = torch.from_numpy(np.unique(ConvexHull(points.double().cpu().numpy()).equations, axis=0)).float()
         except QhullError:

@@ -22,7 +22,7 @@ from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH, Stage
 from regnf_core.robust.model import ObjectModel, model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.refine.levenberg_marquardt import RefinementContext, coarse_to_fine
-from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
+from regnf_core.robust.refine.pose_candidates import Iterations, PoseCandidates
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.search.bounds import (
@@ -153,9 +153,7 @@ def search_poses(
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds  # a wrong box must not end the search
     grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples, view.ahead)
-    context = RefinementContext(
-        model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
-    )
+    context = RefinementContext(model.extremal_points, generator, bound.scale, bound=bound)
     return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
 
 
@@ -168,7 +166,7 @@ def refine_poses(
     """
     bound, offset = problem.bound, problem.view.max_offset
     context = RefinementContext(
-        problem.model.extremal_points, generator, bound.scale, offset, on_step, bound.admits, bound.penalty
+        problem.model.extremal_points, generator, bound.scale, offset, on_step, bound, with_history=True
     )
     start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
     found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
@@ -189,18 +187,19 @@ def result_of(
     problem: RegistrationProblem, evaluation: Evaluation, options: RegistrationOptions, seed: int, evaluations: int
 ) -> RegistrationResult:
     """The result of a registration. evaluations: of both fields, in total."""
-    view, model, winner = problem.view, problem.model, evaluation.winner
-    history = evaluation.candidates.history
+    view, model = problem.view, problem.model
+    assert evaluation.candidates.history is not None, "refined poses have iterations"
+    history = evaluation.candidates.history[evaluation.winner]
     return RegistrationResult(
         verdict=evaluation.found.verdict,
         verdict_reason=evaluation.found.reason,
         verdict_limit=evaluation.found.broken,
         T_object_scene=evaluation.T,
-        T_object_scene_initial=problem.in_field_frames(history[0].T[winner]),
+        T_object_scene_initial=problem.in_field_frames(history.T[0]),
         scene_samples=_surface(view.foreground, view.frame),
         object_samples=_surface(model.samples, model.frame),
         metrics={**evaluation.metrics, "field_evaluations": float(evaluations)},
-        trace=_trace(problem, history, winner),
+        trace=_trace(problem, history),
         residuals={},
         seed=seed,
         options=options.to_dict(),
@@ -216,24 +215,26 @@ def _surface(samples: Samples, frame: WorkingFrame) -> SurfaceSamples:
     return SurfaceSamples(frame.out_of(samples.on_surface()), samples.normals.cpu())
 
 
-def _trace(problem: RegistrationProblem, history: Sequence[Step], winner: int) -> list[IterationRecord]:
-    """The iterations of the pose that won."""
+def _trace(problem: RegistrationProblem, history: Iterations) -> list[IterationRecord]:
+    """The iterations (K,) of the pose that won."""
     size = problem.model.frame.length
-    T = problem.in_field_frames(Sim3.cat([step.T[winner : winner + 1] for step in history]))
+    T = problem.in_field_frames(history.T)
+    columns = (history.costs, history.residual_scene, history.residual_object, T.scale)
+    rows = zip(history.widths, history.samples, *(column.tolist() for column in columns), strict=True)
     return [
         IterationRecord(
             iteration=number,
-            loss=float(step.costs[winner]),
-            residual_scene=float(step.residual_scene[winner]) * size,
-            residual_object=float(step.residual_object[winner]) * size / scale,
+            loss=cost,
+            residual_scene=of_scene * size,
+            residual_object=of_object * size / scale,
             regularizer=0.0,
             kernel_shape=_GEMAN_MCCLURE,
-            kernel_scale=step.width * size,
-            scene_samples=min(step.samples, len(problem.fit.scene_samples)),
-            object_samples=min(step.samples, len(problem.fit.object_samples)),
+            kernel_scale=width * size,
+            scene_samples=min(samples, len(problem.fit.scene_samples)),
+            object_samples=min(samples, len(problem.fit.object_samples)),
             T_object_scene=T[number],
         )
-        for number, (step, scale) in enumerate(zip(history, T.scale.tolist(), strict=True))
+        for number, (width, samples, cost, of_scene, of_object, scale) in enumerate(rows)
     ]
 
 

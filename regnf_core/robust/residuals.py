@@ -24,9 +24,15 @@ from torch import Tensor
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.native import steps as compiled
-from regnf_core.native.library import Steps
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.working_frame import Samples, UnobservedTest, WorkingField, WorkingObservation, subsample
+from regnf_core.robust.working_frame import (
+    Samples,
+    UnobservedTest,
+    WorkingField,
+    WorkingObservation,
+    not_finite,
+    subsample,
+)
 
 
 class DistanceModel(Protocol):
@@ -133,11 +139,18 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
 
     offset: (H,), see :class:`Residuals`; None: the surfaces coincide.
     """
+    pair = native_pair(surfaces, T)
+    if pair is not None:
+        rows, finite = pair.residuals((T.scale, T.rotation, T.translation), offset)
+        if not finite:
+            raise not_finite()
+        values, jacobian, cosines, flags = rows
+        assert values is not None
+        assert jacobian is not None
+        assert cosines is not None
+        return Residuals(values, jacobian.mT, cosines, pair.scene_count, flags, offset)
     A, B = surfaces.scene_samples, surfaces.object_samples
     T = T.to(A.points)
-    steps = compiled.steps_for(A.points, B.points, T.scale)
-    if steps is not None and (A.unobserved is None or isinstance(A.unobserved, WorkingObservation)):
-        return _compiled(steps, surfaces, T, A.unobserved, offset)
     r1, J1, cosines1 = _scene_to_object(surfaces.obj, A, T, surfaces.ahead)
     r2, J2, cosines2, unobserved = _object_to_scene(surfaces.scene, B, T, A.unobserved)
     if offset is not None:
@@ -152,23 +165,17 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
     )
 
 
-def _compiled(
-    steps: Steps, surfaces: SurfacePair, T: Sim3, seen: WorkingObservation | None, offset: Tensor | None
-) -> Residuals:
-    """The same by compiled code."""
+def native_pair(surfaces: SurfacePair, T: Sim3) -> compiled.Pair | None:
+    """The surfaces for compiled code, at poses T; None: it does not work here."""
     A, B = surfaces.scene_samples, surfaces.object_samples
-    n, total = len(A), len(A) + len(B)
-    rows = compiled.Rows(steps, len(T.scale), n, total, seen is not None)
-    for of_object, one, model in ((False, A, surfaces.obj), (True, B, surfaces.scene)):
-        ahead = 0.0 if of_object else surfaces.ahead
-        parts = (T.scale, T.rotation, T.translation), (one.points, one.values, one.normals)
-        asked = compiled.samples(*parts, of_object, ahead, EVIDENCE.min_inlier_cosine)
-        known = seen.compiled() if of_object and seen is not None else None
-        rows.fill(asked, of_object, model, known, None if of_object else one.hidden)
-    if offset is not None:
-        rows.values[:, :n] -= offset[:, None].to(rows.values)
-        rows.values[:, n:] += offset[:, None].to(rows.values)
-    return Residuals(rows.values, rows.jacobian.mT, rows.cosines, n, rows.unobserved, offset)
+    steps, seen = compiled.steps_for(A.points, B.points, T.scale.float()), A.unobserved
+    if steps is None or not (seen is None or isinstance(seen, WorkingObservation)):
+        return None
+    known = None if seen is None else seen.compiled()
+    of_scene, of_object = ((one.points, one.values, one.normals) for one in (A, B))
+    hidden = None if seen is None else A.hidden
+    parts = of_scene, of_object, surfaces.scene, surfaces.obj, known, hidden
+    return compiled.Pair(steps, *parts, surfaces.ahead, EVIDENCE.min_inlier_cosine)
 
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3, ahead: float) -> tuple[Tensor, Tensor, Tensor]:

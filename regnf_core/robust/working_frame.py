@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -18,7 +19,7 @@ from regnf_core.geometry.bundle import Bundle, CopiedOnce
 from regnf_core.geometry.metrics import NearestNeighbors, diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.native import steps as compiled
-from regnf_core.native.steps import Kept
+from regnf_core.native.steps import Kept, NativeModel, native_model
 from regnf_core.robust.constants import EVIDENCE, OCCLUSION, SAMPLING
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from regnf_core.surface.requirements import MIN_POINTS, require_box_in_scene, require_surface
@@ -178,11 +179,20 @@ class WorkingField:
         distance, gradient = distance.to(points.device), gradient.to(points.device)
         return self._finite(distance.float() / self.frame.length), self._finite(gradient.float())
 
+    def native_model(self) -> NativeModel | None:
+        """The same for compiled code, where the field has such."""
+        found = native_model(self.field)
+        return (
+            None
+            if found is None
+            else found.seen_by(self.frame.length * np.eye(3), self.frame.center, 1.0 / self.frame.length)
+        )
+
     def require_finite(self) -> None:
         """Raises InvalidInputError (FIELD_NOT_FINITE) where a value since the last call was not finite."""
         found, self._not_finite = self._not_finite, None
         if found is not None and bool(found):
-            raise _not_finite()
+            raise not_finite()
 
     def _own(self, points: Tensor) -> Tensor:
         """Points (M, 3) in the field's frame, on its device."""
@@ -195,7 +205,7 @@ class WorkingField:
         largest = values.abs().amax()  # NaN where there is one: three operations, and isfinite takes seven
         if on_host(values):
             if not math.isfinite(float(largest)):
-                raise _not_finite()
+                raise not_finite()
             return values
         faulty = ~torch.isfinite(largest)
         self._not_finite = faulty if self._not_finite is None else self._not_finite | faulty
@@ -258,7 +268,8 @@ class WorkingObservation:
         return torch.where(within, states[index], UNSEEN)
 
 
-def _not_finite() -> InvalidInputError:
+def not_finite() -> InvalidInputError:
+    """For what a field said."""
     return InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
 
 

@@ -31,7 +31,7 @@ def object_residuals(scene: SdfField, obj: SdfField, points: Tensor, T_object_sc
 
     Positive: the scene is free where the object should be. Negative: the scene holds more matter there.
     """
-    moved = scene.signed_distance(T_object_scene.inverse().apply(points)).to(points)
+    moved = scene.signed_distance(T_object_scene.apply_inverse(points)).to(points)
     return float(T_object_scene.scale) * moved - obj.signed_distance(points).to(points)
 
 

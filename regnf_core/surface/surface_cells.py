@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from regnf_core.geometry.bundle import Bundle
@@ -53,6 +52,8 @@ class FreeSpace:
 
     def _connected_to_border(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Free cells connected to the border, and the cells beside them."""
+        from scipy import ndimage
+
         labels, count = ndimage.label(self.free.numpy())
         border = np.zeros(count + 1, dtype=bool)
         for axis in range(3):

@@ -157,7 +157,7 @@ def _own_triangles(field: SdfField) -> Triangles | None:
         return None
     vertices = mesh.vertices
     if isinstance(field, TransformedField):
-        vertices = field.T_field_frame.inverse().apply(torch.from_numpy(vertices)).numpy()
+        vertices = field.T_field_frame.apply_inverse(torch.from_numpy(vertices)).numpy()
     colors = None if mesh.colors is None else mesh.colors.astype(np.float64)
     return used_alone(Triangles(vertices, mesh.faces, colors=colors))
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
@@ -224,14 +223,23 @@ def read_camera_file(path: Path) -> CameraFile | None:
             return camera_of_values(np.load(path, allow_pickle=False).tolist(), path.name)
         text = decode_text(path.read_bytes())
         if suffix in (".json", ".yaml", ".yml"):
-            documents = iter([json.loads(text)]) if suffix == ".json" else yaml.safe_load_all(_OPENCV.sub("", text))
-            return camera_of_values(next(documents, None), path.name)
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
+            return camera_of_values(json.loads(text) if suffix == ".json" else _first_of_yaml(text), path.name)
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path.name} cannot be read: {error}", reason=_INVALID) from error
     if named := dict(_NAMED.findall(text)):
         return camera_of_values(named, path.name)
     numbers = [_numbers(line) for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     return _of_rows([row for row in numbers if row], path.name)
+
+
+def _first_of_yaml(text: str) -> Any:
+    """The first document. Raises ValueError."""
+    import yaml
+
+    try:
+        return next(yaml.safe_load_all(_OPENCV.sub("", text)), None)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
 
 
 def camera_of_values(values: Any, name: str) -> CameraFile | None:

@@ -27,8 +27,9 @@ from regnf_core import __version__
 from regnf_service.concurrency import in_thread, pause
 from regnf_service.http import problems
 from regnf_service.http.contract import build_contract
-from regnf_service.http.hosts import OriginGate, allowed_hosts, cors_layer, cors_origins
+from regnf_service.http.hosts import allowed_hosts, cors_origins
 from regnf_service.http.middleware import RequestContext, RequestGate, TokenGate, TurnGate
+from regnf_service.http.origins import OriginGate, cors_layer
 from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
@@ -85,8 +86,8 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.openapi()  # takes a while, so not during the first request
         await in_thread(_check_storage, services)
+        contract = asyncio.create_task(in_thread(app.openapi))  # takes a while, so not when it is asked for
         reaping = asyncio.create_task(_reap(services))
         delivering = asyncio.create_task(deliver_until_stopped(services.webhooks, services.records, services.stopping))
         with served(metrics.registry, services.settings.metrics_address), stopping_on_signals(services.stopping):
@@ -96,6 +97,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
         await services.uploads.emptied(_CLEARING_UP_S)
         await delivering
         await reaping
+        await contract
         services.redis.close()
 
     return lifespan
@@ -261,6 +263,6 @@ def _collect_seldom() -> None:
 
     What is loaded by now stays for good and is left out.
     """
-    gc.collect()
     gc.freeze()
     gc.set_threshold(*_COLLECTIONS)
+    gc.enable()

@@ -16,7 +16,7 @@ DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 NEEDED = {
     "PIL", "annotated_doc", "annotated_types", "click", "numpy", "pydantic", "pydantic_core", "regnf_cli", "regnf_core",
     "regnf_data", "regnf_fit", "rich", "safetensors", "scipy", "shellingham", "torch", "torchgen", "typer",
-    "typing_extensions", "typing_inspection", "yaml",
+    "typing_extensions", "typing_inspection",
 }  # fmt: skip
 """What `register` loads of its own and of others. torch itself loads torchgen, rich and numpy look for some more."""
 SOUGHT = {"charset_normalizer", "cython_runtime", "pygments", "markdown_it", "mdurl", "colorama"}
@@ -48,9 +48,31 @@ def test_register_loads_what_it_needs() -> None:
     assert found - NEEDED - SOUGHT == set()
 
 
-@pytest.mark.parametrize("command", ["register", "serve"])
-def test_help_loads_neither_torch_nor_http(command: str) -> None:
-    assert not loaded(command, "--help") & {"torch", "scipy", "httpx", "fastapi", "PIL", "redis"}
+@pytest.mark.parametrize("command", [[], ["register"], ["serve"]])
+def test_help_loads_neither_torch_nor_http(command: list[str]) -> None:
+    heavy = {"torch", "numpy", "scipy", "httpx", "regnf_client", "fastapi", "PIL", "redis", "yaml"}
+    assert not loaded(*command, "--help") & heavy
+
+
+@pytest.mark.parametrize(
+    ("module", "allowed"),
+    [
+        ("regnf", {"regnf", "regnf_core"}),
+        (
+            "regnf_cli.supervisor",
+            {
+                "annotated_types", "dotenv", "pydantic", "pydantic_core", "pydantic_settings", "regnf_cli",
+                "regnf_core", "regnf_service", "regnf_state", "typing_extensions", "typing_inspection",
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_modules_load_what_they_need(module: str, allowed: set[str]) -> None:
+    """The supervisor starts its processes before it loads what talks to Redis and to the storage."""
+    code = f"import sys; before = set(sys.modules); import {module}; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    names = {name.partition(".")[0] for name in done.stdout.split() if not name.startswith("_")}
+    assert names - set(sys.stdlib_module_names) <= allowed
 
 
 def test_every_command_is_there_whatever_is_asked_for() -> None:

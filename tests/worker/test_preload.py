@@ -87,6 +87,8 @@ import sys, os
 from pathlib import Path
 from regnf_worker.main import preload
 preload()
+from regnf_core.options import _adapter
+assert _adapter.cache_info().currsize == 1
 from regnf_core.geometry.box import OrientedBox
 from tests.core.analytic import chair, chair_box, chair_pose, room
 before = set(sys.modules)

@@ -17,6 +17,7 @@ from redis.exceptions import RedisError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
 from regnf_core.errors import InvalidInputError
+from regnf_core.options import RegistrationOptions
 from regnf_state.journal.journal import StorageMismatchError, claim_storage
 from regnf_state.logs import configure_logging
 from regnf_state.redis.client import WORKER_RETRIES, NoRedisError, connect, redis_address
@@ -41,6 +42,7 @@ _MODULES = (
     "regnf_core.viewing.artifacts",
     "regnf_core.fields.build",
     "regnf_core.library",
+    "regnf_core.paper.pipeline",
     "regnf_core.rendering.job",
     "regnf_data.recordings.importing",
     "regnf_data.recordings.stored",
@@ -64,13 +66,16 @@ class PreloadError(RuntimeError):
 def preload() -> None:
     """Load what registrations need. Raises PreloadError if the process has several threads afterwards (Linux)."""
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    gc.disable()  # what loads stays
     for name in _MODULES:
         import_module(name)
     for name in _PREPARED:
         resolve_name(name)()
+    RegistrationOptions.from_dict({"preset": "robust"})  # makes the validator that every job needs
     tasks = Path("/proc/self/task")
     if tasks.exists() and len(list(tasks.iterdir())) > 1:
         raise PreloadError("a library that was loaded has started threads; unset REGNF_PRELOAD")
+    gc.enable()
     gc.freeze()  # a collection in a child would otherwise copy the pages of everything that was loaded
 
 

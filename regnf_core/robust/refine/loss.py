@@ -8,8 +8,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.native import steps as compiled
-from regnf_core.native.steps import Kept
 from regnf_core.robust.constants import EVIDENCE, REFINEMENT
 from regnf_core.robust.residuals import Residuals, geman_mcclure_agreement, geman_mcclure_weight
 
@@ -31,9 +29,9 @@ def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
     return torch.where(r.unobserved, REFINEMENT.unobserved_width * width, width)
 
 
-def offset_prior(r: Residuals) -> float:
-    """The weight of "no offset", where one direction's samples weigh 1."""
-    return REFINEMENT.offset_prior if r.unobserved is None else REFINEMENT.offset_prior_partial
+def offset_prior(partial: bool) -> float:
+    """The weight of "no offset", where one direction's samples weigh 1. partial: not all of the scene was observed."""
+    return REFINEMENT.offset_prior_partial if partial else REFINEMENT.offset_prior
 
 
 def facing(r: Residuals) -> Tensor:
@@ -72,32 +70,16 @@ def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True, weigh
     they count at all.
     A narrower kernel has the same curvature at zero, and so saturates at a lower loss.
     """
-    steps = compiled.steps_for(r.values)
-    if steps is not None:
-        cost = compiled.costs(steps, _compiled(r, width, normals, weight))
-    else:
-        cost = _plain_cost(r, width, normals, weight)
-    if r.offset is None:
-        return cost
-    prior: Tensor = 0.5 * offset_prior(r) * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
-    return cost + prior
-
-
-def _compiled(r: Residuals, width: Tensor | float, normals: bool, weight: Tensor | None) -> Kept:
-    """What compiled code needs of the residuals and their kernel."""
-    widths = torch.as_tensor(width, dtype=torch.float32).expand(len(r.values), 1)[:, 0]
-    weights = None if weight is None or r.unobserved is None else weight[:, 0]
-    constants = REFINEMENT.unobserved_width, EVIDENCE.min_inlier_cosine
-    parts = r.values, r.cosines, r.scene_count, r.unobserved, widths, weights
-    return compiled.loss(*parts, normals, r.offset is not None, *constants)
-
-
-def _plain_cost(r: Residuals, width: Tensor | float, normals: bool, weight: Tensor | None) -> Tensor:
     widths = kernel_widths(r, width)
     agreement = geman_mcclure_agreement(r.values, widths)
     loss = (1.0 - (agreement * facing(r) if normals else agreement)) * (widths / width) ** 2
     of_scene, of_object = r.means(_weighted(loss, r, weight))
-    return 0.5 * (of_scene + of_object)
+    cost = 0.5 * (of_scene + of_object)
+    if r.offset is None:
+        return cost
+    prior = 0.5 * offset_prior(r.unobserved is not None)
+    of_offset: Tensor = prior * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
+    return cost + of_offset
 
 
 def sample_weights(r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None) -> Tensor:
@@ -115,17 +97,13 @@ def normal_equations(
     unknown. The normals' agreement counts as a constant weight: how it changes with the pose is left out, and steps
     that raise the cost are undone.
     """
-    steps, rows = compiled.steps_for(r.values), r.jacobian.mT
-    if steps is not None and rows.is_contiguous():
-        H, b = compiled.equations(steps, _compiled(r, width, normals, weight), rows, 7 + (r.offset is not None))
-    else:
-        weights = r.weighted(sample_weights(r, width, normals, weight))
-        J = r.jacobian_with_offset().mT
-        weighted = J * weights[:, None]
-        H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()
+    weights = r.weighted(sample_weights(r, width, normals, weight))
+    J = r.jacobian_with_offset().mT
+    weighted = J * weights[:, None]
+    H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()
     if r.offset is not None:
-        H[:, 7, 7] += offset_prior(r)
-        b[:, 7] += offset_prior(r) * r.offset
+        H[:, 7, 7] += offset_prior(r.unobserved is not None)
+        b[:, 7] += offset_prior(r.unobserved is not None) * r.offset
     return H, b
 
 

@@ -8,27 +8,34 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from regnf_core.geometry.bundle import Bundle
+from regnf_core.geometry.bundle import Bundle, over_tensors
 from regnf_core.geometry.sim3 import Sim3
 
 
 @dataclass(frozen=True, eq=False)
-class Step(Bundle):
-    """One iteration of all poses: T (H,), robust costs (H,), mean |residual| (H,) of the scene's and of the object's
-    samples, the kernel width, all in object diameters, and the number of samples of each surface."""
+class Iterations(Bundle):
+    """K iterations of H poses: T (H, K), robust costs (H, K), mean |residual| (H, K) of the scene's and of the object's
+    samples, and of each the kernel width, all in object diameters, and the number of samples of each surface."""
 
     T: Sim3
     costs: Tensor
     residual_scene: Tensor
     residual_object: Tensor
-    width: float
-    samples: int
+    widths: tuple[float, ...]
+    samples: tuple[int, ...]
+
+    def then(self, more: Iterations) -> Iterations:
+        """These, and the same poses' next ones."""
+        columns = ((one.T, one.costs, one.residual_scene, one.residual_object) for one in (self, more))
+        T, costs, of_scene, of_object = over_tensors(lambda *parts: torch.cat(parts, 1), *columns)
+        widths, samples = self.widths + more.widths, self.samples + more.samples
+        return Iterations(T, costs, of_scene, of_object, widths, samples)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidates(Bundle):
     """Poses T (H,), their scores (H,), 0..1, smaller is better, and their history: the iterations of these poses so
-    far.
+    far; None: there is none.
 
     offsets: (H,) float64, how much farther out the scene's surface lies than the object's, object diameters; None: the
     surfaces coincide.
@@ -37,7 +44,7 @@ class PoseCandidates(Bundle):
     T: Sim3
     scores: Tensor
     offsets: Tensor | None = None
-    history: tuple[Step, ...] = ()
+    history: Iterations | None = None
 
     @classmethod
     def start(cls, T: Sim3, with_offsets: bool = False) -> PoseCandidates:

@@ -92,22 +92,22 @@ class PoseBound(Bundle):
 
     def admits(self, T: Sim3) -> Tensor:
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""
-        placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
-        low, high = placed.amin(-2), placed.amax(-2)
-        beyond = torch.maximum(self._lengths, high - low) if self.seen else self._lengths
-        reach = self.edges / 2 + self.tolerance * beyond
-        within = (low >= -reach).all(-1) & (high <= reach).all(-1)  # the box's center is 0
-        size = ((high - low) / self._lengths).amax(-1)
-        return within & (size >= SEARCH.min_share_of_detection)
+        return self.judged(T)[0]
 
-    def penalty(self, T: Sim3) -> Tensor:
-        """(H,): how badly the posed object fills the box, as a score: a Geman-McClure loss over the box's six faces."""
+    def judged(self, T: Sim3) -> tuple[Tensor, Tensor]:
+        """(H,) bool: which poses T (H,) the detection allows; and (H,): how badly the posed object fills the box, as a
+        score: a Geman-McClure loss over the box's six faces."""
+        placed = T.apply_inverse(self.points) @ self.axes  # (H, E, 3)
+        low, high = placed.amin(-2), placed.amax(-2)
+        lengths, size = self._lengths, high - low
+        beyond = torch.maximum(lengths, size) if self.seen else lengths
+        reach = self.edges / 2 + self.tolerance * beyond
+        within = (torch.maximum(-low, high) <= reach).all(-1)  # the box's center is 0
+        admitted = within & ((size / lengths).amax(-1) >= SEARCH.min_share_of_detection)
         if self.seen:
-            return torch.zeros_like(T.scale)
-        placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
-        off = torch.cat([placed.amin(-2) + self.edges / 2, placed.amax(-2) - self.edges / 2], -1)
-        off = off / self._lengths.repeat(2)
-        return SEARCH.box_weight * geman_mcclure_loss(off, SEARCH.box_width).mean(-1)
+            return admitted, torch.zeros_like(T.scale)
+        off = torch.cat([low + self.edges / 2, high - self.edges / 2], -1) / lengths.repeat(2)
+        return admitted, SEARCH.box_weight * geman_mcclure_loss(off, SEARCH.box_width).mean(-1)
 
     @property
     def _lengths(self) -> Tensor:

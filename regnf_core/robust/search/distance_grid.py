@@ -16,7 +16,7 @@ from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.native import steps as compiled
-from regnf_core.native.steps import Kept
+from regnf_core.native.steps import Kept, NativeModel
 from regnf_core.robust.constants import FEATURES, SEARCH
 from regnf_core.robust.working_frame import Samples, on_host
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
@@ -45,7 +45,8 @@ class DistanceGrid(Bundle):
         edge = (high - low) / _CELLS
         axes = [low[k] + (torch.arange(_CELLS, device=points.device) + 0.5) * edge[k] for k in range(3)]
         centers = torch.cartesian_prod(*axes)
-        value, gradient = nearest_sample_distance(points, normals, spacing, centers, thin)
+        found = compiled.nearest_to_cells(points, low, edge, _CELLS)
+        value, gradient = nearest_sample_distance(points, normals, spacing, centers, thin, found)
         at_zero = value - (gradient * centers).sum(-1)
         planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)
         return cls(planes, *(corner[:, None] for corner in (low, high, edge)))
@@ -54,11 +55,16 @@ class DistanceGrid(Bundle):
     def _compiled(self) -> Kept:
         return compiled.planes(_CELLS, self.low, self.high, self.edge, self.planes)
 
+    def native_model(self) -> NativeModel | None:
+        """The same for compiled code, where it works."""
+        steps = compiled.steps_for(self.planes)
+        return None if steps is None else NativeModel(steps.grid, self._compiled, checked=False)
+
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (M,) and gradient (M, 3) at points (M, 3): the nearest cell's, carried on to the point."""
-        steps = compiled.steps_for(points, self.planes)
-        if steps is not None:
-            return compiled.grid_distances(steps, self._compiled, points)
+        model = None if compiled.steps_for(points) is None else self.native_model()
+        if model is not None:
+            return model.value_and_gradient(points)
         places = points.T.contiguous()
         inside = torch.minimum(torch.maximum(places, self.low), self.high)
         cell = ((inside - self.low) / self.edge).int().clamp_(0, _CELLS - 1)
@@ -103,15 +109,22 @@ def distance_grid(samples: Samples, spacing: float, thin: bool = False) -> Dista
 
 
 def nearest_sample_distance(
-    points: Tensor, normals: Tensor, spacing: float, queries: Tensor, thin: bool = False
+    points: Tensor,
+    normals: Tensor,
+    spacing: float,
+    queries: Tensor,
+    thin: bool = False,
+    found: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Signed distance (M,) and gradient (M, 3) at queries (M, 3), to the surface of oriented points (N, 3).
 
     Far away: the distance to the nearest point, signed by its normal. Close: the distance to its tangent plane.
     thin: of a wall thinner than the spacing the face that the query is in front of counts; the nearest point may be the
-    other's.
+    other's · found: distance (M,) and number (M,) of the nearest point, where they are known.
     """
-    far, nearest = (_of_the_face_in_front if thin else _nearest)(points, normals, queries)
+    far, nearest = NearestNeighbors(points).query(queries) if found is None else found
+    if thin:
+        far, nearest = _of_the_face_in_front(points, normals, queries, far, nearest)
     offset = queries - points[nearest]
     n = normals[nearest]
     height = (offset * n).sum(-1)
@@ -123,18 +136,14 @@ def nearest_sample_distance(
     return value, gradient
 
 
-def _nearest(points: Tensor, _normals: Tensor, queries: Tensor) -> tuple[Tensor, Tensor]:
-    return NearestNeighbors(points).query(queries)
-
-
-def _of_the_face_in_front(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor, Tensor]:
+def _of_the_face_in_front(
+    points: Tensor, normals: Tensor, queries: Tensor, far: Tensor, nearest: Tensor
+) -> tuple[Tensor, Tensor]:
     """Distance (M,) and number (M,) of the point that is nearest to each query (M, 3), but for queries behind it: these
     have the nearest of the next few that faces the other way, has the query in front of it, and lies between both."""
-    neighbors = NearestNeighbors(points)
-    far, nearest = neighbors.query(queries)
     height = ((queries - points[nearest]) * normals[nearest]).sum(-1)
     behind = (height < 0.0).nonzero().squeeze(-1)
-    apart, others = neighbors.query_several(queries[behind], SEARCH.sheet_neighbors)
+    apart, others = NearestNeighbors(points).query_several(queries[behind], SEARCH.sheet_neighbors)
     heights = ((queries[behind, None] - points[others]) * normals[others]).sum(-1)
     opposite = (normals[others] * normals[nearest[behind], None]).sum(-1) < SEARCH.sheet_cosine
     in_front = opposite & (heights >= 0.0) & (heights <= -height[behind, None])

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.geometry.metrics import distinct
@@ -59,12 +60,12 @@ def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:
     diameters apart. The diagonal is False.
     """
     points = points.double()
-    placed = T.inverse().apply(points)
-    alike = _alike(symmetry).inverse().apply(points)
+    placed = T.apply_inverse(points)
+    alike = _alike(symmetry).apply_inverse(points)
     rows = []
     for number in range(len(T)):
         pose = T[number]
-        equivalents = pose.inverse().apply(alike.reshape(-1, 3)).reshape(alike.shape)
+        equivalents = pose.apply_inverse(alike.reshape(-1, 3)).reshape(alike.shape)
         far = (placed[:, None] - equivalents).norm(dim=-1).amax(-1).amin(-1)
         rows.append(pose.scale * far > VERDICT.apart)
     return torch.stack(rows)
@@ -111,9 +112,11 @@ class Term:
     knots: Tensor
     values: Tensor
 
-    def __call__(self, x: Tensor) -> Tensor:
-        """The function's values at x (H,)."""
-        return torch.from_numpy(np.interp(x.numpy(), self.knots.numpy(), self.values.numpy()))
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The function's values at x (H,). What is not a number is as bad as can be."""
+        values = self.values.numpy()
+        found: NDArray[np.float64] = np.where(np.isnan(x), values.min(), np.interp(x, self.knots.numpy(), values))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +141,12 @@ class ProbabilityModel:
 
     def logit(self, features: dict[str, Tensor]) -> Tensor:
         """(H,) log odds of the poses with these features, each (H,). What is not a number is as bad as can be."""
-        spoken = self.against(features)
-        return self.bias + torch.stack(list(spoken.values())).sum(0)
+        return self.bias + torch.stack(list(self.against(features).values())).sum(0)
 
     def against(self, features: dict[str, Tensor]) -> dict[str, Tensor]:
         """What each feature speaks against the poses, (H,), in logits: 0 where it is at its best, else negative."""
-        given = [(term, features[term.feature].double()) for term in self.terms]
-        return {term.feature: torch.where(x.isnan(), term.values.min(), term(x.nan_to_num(0.0))) for term, x in given}
+        # Plain arrays: a call costs less there, and all of them are small.
+        return {term.feature: torch.from_numpy(term(features[term.feature].double().numpy())) for term in self.terms}
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     variances = _likely_variances(inliers[: COVARIANCE.likelihood_samples])  # (lengths, nuggets)
     curvature = _curvature(inliers)
     if r.offset is not None:
-        curvature[7, 7] += offset_prior(r)
+        curvature[7, 7] += offset_prior(r.unobserved is not None)
     B = torch.linalg.solve(curvature, (inliers.J * inliers.weights[:, None]).mT)[:7]  # (7, N)
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)
     rough = (variances * nuggets).sum()

@@ -224,7 +224,7 @@ def evaluate_candidates(
         "verdict_margin": found.margin,
         "object_diameter": problem.model.frame.length,
         "occlusion_boundary_share_scene": problem.view.occlusion_boundary_share,
-        "iterations": float(len(candidates.history)),
+        "iterations": float(0 if candidates.history is None else len(candidates.history.widths)),
         "pose_candidates": float(len(candidates)),
     }
     return Evaluation(

@@ -53,7 +53,7 @@ class HeldOut(Bundle):
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
         told = self.evidence.numbers | {"unexplained_share_scene": self.features["unexplained"]}
-        return {name: float(values[index]) for name, values in told.items()}
+        return {name: float(values.numpy()[index]) for name, values in told.items()}
 
 
 def gather_evidence(r: Residuals, offsets: Tensor, options: RobustOptions) -> Evidence:
@@ -171,7 +171,7 @@ def unexplained_samples(held_out: SurfacePair, T: Sim3, beyond: Tensor) -> Tenso
     turned = (T.rotation @ A.normals[sample][..., None])[..., 0]
     away = (turned * gradient).sum(-1) >= EVIDENCE.facing_cosine * slope
     beneath = places - newton_step(value, gradient, EVIDENCE.min_slope)
-    unexplained[pose, sample] = away | _covered(held_out, T, T.inverse().apply(beneath[:, None])[:, 0])
+    unexplained[pose, sample] = away | _covered(held_out, T, T.apply_inverse(beneath[:, None])[:, 0])
     return unexplained
 
 
@@ -283,7 +283,7 @@ def _conflict(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Grou
     free = groups.observed & (r2 > EVIDENCE.coarse)
     seen_through = free
     if problem.view.observation is not None:
-        places = moved.inverse().apply(problem.held_out.object_samples.points)
+        places = moved.apply_inverse(problem.held_out.object_samples.points)
         measured = problem.view.observation.on_surface(places.reshape(-1, 3)).reshape(r2.shape)
         seen_through = groups.observed & ~measured & (r2 > EVIDENCE.close)
     return {

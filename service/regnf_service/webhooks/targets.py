@@ -13,15 +13,17 @@ import hmac
 import ipaddress
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import urlsplit
 
 from regnf_service.problem import Problem
 from regnf_service.tokens import TokensError
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
-from regnf_state.records import JobRecord
-from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
 from regnf_state.settings import address_of
+
+if TYPE_CHECKING:
+    from regnf_state.records import JobRecord
+    from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
 
 _PORTS = {"http": 80, "https": 443}
 _MAX_URL_CHARS = 2000

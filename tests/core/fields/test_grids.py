@@ -150,9 +150,8 @@ def test_half_precision_stays_half_and_is_evaluated_in_single(tmp_path: Path) ->
     write_safe_field(tmp_path / "f", description(), {"values": half})
     where = torch.from_numpy(points(50, 0.2))
     opened = open_field(tmp_path / "f")
-    torch.testing.assert_close(
-        opened.signed_distance(where), field(half.astype(np.float32)).signed_distance(where), rtol=0, atol=0
-    )
+    # One by tensor algebra, one by compiled code: they round differently.
+    torch.testing.assert_close(opened.signed_distance(where), field(half.astype(np.float32)).signed_distance(where))
     torch.testing.assert_close(opened.to("cpu").signed_distance(where), opened.signed_distance(where))
 
 

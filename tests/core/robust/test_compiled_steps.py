@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -12,16 +12,24 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from regnf_core.fields.observation import Observation
+from regnf_core.errors import InvalidInputError
+from regnf_core.fields.build import ScaledField, build_field
+from regnf_core.fields.composite import TransformedField
+from regnf_core.fields.observation import CountingField, Observation, ObservedField, SdfField
+from regnf_core.fields.user_fields import UserField
+from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.native import steps as compiled
 from regnf_core.native.library import SWITCH
-from regnf_core.robust.refine.loss import normal_equations, observed_weight, robust_cost
+from regnf_core.native.steps import native_model
+from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.search.bounds import ScaleBound
 from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
 from regnf_core.robust.verdict import covariance
-from regnf_core.robust.working_frame import Samples, WorkingFrame, WorkingObservation
+from regnf_core.robust.working_frame import Samples, WorkingField, WorkingFrame, WorkingObservation
+from regnf_core.schema.kinds import VoxelGridDescription
 from tests.core.fields.native_builds import variants
 
 NAMES = ("avx512", "avx2", "plain")
@@ -78,10 +86,31 @@ def pair(partial: bool, grid: bool, seed: int) -> tuple[SurfacePair, Sim3]:
     return SurfacePair(models[0], models[1], scene, obj, 0.02 if partial else 0.0), poses(5, numbers)
 
 
-def assert_alike(found: Residuals, expected: Residuals) -> None:
-    torch.testing.assert_close(found.values, expected.values, rtol=1e-5, atol=2e-6)
-    torch.testing.assert_close(found.jacobian, expected.jacobian, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(found.cosines, expected.cosines, rtol=1e-5, atol=1e-5)
+MINIMIZATIONS = [
+    Settings(),
+    Settings(widest=0.5),
+    Settings(normals=False),
+    Settings(keeps_scale=True),
+    Settings(scale=ScaleBound(0.95, 1.05), widest=0.2),
+]
+
+
+def assert_bundles_alike(found: Any, expected: Any, rtol: float, atol: float) -> None:
+    """All their tensors, and those of what they hold."""
+    assert vars(found).keys() == vars(expected).keys()
+    for name, one in vars(expected).items():
+        if isinstance(one, Tensor):
+            torch.testing.assert_close(vars(found)[name], one, rtol=rtol, atol=atol)
+        elif isinstance(one, Bundle):
+            assert_bundles_alike(vars(found)[name], one, rtol, atol)
+        else:
+            assert vars(found)[name] == one
+
+
+def assert_alike(found: Residuals, expected: Residuals, atol: float = 2e-6) -> None:
+    torch.testing.assert_close(found.values, expected.values, rtol=1e-5, atol=atol)
+    torch.testing.assert_close(found.jacobian, expected.jacobian, rtol=1e-5, atol=5.0 * atol)
+    torch.testing.assert_close(found.cosines, expected.cosines, rtol=1e-5, atol=5.0 * atol)
     assert found.scene_count == expected.scene_count
     assert (found.unobserved is None) == (expected.unobserved is None)
     if found.unobserved is not None:
@@ -98,19 +127,103 @@ def test_residuals(partial: bool, grid: bool, offset: float | None, plainly: Any
     assert_alike(residuals(surfaces, T, offsets), plainly(residuals, surfaces, T, offsets))
 
 
-@pytest.mark.parametrize("normals", [True, False])
+@pytest.mark.parametrize("steps", [0, 1, 4])
+@pytest.mark.parametrize("offset", [None, 0.0, 0.04])
+@pytest.mark.parametrize("settings", MINIMIZATIONS)
 @pytest.mark.parametrize("partial", [False, True])
-@pytest.mark.parametrize("offset", [False, True])
-def test_cost_and_normal_equations(partial: bool, normals: bool, offset: bool, plainly: Any) -> None:
+def test_minimization(partial: bool, settings: Settings, offset: float | None, steps: int, plainly: Any) -> None:
+    """Poses, costs and scores, after one step and after several: their errors grow with the steps."""
     surfaces, T = pair(partial, grid=False, seed=4)
-    r = residuals(surfaces, T, torch.full((5,), 0.02, dtype=torch.float64) if offset else None)
-    width, weight = torch.linspace(0.02, 0.3, 5)[:, None], observed_weight(r)
-    assert (weight is None) != partial
-    given = r, width, normals, weight
-    torch.testing.assert_close(robust_cost(*given), plainly(robust_cost, *given), rtol=1e-5, atol=1e-7)
-    for found, expected in zip(normal_equations(*given), plainly(normal_equations, *given), strict=True):
-        assert found.shape[-1] == (8 if offset else 7)
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
+    start = None if offset is None else torch.linspace(-0.01, 0.01, 5, dtype=torch.float64)
+    settings = replace(settings, max_offset=offset or 0.0, with_history=True)
+    given = surfaces, settings.scale.limited_poses(T), (0.3, 0.2, 0.1, 0.05)[:steps], settings, start
+    found, expected = minimize(*given), plainly(minimize, *given)
+    assert_bundles_alike(found, expected, *((1e-3, 1e-4) if steps > 1 else (2e-5, 2e-5)))
+    assert (found.history is None) == (steps == 0)
+    if found.history is not None:
+        assert found.history.T.scale.shape == (5, steps)
+        assert torch.equal(found.history.T.translation[:, -1], found.T.translation)
+
+
+def voxel_grid(values: Tensor, sign: Literal[1, -1] = 1) -> SdfField:
+    low, spacing = (-0.6, -0.5, -0.7), (0.1, 0.12, 0.09)
+    description = VoxelGridDescription(
+        kind="voxel_grid", bounds=((-0.6, -0.5, -0.7), (0.5, 0.46, 0.47)), origin=low, spacing=spacing, sign=sign
+    )
+    return build_field(description, {"values": values})
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_fields_with_compiled_code_through_all_that_they_are_seen_by(sign: Literal[1, -1], plainly: Any) -> None:
+    """Working frame, counting, another frame, another unit, an observation: what they give together, beyond the grid
+    as well, and how many points are counted."""
+    numbers = torch.Generator().manual_seed(8)
+    turned = Sim3.exp(torch.tensor([0.3, -0.2, 0.5, 0.05, 0.02, -0.04, 0.2], dtype=torch.float64))
+    inner = voxel_grid(torch.randn(12, 9, 14, generator=numbers), sign)
+    field = TransformedField(ScaledField(ObservedField(inner, None), 1.4, sign), turned)
+    working = [
+        WorkingField(CountingField(field), WorkingFrame(torch.tensor([0.1, -0.1, 0.2]).double(), 1.7)) for _ in range(2)
+    ]
+    assert native_model(working[0]) is not None
+    surfaces, T = pair(partial=True, grid=False, seed=5)
+    given = [replace(surfaces, scene=one, obj=one) for one in working]
+    found, expected = residuals(given[0], T), plainly(residuals, given[1], T)
+    assert_alike(found, expected, atol=2e-5)
+    minimize(given[0], T, (0.1, 0.1))
+    plainly(minimize, given[1], T, (0.1, 0.1))
+    counted = [one.field.evaluations for one in working]  # type: ignore[attr-defined]
+    assert counted[0] == counted[1] == 4 * 5 * (101 + 67)
+
+
+def test_values_that_are_not_finite_are_refused(plainly: Any) -> None:
+    values = torch.zeros(12, 9, 14)
+    values[5] = float("nan")
+    surfaces, T = pair(partial=False, grid=False, seed=5)
+    bad = WorkingField(voxel_grid(values), WorkingFrame(torch.zeros(3).double(), 1.0))
+    assert native_model(bad) is not None
+    for given in (replace(surfaces, scene=bad), replace(surfaces, obj=bad)):
+        for way in (lambda work, *given: work(*given), plainly):
+            with pytest.raises(InvalidInputError, match="not finite"):
+                way(residuals, given, T)
+            with pytest.raises(InvalidInputError, match="not finite"):
+                way(minimize, given, T, (0.1,))
+
+
+def test_values_in_float16_and_fields_that_check_their_own_values_have_no_compiled_code() -> None:
+    assert native_model(voxel_grid(torch.zeros(4, 4, 4).half())) is None
+    assert native_model(UserField(voxel_grid(torch.zeros(4, 4, 4)))) is None
+
+
+def test_an_error_of_a_field_or_of_a_step_ends_a_minimization(plainly: Any) -> None:
+    class Unwilling:
+        def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+            raise KeyboardInterrupt
+
+    surfaces, T = pair(partial=False, grid=False, seed=7)
+    with pytest.raises(KeyboardInterrupt):
+        minimize(replace(surfaces, obj=Unwilling()), T, (0.1,))
+    for way in (minimize, lambda *given: plainly(minimize, *given)):
+        steps: list[int] = []
+
+        def stop(steps: list[int] = steps) -> None:
+            steps.append(1)
+            if len(steps) == 2:
+                raise TimeoutError
+
+        with pytest.raises(TimeoutError):
+            way(surfaces, T, (0.1,) * 5, Settings(), None, stop)
+        assert len(steps) == 2
+
+
+def test_what_is_given_is_not_changed() -> None:
+    surfaces, T = pair(partial=False, grid=False, seed=7)
+    offset = torch.zeros(5, dtype=torch.float64)
+    before = T.matrix().clone()
+    found = minimize(surfaces, T, (0.1, 0.1), Settings(), offset)
+    assert torch.equal(T.matrix(), before)
+    assert not offset.any()
+    assert found.offset is not None
+    assert bool(found.offset.any())
 
 
 def test_places_beyond_a_grid_and_places_that_are_not_finite(plainly: Any) -> None:
@@ -151,6 +264,22 @@ def test_nearest_points(form: str, count: int, plainly: Any) -> None:
     np.testing.assert_allclose(np.linalg.norm(points[number] - places[:, None], axis=-1), distance, rtol=1e-12)
     assert all(len(set(row)) == count for row in number.tolist())
     assert plainly(compiled.nearest, *given) is None
+
+
+@pytest.mark.parametrize("count", [1, 5, 700])
+@pytest.mark.parametrize("cells", [1, 5, 16])
+def test_nearest_points_to_cells(cells: int, count: int, plainly: Any) -> None:
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(count)).double()
+    low, edge = torch.tensor([-2.0, -1.5, -3.0]).double(), torch.tensor([4.0, 3.0, 6.5]).double() / cells
+    found = compiled.nearest_to_cells(points, low, edge, cells)
+    assert found is not None
+    axes = [low[k] + (torch.arange(cells).double() + 0.5) * edge[k] for k in range(3)]
+    centers = torch.cartesian_prod(*axes)
+    distance, _ = cKDTree(points.numpy()).query(centers.numpy())
+    np.testing.assert_allclose(found[0], distance, rtol=1e-12)
+    np.testing.assert_allclose((points[found[1]] - centers).norm(dim=-1), distance, rtol=1e-12)
+    assert plainly(compiled.nearest_to_cells, points, low, edge, cells) is None
+    assert compiled.nearest_to_cells(points * float("nan"), low, edge, cells) is None
 
 
 def test_what_is_not_finite_is_left_to_the_other_search(plainly: Any) -> None:

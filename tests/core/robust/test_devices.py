@@ -118,7 +118,7 @@ def test_a_problem_is_moved_whole(neural: RegistrationProblem) -> None:
     T = poses(3)
     points = torch.zeros(50, 3, device=ELSEWHERE)
     with Border() as border:
-        assert neural.bound.admits(T).device == neural.bound.penalty(T).device == ELSEWHERE
+        assert {one.device for one in neural.bound.judged(T)} == {ELSEWHERE}
         value, gradient = neural.model.distance_grid.value_and_gradient(points)
     assert (value.shape, gradient.shape) == ((50,), (50, 3))
     assert value.device == gradient.device == ELSEWHERE
@@ -146,14 +146,15 @@ def test_iterations_read_and_copy_nothing(neural: RegistrationProblem, max_offse
     pair = observed(neural.fit)
     if on_grids:
         pair = replace(pair, scene=neural.view.distance_grid, obj=neural.model.distance_grid)
-    settings = Settings(0.04, ScaleBound(0.5, 2.0), max_offset)
+    settings = Settings(0.04, ScaleBound(0.5, 2.0), max_offset, with_history=True)
     start = poses(6)
     residuals(pair, start)  # a field may keep what it copies once
     reported = []
     with Border() as border:
-        found = minimize(pair, start, [0.03, 0.02, 0.01], settings, start.scale, reported.append)
+        found = minimize(pair, start, [0.03, 0.02, 0.01], settings, start.scale, lambda: reported.append(1))
     assert len(reported) == 3
-    assert found.T.scale.device == found.costs.device == ELSEWHERE
+    assert found.history is not None
+    assert found.T.scale.device == found.scores.device == found.history.costs.device == ELSEWHERE
     assert border.copies == []
 
 

@@ -140,8 +140,9 @@ def test_no_iteration_raises_the_cost() -> None:
     start = Sim3.identity().expand(5).perturb(0.2 * torch.randn(5, 7, generator=generator, dtype=torch.float64))
     surfaces = SurfacePair(target.field, target.field, target.samples, target.samples)
     before = robust_cost(residuals(surfaces, start), 0.05)
-    costs = [before]
-    minimize(surfaces, start, [0.05] * 6, on_iteration=lambda done: costs.append(done.costs))
+    history = minimize(surfaces, start, [0.05] * 6, Settings(with_history=True)).history
+    assert history is not None
+    costs = [before, *history.costs.T]
     assert all((later <= earlier + 1e-7).all() for earlier, later in pairwise(costs))
 
 

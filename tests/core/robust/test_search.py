@@ -113,7 +113,7 @@ def test_an_object_may_reach_beyond_what_was_seen_of_it_by_its_own_extent() -> N
     seen = replace(bound(0.7), seen=True)
     assert bound(0.7).admits(poses).tolist() == [False, False, False]
     assert seen.admits(poses).tolist() == [True, True, False]
-    assert seen.penalty(poses).tolist() == [0.0, 0.0, 0.0], "nobody knows where it ends"
+    assert seen.judged(poses)[1].tolist() == [0.0, 0.0, 0.0], "nobody knows where it ends"
 
 
 def test_the_boxs_own_axes_count() -> None:
@@ -130,7 +130,7 @@ def test_a_pose_that_fills_the_box_is_not_penalized() -> None:
     """And by half of the weight where every face is one kernel width off."""
     off = placed(1.0 + 2.0 * SEARCH.box_width)
     poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0)), off])
-    exact, tight, small, large, beside, half = bound(1.0).penalty(poses).tolist()
+    exact, tight, small, large, beside, half = bound(1.0).judged(poses)[1].tolist()
     assert exact == pytest.approx(0.0, abs=1e-12)
     assert exact < tight < beside < small < large < SEARCH.box_weight
     assert half == pytest.approx(SEARCH.box_weight / 2)
