@@ -301,9 +301,11 @@ class ArtifactEntry(Outgoing):
 
     name: str
     state: Literal["ready", "pending"] = Field(
-        default="ready", description="`pending`: it is not made yet; a request for it is held until it is there."
+        default="ready", description="`pending`: it is still being made; a request for it is held until it is there."
     )
-    bytes: int | None = Field(description="Null while it is pending, as the digest.")
+    bytes: int | None = Field(
+        description="Null while it is pending, as the digest, and for a picture that is drawn when it is asked for."
+    )
     sha256: Sha256 | None
     url: Address
 

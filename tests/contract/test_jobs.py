@@ -215,11 +215,13 @@ def test_a_picture_is_drawn_when_it_is_first_asked_for(world: World, drawings: l
     job_id = world.submit(seed=1)
     world.succeed(job_id, pending=["aligned.ply"], on_request=["preview.png"])
     address = f"/jobs/{job_id}/artifacts/preview.png"
+    assert states(world, job_id)["preview.png"] == "pending"
     assert_refused(world.client.get(address, params={"wait": 0}), 409, "ARTIFACT_NOT_READY")
     world.finish(job_id, {"aligned.ply": DATA})
-    assert (states(world, job_id)["preview.png"], drawings) == ("pending", [])
+    listed = {one["name"]: one for one in world.client.get(f"/jobs/{job_id}/result").json()["artifacts"]}
+    assert (listed["preview.png"]["state"], listed["preview.png"]["bytes"], drawings) == ("ready", None, [])
     assert world.client.head(address).headers["content-length"] == str(len(DATA))
-    assert states(world, job_id)["preview.png"] == "ready"
+    assert world.client.get(f"/jobs/{job_id}/result").json()["artifacts"][-1]["bytes"] == len(DATA)
     assert world.client.get(address).content == DATA
     assert drawings == [DATA]
 

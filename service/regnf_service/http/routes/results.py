@@ -46,21 +46,20 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
     """A failed job has no result: the member `error` of the 409 is the job's own problem.
 
-    The result is there before its pictures and clouds, which are listed as `pending` until they are made: clouds in a
-    moment, `preview.png` once it is asked for.
+    The result is there before its pictures and clouds, which are listed as `pending` until they are made. `preview.png`
+    is drawn of the clouds when it is asked for the first time: `bytes` and `sha256` are null until then.
     """
     manifest = _manifest(services, id, caller)
     document = result_of(services, manifest)
     known = {one["name"]: one for one in document.get("artifacts", ())}  # a rendering says what its files show
+    drawable = "pending" if manifest.pending else "ready"
     told = {
         **{
             name: {"state": "ready", "bytes": one.bytes, "sha256": one.sha256}
             for name, one in manifest.served().items()
         },
-        **{
-            name: {"state": "pending", "bytes": None, "sha256": None}
-            for name in (*manifest.pending, *manifest.on_request)
-        },
+        **{name: {"state": "pending", "bytes": None, "sha256": None} for name in manifest.pending},
+        **{name: {"state": drawable, "bytes": None, "sha256": None} for name in manifest.on_request},
     }
     listed = [
         known.get(name, {}) | {"name": name, "url": f"{prefix}/jobs/{id}/artifacts/{name}"} | one
