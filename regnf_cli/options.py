@@ -69,6 +69,8 @@ library_path = _parser(require_field_file, folders=True)
 
 def is_recording(path: Path) -> bool:
     """Whether a path is a recording's; never without the engine's extra, which reads them."""
+    if path.suffix == ".safetensors":
+        return False  # a field: what knows recordings need not be loaded
     try:
         from regnf_data.recordings.opening import is_recording as known
     except ModuleNotFoundError:
