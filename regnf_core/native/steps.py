@@ -156,10 +156,16 @@ class NativeModel:
     def structure(self) -> Any:
         """regnf_model; it holds addresses of this model's parts."""
         return _Model(
-            ask=ctypes.cast(self.ask, _ADDRESS).value, described=self.described.address, at_once=_AT_ONCE,
+            ask=_address_of(self.ask), described=self.described.address, at_once=_AT_ONCE,
             as_it_is=not self.checked, turn=(_DOUBLE * 9)(*self.turn), shift=(_DOUBLE * 3)(*self.shift),
             factor=self.factor,
         )  # fmt: skip
+
+
+def _address_of(function: Any) -> int:
+    """Of a function of ctypes. A cast would give it too, and make the function hold itself."""
+    found: int = _ADDRESS.from_buffer(function).value or 0
+    return found
 
 
 def native_model(of: Any) -> NativeModel | None:
@@ -174,45 +180,50 @@ class Called:
 
     def __init__(self) -> None:
         self._functions: list[Any] = []
-        self._error: BaseException | None = None
+        self._errors: list[BaseException] = []
 
     def on_iteration(self, function: Callable[[], None]) -> int:
         """The address of a function that calls this one."""
 
+        errors = self._errors  # not this object, which holds the function: only a collection would free both
+
         def called() -> int:
-            return self._guarded(function, _STOPPED)
+            return _guarded(function, _STOPPED, errors)
 
         return self._address(_CALLED(called))
 
     def model(self, of: Any) -> Any:
         """regnf_model of what has a ``value_and_gradient``."""
 
+        errors = self._errors
+
         def asked(_described: int, points: int, count: int, value: int, gradient: int) -> int:
-            return self._guarded(lambda: _answer(of, points, count, value, gradient), _ASKED_IN_VAIN)
+            return _guarded(lambda: _answer(of, points, count, value, gradient), _ASKED_IN_VAIN, errors)
 
         return _Model(ask=self._address(_ASK(asked)), as_it_is=True)
 
     def require(self, fault: int) -> bool:
         """Whether all was finite. Raises what a function raised, or MemoryError."""
-        if self._error is not None:
-            raise self._error
+        if self._errors:
+            raise self._errors[0]
         if fault == _NO_MEMORY:
             raise MemoryError("no memory for a registration's residuals")
         assert fault in (_DONE, _NOT_FINITE)
         return bool(fault == _DONE)
 
-    def _guarded(self, function: Callable[[], None], fault: int) -> int:
-        try:
-            function()
-        except BaseException as error:  # noqa: BLE001 -- compiled code is in between; it is raised after it
-            self._error = error
-            return fault
-        return _DONE
-
     def _address(self, function: Any) -> int:
         self._functions.append(function)
-        found: int = ctypes.cast(function, _ADDRESS).value or 0
-        return found
+        return _address_of(function)
+
+
+def _guarded(function: Callable[[], None], fault: int, errors: list[BaseException]) -> int:
+    """0, or the fault where the function raised; its error is added."""
+    try:
+        function()
+    except BaseException as error:  # noqa: BLE001 -- compiled code is in between; it is raised after it
+        errors.append(error)
+        return fault
+    return _DONE
 
 
 def _answer(model: Any, points: int, count: int, value: int, gradient: int) -> None:

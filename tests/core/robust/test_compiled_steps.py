@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -213,6 +215,21 @@ def test_an_error_of_a_field_or_of_a_step_ends_a_minimization(plainly: Any) -> N
         with pytest.raises(TimeoutError):
             way(surfaces, T, (0.1,) * 5, Settings(), None, stop)
         assert len(steps) == 2
+
+
+def test_nothing_waits_for_a_collection_of_garbage() -> None:
+    surfaces, T = pair(partial=False, grid=False, seed=7)
+    scene = Blob()
+    kept = weakref.ref(scene)
+    surfaces = replace(surfaces, scene=scene)
+    gc.disable()
+    try:
+        minimize(surfaces, T, (0.1, 0.1))
+        residuals(surfaces, T)
+        del scene, surfaces
+        assert kept() is None
+    finally:
+        gc.enable()
 
 
 def test_what_is_given_is_not_changed() -> None:
