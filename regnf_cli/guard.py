@@ -29,6 +29,7 @@ def main(arguments: list[str]) -> None:
 MODULES = {
     "engine": ("torch", "open3d", "igl", "PIL", "rosbags", "safetensors", "scipy", "trimesh", "yaml"),
     "service": (
+        "PIL",
         "fastapi",
         "obstore",
         "prometheus_client",

@@ -9,8 +9,9 @@ import psutil
 
 
 def children_of(pid: int) -> list[int]:
-    """Processes whose parent this is; zombies count. Raises psutil.NoSuchProcess when the parent has ended."""
-    return [child.pid for child in psutil.Process(pid).children()]
+    """Processes whose parent this is, the newest one last; zombies count. Raises psutil.NoSuchProcess when the parent
+    has ended."""
+    return [child.pid for child in sorted(psutil.Process(pid).children(), key=lambda child: child.create_time())]
 
 
 def descendants_of(pid: int) -> list[int]:

@@ -78,7 +78,7 @@ class House:
 
     def kill_job(self, index: int) -> bool:
         """Kill the process of the job that a worker runs; whether there was one."""
-        for child in children_of(self.workers[index].pid):
+        for child in children_of(self.workers[index].pid)[-1:]:  # beside it, one may draw or finish
             with suppress(ProcessLookupError):
                 os.kill(child, signal.SIGKILL)
                 return True
