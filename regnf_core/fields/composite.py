@@ -80,9 +80,11 @@ class TransformedField(FieldView):
 
     def native_model(self) -> NativeModel | None:
         """For compiled code, where the field has such."""
-        found, T = native_model(self.field), self.T_field_frame
+        found, T = native_model(self.field), self.T_field_frame.on("cpu")
+        if found is None or any(part.requires_grad for part in (T.scale, T.rotation, T.translation)):
+            return None
         scale = float(T.scale)
-        return None if found is None else found.seen_by(scale * T.rotation.numpy(), T.translation.numpy(), 1.0 / scale)
+        return found.seen_by(scale * T.rotation.numpy(), T.translation.numpy(), 1.0 / scale)
 
     def to(self, device: torch.device | str) -> TransformedField:
         return TransformedField(self.field.to(device), self.T_field_frame)

@@ -81,7 +81,7 @@ def _described(function: NeusFactoFunction) -> tuple[_Field, list[Any]]:
     field = _Field(layers=count, contraction=_CONTRACTIONS[function.contraction], radius=function.grid_radius)
     field.widths = ctypes.addressof(widths)
     field.weights, field.biases = ctypes.addressof(weights), ctypes.addressof(biases)
-    kept = [function, widths, weights, biases]
+    kept = [function, widths, weights, biases, *mlp.weights, *mlp.biases]
     if waves is not None:
         along, frequencies = _waves(waves)
         field.directions, field.degree = len(along), waves.degree
@@ -101,8 +101,8 @@ def _described(function: NeusFactoFunction) -> tuple[_Field, list[Any]]:
 @lru_cache(maxsize=64)
 def _waves(encoding: PositionalEncoding) -> tuple[Tensor, Tensor]:
     """Directions (L, 3) of the lengths that are encoded, and the frequencies."""
-    like = torch.empty(0)
-    return encoding.directions(like) if encoding.off_axis else torch.eye(3), encoding.frequencies(like)
+    like = torch.empty(0, dtype=torch.float32, device="cpu")
+    return encoding.directions(like) if encoding.off_axis else torch.eye(3).to(like), encoding.frequencies(like)
 
 
 def native_evaluator(function: NeusFactoFunction) -> NativeEvaluator | None:

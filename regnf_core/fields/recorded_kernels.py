@@ -34,7 +34,8 @@ def record_cuda(evaluate: Evaluation, points: Tensor) -> tuple[Callable[[], None
         evaluate(points)  # libraries prepare themselves in a first call
     torch.cuda.current_stream(points.device).wait_stream(aside)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    # On the points' device, whichever is the current one; other threads may go on with theirs.
+    with torch.cuda.device(points.device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
         found = evaluate(points)
     return graph.replay, found
 

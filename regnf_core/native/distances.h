@@ -27,18 +27,20 @@ INLINE int64_t cell_of(float c, int64_t last) {
 static int grid_distances(const void *self, const float *points, int64_t count, float *value, float *gradient) {
     const regnf_planes *grid = self;
     const int64_t cells = grid->cells;
-    for (int64_t p = 0; p < count; p++, points += 3, gradient += 3) {
+    for (int64_t p = 0; p < count; p++, points += 3) {
         float inside[3], beyond[3];
         int64_t cell[3];
         const float squares = into_box(points, grid->low, grid->high, inside, beyond);
         for (int k = 0; k < 3; k++) cell[k] = cell_of((inside[k] - grid->low[k]) / grid->edge[k], cells - 1);
         const float *plane = grid->planes + 4 * ((cell[0] * cells + cell[1]) * cells + cell[2]);
-        memcpy(gradient, plane + 1, 3 * sizeof(float));
-        value[p] = plane[0] + dot3(plane + 1, inside);
-        if (squares == 0.0f) continue;
         const float distance = sqrtf(squares);
-        value[p] += distance;
-        for (int k = 0; k < 3; k++) gradient[k] = beyond[k] / (distance < 1e-9f ? 1e-9f : distance);
+        value[p] = plane[0] + dot3(plane + 1, inside);
+        if (squares != 0.0f) value[p] += distance;
+        if (gradient == NULL) continue;
+        memcpy(gradient, plane + 1, 3 * sizeof(float));
+        if (squares != 0.0f)
+            for (int k = 0; k < 3; k++) gradient[k] = beyond[k] / (distance < 1e-9f ? 1e-9f : distance);
+        gradient += 3;
     }
     return REGNF_DONE;
 }
@@ -83,7 +85,6 @@ static int voxel_distances(const void *self, const float *points, int64_t count,
 
 /* Distances and gradients of a model at points, which are overwritten. Returns a fault. */
 static int ask_model(const regnf_model *m, float *points, int64_t count, float *value, float *gradient) {
-    if (m->as_it_is) return m->ask(m->self, points, count, value, gradient);
     for (int64_t p = 0; p < count; p++) {
         const double x[3] = {points[3 * p], points[3 * p + 1], points[3 * p + 2]};
         for (int k = 0; k < 3; k++) {
@@ -93,16 +94,16 @@ static int ask_model(const regnf_model *m, float *points, int64_t count, float *
     }
     const int fault = m->ask(m->self, points, count, value, gradient);
     if (fault != REGNF_DONE) return fault;
-    float turn[9], probe = 0.0f;
+    float turn[9], probe = 0.0f; /* 0, or NaN where something is not finite */
     for (int k = 0; k < 9; k++) turn[k] = (float)(m->factor * m->turn[k]);
     for (int64_t p = 0; p < count; p++, gradient += 3) {
         float g[3];
         memcpy(g, gradient, sizeof g);
         value[p] *= (float)m->factor;
         for (int k = 0; k < 3; k++) gradient[k] = turn[k] * g[0] + turn[3 + k] * g[1] + turn[6 + k] * g[2];
-        probe += 0.0f * (value[p] + gradient[0] + gradient[1] + gradient[2]); /* 0, or NaN */
+        probe += 0.0f * value[p] + 0.0f * gradient[0] + 0.0f * gradient[1] + 0.0f * gradient[2];
     }
-    return probe == 0.0f ? REGNF_DONE : REGNF_NOT_FINITE;
+    return m->checked && probe != 0.0f ? REGNF_NOT_FINITE : REGNF_DONE;
 }
 
 #endif

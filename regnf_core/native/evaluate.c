@@ -107,6 +107,9 @@ void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float
 }
 
 const regnf_steps REGNF_STEPS(REGNF_SET) = {
-    pair_residuals, minimize,         grid_distances, voxel_distances,
-    nearest,        nearest_to_cells, kernel_sums,    nearest_discs,
+    places,         fill,
+    begin,          next_places, next_fill, settle, step, score, end,
+    grid_distances, voxel_distances,
+    nearest,        nearest_to_cells,
+    kernel_sums,    nearest_discs,
 };

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 5 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 6 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -33,7 +33,7 @@ typedef struct {
  * Returns 0 (REGNF_DONE) or a fault. */
 typedef int regnf_ask(const void *self, const float *points, int64_t count, float *value, float *gradient);
 
-enum { REGNF_DONE = 0, REGNF_NO_MEMORY = 1, REGNF_ASKED_IN_VAIN = 2, REGNF_NOT_FINITE = 3, REGNF_STOPPED = 4 };
+enum { REGNF_DONE = 0, REGNF_NO_MEMORY = 1, REGNF_NOT_FINITE = 2 };
 
 /* For tests: exp, log(1 + x), sin and cos of numbers (count), for which = 0, 1, 2, 3. */
 typedef void regnf_elementary_function(int which, const float *x, int64_t count, float *out);
@@ -42,8 +42,8 @@ typedef void regnf_elementary_function(int which, const float *x, int64_t count,
 typedef struct {
     regnf_ask *ask;
     const void *self;
-    int64_t at_once;  /* points that it is asked for at most; 0: all that there are */
-    int32_t as_it_is; /* 1: f(x), whatever it is; 0: a value that is not finite is a fault */
+    int64_t at_once; /* points that it is asked for at most */
+    int32_t checked; /* 1: a value that is not finite is a fault */
     double turn[9], shift[3], factor;
 } regnf_model;
 
@@ -88,7 +88,7 @@ typedef struct {
 /* Two surfaces: samples of both, and what each is asked of. */
 typedef struct {
     regnf_samples scene_samples, object_samples;
-    const regnf_model *scene, *object;
+    const regnf_model *scene, *object; /* NULL: the caller asks it, and gives its distances */
     const regnf_observation *seen; /* of the scene, or NULL: all of it */
     const uint8_t *hidden;         /* scene samples that nobody saw from their front, or NULL */
     float ahead;                   /* in front of the scene's samples: where the object is asked, units of the scene */
@@ -107,7 +107,6 @@ typedef struct {
     double min_damping, relative_damping, fixed_damping, max_step;
     double spread_quantile, spread_factor;
     double unobserved_width, min_observed_share, unobserved_loss, offset_prior, score_width;
-    int (*on_iteration)(void); /* or NULL; what is not 0 ends the minimization */
 } regnf_settings;
 
 /* The iterations so far: (poses, iterations) each; NULL: they are not kept. */
@@ -118,10 +117,20 @@ typedef struct {
 
 /* One set of the steps; see steps.h, minimize.h, distances.h, near.h and discs.h. */
 typedef struct {
-    int (*residuals)(const regnf_pair *, const regnf_poses *, const regnf_rows *);
-    /* Poses are changed in place; scores (poses) and |residuals| (poses, total) at the end. */
-    int (*minimize)(const regnf_pair *, regnf_poses *, const regnf_settings *, float *scores, float *sizes,
-                    const regnf_history *);
+    /* Where the samples of one surface are at all poses, (poses, samples, 3); and their residuals from the other one's
+     * distances and gradients there. With NULL for both, its model is asked. */
+    void (*places)(const regnf_pair *, const regnf_poses *, int of_object, float *places);
+    int (*fill)(const regnf_pair *, const regnf_poses *, int of_object, const regnf_rows *, const float *value,
+                const float *gradient);
+    /* A minimization: what is given lives as long as its state, and the poses are moved. First, and after each step,
+     * its next poses are filled for both surfaces, and settled: they become the present ones where they are better. */
+    void *(*begin)(const regnf_pair *, regnf_poses *, const regnf_settings *, const regnf_history *);
+    void (*next_places)(const void *state, int of_object, float *places);
+    int (*next_fill)(void *state, int of_object, const float *value, const float *gradient);
+    void (*settle)(void *state);
+    void (*step)(void *state);
+    void (*score)(const void *state, float *scores, float *sizes); /* (poses), and |residuals| (poses, total) */
+    void (*end)(void *state);
     regnf_ask *grid, *voxels;
     int (*nearest)(const double *points, int64_t n, const double *places, int64_t m, int64_t count, double *distance,
                    int64_t *number);

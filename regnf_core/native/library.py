@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 5
+_LAYOUT = 6
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -32,8 +32,15 @@ Elementary = Callable[[int, int, int, int], None]
 
 _ADDRESS, _COUNT = ctypes.c_void_p, ctypes.c_int64
 _STEPS: dict[str, tuple[Any, ...]] = {
-    "residuals": (ctypes.c_int, *(_ADDRESS,) * 3),
-    "minimize": (ctypes.c_int, *(_ADDRESS,) * 6),
+    "places": (None, _ADDRESS, _ADDRESS, ctypes.c_int, _ADDRESS),
+    "fill": (ctypes.c_int, _ADDRESS, _ADDRESS, ctypes.c_int, *(_ADDRESS,) * 3),
+    "begin": (_ADDRESS, *(_ADDRESS,) * 4),
+    "next_places": (None, _ADDRESS, ctypes.c_int, _ADDRESS),
+    "next_fill": (ctypes.c_int, _ADDRESS, ctypes.c_int, _ADDRESS, _ADDRESS),
+    "settle": (None, _ADDRESS),
+    "step": (None, _ADDRESS),
+    "score": (None, _ADDRESS, _ADDRESS, _ADDRESS),
+    "end": (None, _ADDRESS),
     "grid": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "voxels": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "nearest": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _COUNT, _COUNT, _ADDRESS, _ADDRESS),

@@ -66,7 +66,7 @@ INLINE float strip_dot(const float *a, const float *b) {
 static double cost_of(const kernel *l, const row *r, float limit) {
     judged one;
     strip loss;
-    double cost = 0.0;
+    double cost = l->scene_count > 0 && l->scene_count < l->total ? 0.0 : NAN; /* a mean of nothing */
     for (int64_t first = 0; first < l->total; first += STRIP) {
         const int64_t live = l->total - first < STRIP ? l->total - first : STRIP;
         judge(l, r, first, live, &one);
@@ -228,46 +228,79 @@ static void turned_by(const double *omega, const double *R, double *out) {
 
 /* All that a minimization works with: the poses that are tried, two rows for each pose, and numbers of each pose. */
 typedef struct {
-    regnf_poses tried;
+    const regnf_pair *pair;
+    const regnf_settings *set;
+    const regnf_history *history;
+    regnf_poses *T, tried;
     regnf_rows rows;
+    kernel l;
+    int64_t taken; /* steps; -1: the first residuals are still to come */
     double *start, *damping, *cost;
-    float *observed;
+    float *observed, *widths;
     int64_t *now, *next; /* rows of the present and of the tried pose */
     uint32_t *scratch;
     char *memory;
 } workplace;
 
-static char *taken(char **at, size_t bytes) {
+static char *room_for(char **at, size_t bytes) {
     char *const from = *at;
-    if (from != NULL) *at += (bytes + 63) / 64 * 64;
+    *at += (bytes + 63) / 64 * 64;
     return from;
 }
 
-static int prepare(workplace *w, const regnf_pair *pair, const regnf_poses *T, int with_steps) {
+static void *begin(const regnf_pair *pair, regnf_poses *T, const regnf_settings *set, const regnf_history *history) {
+    const int with_steps = set->iterations > 0;
     const size_t poses = (size_t)T->count, rows = poses * (with_steps ? 2 : 1);
     const size_t total = (size_t)(pair->scene_samples.count + pair->object_samples.count);
-    const size_t numbers = 17 * poses * sizeof(double) + 2 * poses * sizeof(int64_t) + poses * sizeof(float);
-    const size_t bytes = rows * total * ((with_steps ? 9 : 2) * sizeof(float) + 1) + numbers + 4 * total + 64 * 16;
-    char *at = w->memory = aligned_alloc(64, (bytes + 63) / 64 * 64);
-    if (at == NULL) return REGNF_NO_MEMORY;
-    w->tried = (regnf_poses){.count = T->count};
-    w->tried.scale = (double *)taken(&at, poses * sizeof(double));
-    w->tried.rotation = (double *)taken(&at, 9 * poses * sizeof(double));
-    w->tried.translation = (double *)taken(&at, 3 * poses * sizeof(double));
-    double *const offset = (double *)taken(&at, poses * sizeof(double));
+    const size_t numbers = 17 * poses * sizeof(double) + 2 * poses * sizeof(int64_t) + 2 * poses * sizeof(float);
+    const size_t bytes = rows * total * ((with_steps ? 9 : 2) * sizeof(float) + 1) + numbers + 4 * total + 64 * 17;
+    workplace *w = calloc(1, sizeof *w);
+    char *at = aligned_alloc(64, (bytes + 63) / 64 * 64);
+    if (w == NULL || at == NULL) {
+        free(w);
+        free(at);
+        return NULL;
+    }
+    *w = (workplace){.pair = pair, .set = set, .history = history, .T = T, .taken = -1, .memory = at};
+    w->l = (kernel){.total = (int64_t)total, .scene_count = pair->scene_samples.count, .normals = set->normals};
+    w->l.min_cosine = pair->min_cosine;
+    w->l.narrow = (float)set->unobserved_width;
+    w->tried.count = T->count;
+    w->tried.scale = (double *)room_for(&at, poses * sizeof(double));
+    w->tried.rotation = (double *)room_for(&at, 9 * poses * sizeof(double));
+    w->tried.translation = (double *)room_for(&at, 3 * poses * sizeof(double));
+    double *const offset = (double *)room_for(&at, poses * sizeof(double));
     w->tried.offset = T->offset ? offset : NULL;
-    w->start = (double *)taken(&at, poses * sizeof(double));
-    w->damping = (double *)taken(&at, poses * sizeof(double));
-    w->cost = (double *)taken(&at, poses * sizeof(double));
-    w->observed = (float *)taken(&at, poses * sizeof(float));
-    w->now = (int64_t *)taken(&at, poses * sizeof(int64_t));
-    w->next = (int64_t *)taken(&at, poses * sizeof(int64_t));
-    w->scratch = (uint32_t *)taken(&at, 4 * total);
-    w->rows = (regnf_rows){.values = (float *)taken(&at, rows * total * sizeof(float))};
-    w->rows.cosines = (float *)taken(&at, rows * total * sizeof(float));
-    if (with_steps) w->rows.jacobian = (float *)taken(&at, 7 * rows * total * sizeof(float));
-    if (pair->seen) w->rows.unobserved = (uint8_t *)taken(&at, rows * total);
-    return REGNF_DONE;
+    w->start = (double *)room_for(&at, poses * sizeof(double));
+    w->damping = (double *)room_for(&at, poses * sizeof(double));
+    w->cost = (double *)room_for(&at, poses * sizeof(double));
+    w->observed = (float *)room_for(&at, poses * sizeof(float));
+    w->widths = (float *)room_for(&at, poses * sizeof(float));
+    w->now = (int64_t *)room_for(&at, poses * sizeof(int64_t));
+    w->next = (int64_t *)room_for(&at, poses * sizeof(int64_t));
+    w->scratch = (uint32_t *)room_for(&at, 4 * total);
+    w->rows.values = (float *)room_for(&at, rows * total * sizeof(float));
+    w->rows.cosines = (float *)room_for(&at, rows * total * sizeof(float));
+    if (with_steps) w->rows.jacobian = (float *)room_for(&at, 7 * rows * total * sizeof(float));
+    if (pair->seen) w->rows.unobserved = (uint8_t *)room_for(&at, rows * total);
+    for (int64_t h = 0; h < T->count; h++) w->now[h] = h, w->next[h] = T->count + h;
+    return w;
+}
+
+static void end(void *state) {
+    free(((workplace *)state)->memory);
+    free(state);
+}
+
+static void next_places(const void *state, int of_object, float *out) {
+    const workplace *w = state;
+    places(w->pair, w->taken < 0 ? w->T : &w->tried, of_object, out);
+}
+
+static int next_fill(void *state, int of_object, const float *value, const float *gradient) {
+    workplace *w = state;
+    const int first = w->taken < 0;
+    return fill_rows(w->pair, first ? w->T : &w->tried, of_object, &w->rows, first ? w->now : w->next, value, gradient);
 }
 
 static void keep(const regnf_history *history, const regnf_poses *T, int64_t h, int64_t at, double cost, const kernel *l,
@@ -314,34 +347,53 @@ static void accept_pose(regnf_poses *T, const regnf_poses *from, int64_t h) {
     if (T->offset) T->offset[h] = from->offset[h];
 }
 
-/* One iteration of all poses. */
-static int iterate(const regnf_pair *pair, regnf_poses *T, const regnf_settings *set, int64_t number,
-                   const regnf_history *history, kernel l, workplace *w, float *widths) {
-    const double lowest = set->widths[number], widest = set->widest > lowest ? set->widest : lowest;
-    for (int64_t h = 0; h < T->count; h++) {
-        const row now = row_of(&w->rows, w->now[h], l.total);
-        float width = (float)lowest * (float)(T->scale[h] / w->start[h]);
+/* The next poses, from the present ones. */
+static void step(void *state) {
+    workplace *w = state;
+    const regnf_settings *set = w->set;
+    const double lowest = set->widths[w->taken], widest = set->widest > lowest ? set->widest : lowest;
+    for (int64_t h = 0; h < w->T->count; h++) {
+        const row now = row_of(&w->rows, w->now[h], w->l.total);
+        float width = (float)lowest * (float)(w->T->scale[h] / w->start[h]);
         if (set->widest > 0.0) {
             const float most = (float)(widest / lowest) * width;
             const float own = (float)set->spread_factor
-                              * quantile_of_sizes(now.values, l.total, set->spread_quantile, w->scratch);
+                              * quantile_of_sizes(now.values, w->l.total, set->spread_quantile, w->scratch);
             width = own < width ? width : own > most ? most : own;
         }
-        l.width = widths[h] = width;
-        l.observed = w->observed[h];
-        try_pose(set, T, h, &l, &now, w);
+        w->l.width = w->widths[h] = width;
+        w->l.observed = w->observed[h];
+        try_pose(set, w->T, h, &w->l, &now, w);
     }
-    const int fault = rows_of(pair, &w->tried, &w->rows, w->next);
-    if (fault != REGNF_DONE) return fault;
-    for (int64_t h = 0; h < T->count; h++) {
-        row now = row_of(&w->rows, w->next[h], l.total);
+    w->taken++;
+}
+
+static void settle_first(workplace *w) {
+    for (int64_t h = 0; h < w->T->count; h++) {
+        const row now = row_of(&w->rows, w->now[h], w->l.total);
+        w->observed[h] = observed_weight(&w->l, &now, (float)w->set->min_observed_share);
+        w->start[h] = w->T->scale[h];
+        w->damping[h] = w->set->damping_start;
+    }
+    w->taken = 0;
+}
+
+static void settle(void *state) {
+    workplace *w = state;
+    const regnf_settings *set = w->set;
+    if (w->taken < 0) {
+        settle_first(w);
+        return;
+    }
+    for (int64_t h = 0; h < w->T->count; h++) {
+        row now = row_of(&w->rows, w->next[h], w->l.total);
         /* A kernel is as wide in the scene as before the step: in object units it grows with the pose's scale. */
-        l.width = widths[h] * (float)(w->tried.scale[h] / T->scale[h]);
-        l.observed = w->observed[h];
-        const double tried = cost_of(&l, &now, 0.0f) + prior(set, &w->tried, h, l.width);
+        w->l.width = w->widths[h] * (float)(w->tried.scale[h] / w->T->scale[h]);
+        w->l.observed = w->observed[h];
+        const double tried = cost_of(&w->l, &now, 0.0f) + prior(set, &w->tried, h, w->l.width);
         const int better = tried < w->cost[h]; /* 0 for a step that is not finite: it is undone as well */
         if (better) {
-            accept_pose(T, &w->tried, h);
+            accept_pose(w->T, &w->tried, h);
             const int64_t held = w->now[h];
             w->now[h] = w->next[h];
             w->next[h] = held;
@@ -350,41 +402,22 @@ static int iterate(const regnf_pair *pair, regnf_poses *T, const regnf_settings 
         double damping = better ? w->damping[h] / set->damping_decrease : w->damping[h] * set->damping_increase;
         damping = damping < set->damping_low ? set->damping_low : damping;
         w->damping[h] = damping > set->damping_high ? set->damping_high : damping;
-        now = row_of(&w->rows, w->now[h], l.total);
-        keep(history, T, h, h * set->iterations + number, w->cost[h], &l, &now);
+        now = row_of(&w->rows, w->now[h], w->l.total);
+        keep(w->history, w->T, h, h * set->iterations + w->taken - 1, w->cost[h], &w->l, &now);
     }
-    return set->on_iteration != NULL && set->on_iteration() != 0 ? REGNF_STOPPED : REGNF_DONE;
 }
 
-static int minimize(const regnf_pair *pair, regnf_poses *T, const regnf_settings *set, float *scores, float *sizes,
-                    const regnf_history *history) {
-    workplace w = {0};
-    kernel l = {.scene_count = pair->scene_samples.count, .normals = set->normals, .min_cosine = pair->min_cosine};
-    l.total = l.scene_count + pair->object_samples.count;
-    l.narrow = (float)set->unobserved_width;
-    float *widths = malloc((size_t)(T->count + 1) * sizeof(float));
-    int fault = widths == NULL ? REGNF_NO_MEMORY : prepare(&w, pair, T, set->iterations > 0);
-    for (int64_t h = 0; h < T->count && fault == REGNF_DONE; h++) w.now[h] = h, w.next[h] = T->count + h;
-    if (fault == REGNF_DONE) fault = rows_of(pair, T, &w.rows, w.now);
-    for (int64_t h = 0; h < T->count && fault == REGNF_DONE; h++) {
-        const row now = row_of(&w.rows, h, l.total);
-        w.observed[h] = observed_weight(&l, &now, (float)set->min_observed_share);
-        w.start[h] = T->scale[h];
-        w.damping[h] = set->damping_start;
-    }
-    for (int64_t i = 0; i < set->iterations && fault == REGNF_DONE; i++)
-        fault = iterate(pair, T, set, i, history, l, &w, widths);
+static void score(const void *state, float *scores, float *sizes) {
+    const workplace *w = state;
+    kernel l = w->l;
     l.normals = 1;
     l.narrow = l.observed = 1.0f;
-    l.width = (float)set->score_width;
-    for (int64_t h = 0; h < T->count && fault == REGNF_DONE; h++) {
-        const row now = row_of(&w.rows, w.now[h], l.total);
-        scores[h] = (float)cost_of(&l, &now, (float)set->unobserved_loss);
+    l.width = (float)w->set->score_width;
+    for (int64_t h = 0; h < w->T->count; h++) {
+        const row now = row_of(&w->rows, w->now[h], l.total);
+        scores[h] = (float)cost_of(&l, &now, (float)w->set->unobserved_loss);
         for (int64_t i = 0; i < l.total; i++) sizes[h * l.total + i] = fabsf(now.values[i]);
     }
-    free(widths);
-    free(w.memory);
-    return fault;
 }
 
 #endif

@@ -112,7 +112,7 @@ static void search(const box_tree *tree, int64_t number, const double *place, ne
     }
     for (int i = 0; i < LEAF; i++) {
         const double apart = apart_of[i];
-        if (apart > near->limit || (near->found == near->count && apart >= near->limit)) continue;
+        if (apart == INFINITY || apart > near->limit || (near->found == near->count && apart >= near->limit)) continue;
         const int64_t point = tree->order[node->begin + i];
         int64_t at = near->found < near->count ? near->found++ : near->count - 1;
         for (; at > 0 && near->squares[at - 1] > apart; at--) {

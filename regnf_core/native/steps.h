@@ -146,47 +146,62 @@ static void object_rows(const regnf_pair *pair, const pose *T, const float *valu
     }
 }
 
-/* One direction of so many poses from the first on; memory: 7 numbers a sample of each of them. */
-static int one_direction(const regnf_pair *pair, int of_object, const regnf_poses *T, int64_t first, int64_t poses,
-                         const regnf_rows *rows, const int64_t *numbers, float *memory) {
-    const int64_t n = pair->scene_samples.count, m = pair->object_samples.count, count = of_object ? m : n;
-    float *places = memory, *value = places + 3 * poses * count, *gradient = value + poses * count;
+static int64_t samples_of(const regnf_pair *pair, int of_object) {
+    return of_object ? pair->object_samples.count : pair->scene_samples.count;
+}
+
+/* Of so many poses from the first on. */
+static void places_of(const regnf_pair *pair, const regnf_poses *T, int of_object, int64_t first, int64_t poses,
+                      float *out) {
     for (int64_t h = 0; h < poses; h++) {
         const pose at = pose_of(T, first + h);
-        (of_object ? object_places : scene_places)(pair, &at, places + 3 * h * count);
+        (of_object ? object_places : scene_places)(pair, &at, out + 3 * h * samples_of(pair, of_object));
     }
-    const int fault = ask_model(of_object ? pair->scene : pair->object, places, poses * count, value, gradient);
-    if (fault != REGNF_DONE) return fault;
+}
+
+/* The same; that of pose h goes to row numbers[h], or h. */
+static void rows_from(const regnf_pair *pair, const regnf_poses *T, int of_object, int64_t first, int64_t poses,
+                      const regnf_rows *rows, const int64_t *numbers, const float *value, const float *gradient) {
+    const int64_t count = samples_of(pair, of_object), total = samples_of(pair, 0) + samples_of(pair, 1);
     for (int64_t h = 0; h < poses; h++) {
         const pose at = pose_of(T, first + h);
-        const row to = row_of(rows, numbers ? numbers[first + h] : first + h, n + m);
+        const row to = row_of(rows, numbers ? numbers[first + h] : first + h, total);
         (of_object ? object_rows : scene_rows)(pair, &at, value + h * count, gradient + 3 * h * count, to);
     }
-    return REGNF_DONE;
 }
 
-/* Residuals of all poses; that of pose h in row numbers[h], or h. */
-static int rows_of(const regnf_pair *pair, const regnf_poses *T, const regnf_rows *rows, const int64_t *numbers) {
-    for (int of_object = 0; of_object < 2; of_object++) {
-        const int64_t count = of_object ? pair->object_samples.count : pair->scene_samples.count;
-        const int64_t limit = (of_object ? pair->scene : pair->object)->at_once;
-        int64_t step = T->count;
-        if (limit > 0 && step * count > limit) step = count >= limit ? 1 : limit / count;
-        float *memory = malloc((size_t)(7 * step * count + 1) * sizeof(float));
-        if (memory == NULL) return REGNF_NO_MEMORY;
-        int fault = REGNF_DONE;
-        for (int64_t first = 0; first < T->count && fault == REGNF_DONE; first += step) {
-            const int64_t poses = T->count - first < step ? T->count - first : step;
-            fault = one_direction(pair, of_object, T, first, poses, rows, numbers, memory);
-        }
-        free(memory);
-        if (fault != REGNF_DONE) return fault;
+/* Residuals of one surface's samples at all poses. */
+static int fill_rows(const regnf_pair *pair, const regnf_poses *T, int of_object, const regnf_rows *rows,
+                     const int64_t *numbers, const float *value, const float *gradient) {
+    if (value != NULL) {
+        rows_from(pair, T, of_object, 0, T->count, rows, numbers, value, gradient);
+        return REGNF_DONE;
     }
-    return REGNF_DONE;
+    const regnf_model *model = of_object ? pair->scene : pair->object;
+    const int64_t count = samples_of(pair, of_object);
+    const int64_t few = count > 0 && model->at_once < T->count * count ? model->at_once / count : T->count;
+    const int64_t step = few > 1 ? few : 1;
+    float *memory = malloc((size_t)(7 * step * count + 1) * sizeof(float));
+    if (memory == NULL) return REGNF_NO_MEMORY;
+    float *asked = memory + 3 * step * count, *slopes = asked + step * count;
+    int fault = REGNF_DONE;
+    for (int64_t first = 0; first < T->count && fault == REGNF_DONE; first += step) {
+        const int64_t poses = T->count - first < step ? T->count - first : step;
+        places_of(pair, T, of_object, first, poses, memory);
+        fault = ask_model(model, memory, poses * count, asked, slopes);
+        if (fault == REGNF_DONE) rows_from(pair, T, of_object, first, poses, rows, numbers, asked, slopes);
+    }
+    free(memory);
+    return fault;
 }
 
-static int pair_residuals(const regnf_pair *pair, const regnf_poses *T, const regnf_rows *rows) {
-    return rows_of(pair, T, rows, NULL);
+static void places(const regnf_pair *pair, const regnf_poses *T, int of_object, float *out) {
+    places_of(pair, T, of_object, 0, T->count, out);
+}
+
+static int fill(const regnf_pair *pair, const regnf_poses *T, int of_object, const regnf_rows *rows, const float *value,
+                const float *gradient) {
+    return fill_rows(pair, T, of_object, rows, NULL, value, gradient);
 }
 
 #define STRIP 256 /* samples at once: what is worked out of them stays in the nearest cache */

@@ -27,7 +27,7 @@ def _structure(name: str, **members: Any) -> type[ctypes.Structure]:
 _DOUBLE = ctypes.c_double
 _Samples: Any = _structure("Samples", count=_I64, points=_ADDRESS, values=_ADDRESS, normals=_ADDRESS)
 _Model: Any = _structure(
-    "Model", ask=_ADDRESS, described=_ADDRESS, at_once=_I64, as_it_is=_I32, turn=_DOUBLE * 9, shift=_DOUBLE * 3,
+    "Model", ask=_ADDRESS, described=_ADDRESS, at_once=_I64, checked=_I32, turn=_DOUBLE * 9, shift=_DOUBLE * 3,
     factor=_DOUBLE,
 )  # fmt: skip
 _Poses: Any = _structure("Poses", count=_I64, scale=_ADDRESS, rotation=_ADDRESS, translation=_ADDRESS, offset=_ADDRESS)
@@ -50,18 +50,23 @@ _NUMBERS = (
 )  # fmt: skip
 _Settings: Any = _structure(
     "Settings", iterations=_I64, widths=_ADDRESS, widest=_DOUBLE, low=_DOUBLE, high=_DOUBLE, max_offset=_DOUBLE,
-    normals=_I32, keeps_scale=_I32, **dict.fromkeys(_NUMBERS, _DOUBLE), on_iteration=_ADDRESS,
+    normals=_I32, keeps_scale=_I32, **dict.fromkeys(_NUMBERS, _DOUBLE),
 )  # fmt: skip
 _History: Any = _structure(
     "History", scale=_ADDRESS, rotation=_ADDRESS, translation=_ADDRESS, costs=_ADDRESS, of_scene=_ADDRESS,
     of_object=_ADDRESS,
 )  # fmt: skip
-_ASK = ctypes.CFUNCTYPE(ctypes.c_int, _ADDRESS, _ADDRESS, _I64, _ADDRESS, _ADDRESS)
-_CALLED = ctypes.CFUNCTYPE(ctypes.c_int)
-_DONE, _NO_MEMORY, _ASKED_IN_VAIN, _NOT_FINITE, _STOPPED = range(5)
+_DONE, _NO_MEMORY, _NOT_FINITE = range(3)
 """As in field.h."""
+_FARTHEST = 1e150
+"""Of coordinates whose squared distances are finite."""
 _AT_ONCE = 2048
 """Points that a compiled model is asked for at once: what is worked out of them stays in a core's own cache."""
+
+
+def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Memory for results of compiled code, whatever torch's present defaults are."""
+    return torch.empty(shape, dtype=dtype, device="cpu")
 
 
 def steps_for(*tensors: Tensor) -> Steps | None:
@@ -141,11 +146,11 @@ class NativeModel:
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """f (N,) itself and its gradient (N, 3)."""
-        gradient = torch.empty(len(points), 3)
+        gradient = room(len(points), 3)
         return self._asked(points, gradient), gradient
 
     def _asked(self, points: Tensor, gradient: Tensor | None) -> Tensor:
-        points, value = points.contiguous(), torch.empty(len(points))
+        points, value = points.contiguous(), room(len(points))
         assert points.dtype == torch.float32
         assert points.shape[1:] == (3,)
         to = None if gradient is None else gradient.data_ptr()
@@ -157,7 +162,7 @@ class NativeModel:
         """regnf_model; it holds addresses of this model's parts."""
         return _Model(
             ask=_address_of(self.ask), described=self.described.address, at_once=_AT_ONCE,
-            as_it_is=not self.checked, turn=(_DOUBLE * 9)(*self.turn), shift=(_DOUBLE * 3)(*self.shift),
+            checked=self.checked, turn=(_DOUBLE * 9)(*self.turn), shift=(_DOUBLE * 3)(*self.shift),
             factor=self.factor,
         )  # fmt: skip
 
@@ -175,67 +180,6 @@ def native_model(of: Any) -> NativeModel | None:
     return model
 
 
-class Called:
-    """Functions of Python that compiled code calls, and the first error in one of them."""
-
-    def __init__(self) -> None:
-        self._functions: list[Any] = []
-        self._errors: list[BaseException] = []
-
-    def on_iteration(self, function: Callable[[], None]) -> int:
-        """The address of a function that calls this one."""
-
-        errors = self._errors  # not this object, which holds the function: only a collection would free both
-
-        def called() -> int:
-            return _guarded(function, _STOPPED, errors)
-
-        return self._address(_CALLED(called))
-
-    def model(self, of: Any) -> Any:
-        """regnf_model of what has a ``value_and_gradient``."""
-
-        errors = self._errors
-
-        def asked(_described: int, points: int, count: int, value: int, gradient: int) -> int:
-            return _guarded(lambda: _answer(of, points, count, value, gradient), _ASKED_IN_VAIN, errors)
-
-        return _Model(ask=self._address(_ASK(asked)), as_it_is=True)
-
-    def require(self, fault: int) -> bool:
-        """Whether all was finite. Raises what a function raised, or MemoryError."""
-        if self._errors:
-            raise self._errors[0]
-        if fault == _NO_MEMORY:
-            raise MemoryError("no memory for a registration's residuals")
-        assert fault in (_DONE, _NOT_FINITE)
-        return bool(fault == _DONE)
-
-    def _address(self, function: Any) -> int:
-        self._functions.append(function)
-        return _address_of(function)
-
-
-def _guarded(function: Callable[[], None], fault: int, errors: list[BaseException]) -> int:
-    """0, or the fault where the function raised; its error is added."""
-    try:
-        function()
-    except BaseException as error:  # noqa: BLE001 -- compiled code is in between; it is raised after it
-        errors.append(error)
-        return fault
-    return _DONE
-
-
-def _answer(model: Any, points: int, count: int, value: int, gradient: int) -> None:
-    places = torch.empty(count, 3)
-    ctypes.memmove(places.data_ptr(), points, 12 * count)
-    distance, slope = (part.float() for part in model.value_and_gradient(places))
-    # The code trusts their sizes, and a caller's own field may have any: reshape raises RuntimeError then.
-    distance, slope = distance.reshape(count).contiguous(), slope.reshape(count, 3).contiguous()
-    ctypes.memmove(value, distance.data_ptr(), 4 * count)
-    ctypes.memmove(gradient, slope.data_ptr(), 12 * count)
-
-
 class Pair:
     """Two surfaces for compiled code."""
 
@@ -248,43 +192,41 @@ class Pair:
         :class:`regnf_core.robust.working_frame.Samples`."""
         self.scene_count, self.total = len(scene_samples[1]), len(scene_samples[1]) + len(object_samples[1])
         self.partial = seen is not None
-        self._steps, self._called = steps, Called()
-        self._kept: list[Any] = [seen]
-        self._counted = [(self.total - self.scene_count, native_model(scene)), (self.scene_count, native_model(obj))]
-        models = [
-            self._called.model(one) if native is None else native.structure()
-            for one, (_, native) in zip((scene, obj), self._counted, strict=True)
-        ]
-        self._kept += [scene, obj, models]
+        self._steps, self._seen, self._kept = steps, seen, list[Tensor]()
+        self._asked = [_Asked(self.scene_count, obj), _Asked(self.total - self.scene_count, scene)]
         self._structure = _Pair(
             scene_samples=self._samples(scene_samples), object_samples=self._samples(object_samples),
-            scene=ctypes.addressof(models[0]), obj=ctypes.addressof(models[1]),
-            seen=None if seen is None else seen.address, hidden=None if hidden is None else self._of(hidden),
-            ahead=ahead, min_cosine=min_cosine,
+            scene=self._asked[1].address, obj=self._asked[0].address, seen=None if seen is None else seen.address,
+            hidden=None if hidden is None else self._of(hidden, (self.scene_count,)), ahead=ahead,
+            min_cosine=min_cosine,
         )  # fmt: skip
+        self._address = ctypes.addressof(self._structure)
 
-    def _of(self, tensor: Tensor) -> int:
+    def _of(self, tensor: Tensor, shape: tuple[int, ...]) -> int:
         """Its address. It lives as long as the pair."""
-        self._kept.append(tensor.contiguous())
+        self._kept.append(tensor.reshape(shape).contiguous())
         found: int = self._kept[-1].data_ptr()
         return found
 
     def _samples(self, parts: Sequence[Tensor]) -> Any:
-        points, values, normals = map(self._of, parts)
-        return _Samples(count=len(parts[1]), points=points, values=values, normals=normals)
+        count = len(parts[1])
+        points, values, normals = map(self._of, parts, ((count, 3), (count,), (count, 3)))
+        return _Samples(count=count, points=points, values=values, normals=normals)
 
     def residuals(self, poses: Sequence[Tensor], offset: Tensor | None) -> tuple[list[Tensor | None], bool]:
         """Values (H, N + M), Jacobians (H, 7, N + M), cosines and, where not all was observed, flags (H, N + M); and
         whether all was finite. poses: scale (H,), rotation (H, 3, 3), translation (H, 3) · offset: (H,)."""
         count, total = len(poses[0]), self.total
-        values, cosines = torch.empty(2, count, total)
-        jacobian = torch.empty(count, 7, total)
-        flags = torch.empty(count, total, dtype=torch.bool) if self.partial else None
+        values, cosines, jacobian = room(count, total), room(count, total), room(count, 7, total)
+        flags = room(count, total, dtype=torch.bool) if self.partial else None
         given = {"values": values, "jacobian": jacobian, "cosines": cosines}
         rows = Kept(_Rows, **given, **({} if flags is None else {"unobserved": flags}))
-        of, at = self._poses(poses, offset), ctypes.addressof
-        finite = self._called.require(self._steps.residuals(at(self._structure), of.address, rows.address))
-        self._count(count)
+        of, steps, address = _poses(poses, offset), self._steps, self._address
+        finite = self._fill(
+            count,
+            lambda of_object, places: steps.places(address, of.address, of_object, places),
+            lambda of_object, *found: steps.fill(address, of.address, of_object, rows.address, *found),
+        )
         return [values, jacobian, cosines, flags], finite
 
     def minimize(
@@ -292,36 +234,81 @@ class Pair:
         on_iteration: Callable[[], None], with_history: bool,
     ) -> Minimized:  # fmt: skip
         """poses, offset: see `residuals`; copies of them are moved · numbers: of regnf_settings, by name."""
-        count, steps = len(poses[0]), len(widths)
-        of = self._poses([one.clone() for one in poses], None if offset is None else offset.clone())
-        scores, sizes = torch.empty(count), torch.empty(count, self.total)
-        along = torch.tensor(widths, dtype=torch.float64)
-        called = self._called.on_iteration(on_iteration)
-        settings = Kept(_Settings, iterations=steps, widths=along, on_iteration=called, **numbers)
-        history: Kept | None = None
-        if with_history:
-            T = {"scale": (), "rotation": (3, 3), "translation": (3,)}
-            parts = {name: torch.empty(count, steps, *shape, dtype=torch.float64) for name, shape in T.items()}
-            rest = {name: torch.empty(count, steps) for name in ("costs", "of_scene", "of_object")}
-            history = Kept(_History, **parts, **rest)
-        fault = self._steps.minimize(
-            ctypes.addressof(self._structure), of.address, settings.address, scores.data_ptr(), sizes.data_ptr(),
-            None if history is None else history.address,
-        )  # fmt: skip
-        finite = self._called.require(fault)
-        self._count(count * (steps + 1))
+        count, steps = len(poses[0]), self._steps
+        of = _poses([one.clone() for one in poses], None if offset is None else offset.clone())
+        along = torch.tensor(widths, dtype=torch.float64, device="cpu")
+        settings = Kept(_Settings, iterations=len(widths), widths=along, **numbers)
+        history = _history(count, len(widths)) if with_history else None
+        scores, sizes = room(count), room(count, self.total)
+        kept = None if history is None else history.address
+        state = steps.begin(self._address, of.address, settings.address, kept)
+        if not state:
+            raise MemoryError("no memory for a registration's residuals")
+        try:
+            for number in range(len(widths) + 1):
+                if number:
+                    steps.step(state)
+                finite = self._fill(
+                    count,
+                    lambda of_object, places: steps.next_places(state, of_object, places),
+                    lambda of_object, *found: steps.next_fill(state, of_object, *found),
+                )
+                if not finite:
+                    break
+                steps.settle(state)
+                if number:
+                    on_iteration()
+            steps.score(state, scores.data_ptr(), sizes.data_ptr())
+        finally:
+            steps.end(state)
         return Minimized(of.tensors, scores, sizes, {} if history is None else history.tensors, finite)
 
-    def _poses(self, poses: Sequence[Tensor], offset: Tensor | None) -> Kept:
-        parts = dict(zip(("scale", "rotation", "translation"), poses, strict=True))
-        if offset is not None:
-            parts["offset"] = offset
-        return Kept(_Poses, count=len(poses[0]), **{name: one.double() for name, one in parts.items()})
+    def _fill(self, poses: int, places: Callable[..., None], fill: Callable[..., int]) -> bool:
+        """The residuals of both surfaces' samples; whether all was finite. places, fill: see field.h."""
+        for of_object, asked in enumerate(self._asked):
+            found: tuple[int | None, int | None] = (None, None)
+            if asked.native is None:
+                points = room(poses * asked.samples, 3)
+                places(of_object, points.data_ptr())
+                value, gradient = (part.float() for part in asked.model.value_and_gradient(points))
+                # The code trusts their sizes, and a caller's own field may have any: reshape raises RuntimeError then.
+                value = value.reshape(len(points)).contiguous()
+                gradient = gradient.reshape(len(points), 3).contiguous()
+                found = value.data_ptr(), gradient.data_ptr()
+            fault = fill(of_object, *found)
+            if fault == _NO_MEMORY:
+                raise MemoryError("no memory for a registration's residuals")
+            asked.count(poses)
+            if fault != _DONE:
+                return False
+        return True
 
-    def _count(self, times: int) -> None:
-        for samples, native in self._counted:
-            for counted in () if native is None else native.counted:
-                counted(times * samples)
+
+class _Asked:
+    """What the samples of one surface are asked of: ``samples`` of them at each pose. address: of its regnf_model, or
+    None where it is no compiled code's."""
+
+    def __init__(self, samples: int, model: Any) -> None:
+        self.samples, self.model, self.native = samples, model, native_model(model)
+        self._structure = None if self.native is None else self.native.structure()
+        self.address = None if self._structure is None else ctypes.addressof(self._structure)
+
+    def count(self, poses: int) -> None:
+        for counted in () if self.native is None else self.native.counted:
+            counted(poses * self.samples)
+
+
+def _poses(poses: Sequence[Tensor], offset: Tensor | None) -> Kept:
+    count = len(poses[0])
+    shapes = {"scale": (count,), "rotation": (count, 3, 3), "translation": (count, 3), "offset": (count,)}
+    given = dict(zip(shapes, (*poses, *([] if offset is None else [offset])), strict=False))
+    return Kept(_Poses, count=count, **{name: one.double().expand(shapes[name]) for name, one in given.items()})
+
+
+def _history(count: int, steps: int) -> Kept:
+    T = {"scale": (), "rotation": (3, 3), "translation": (3,)}
+    parts = {name: room(count, steps, *shape, dtype=torch.float64) for name, shape in T.items()}
+    return Kept(_History, **parts, **{name: room(count, steps) for name in ("costs", "of_scene", "of_object")})
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,6 +323,11 @@ class Minimized:
     finite: bool
 
 
+def _is_near(points: Tensor) -> bool:
+    """Whether all coordinates are finite, and their squared distances."""
+    return bool((np.abs(points.numpy()) < _FARTHEST).all())
+
+
 def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor] | None:
     """Distances (N, K) from places (N, 3) to the ``count`` nearest of points (M, 3), nearest first, and their numbers
     (N, K); None where there is no compiled code for it."""
@@ -343,9 +335,9 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     if found is None or points.device.type != "cpu" or not 1 <= count <= min(_MOST_NEAR, len(points)):
         return None
     of, at = points.double().contiguous(), places.cpu().double().contiguous()
-    if not all(np.isfinite(one.numpy()).all() for one in (of, at)):
+    if not all(_is_near(one) for one in (of, at)):
         return None
-    distance, number = torch.empty(len(at), count, dtype=torch.float64), torch.empty(len(at), count, dtype=torch.int64)
+    distance, number = room(len(at), count, dtype=torch.float64), room(len(at), count, dtype=torch.int64)
     if found.steps.nearest(
         of.data_ptr(), len(of), at.data_ptr(), len(at), count, distance.data_ptr(), number.data_ptr()
     ):
@@ -361,9 +353,9 @@ def nearest_to_cells(points: Tensor, low: Tensor, edge: Tensor, cells: int) -> t
     if found is None or points.device.type != "cpu" or len(points) == 0:
         return None
     of, corner, edges = (part.double().contiguous() for part in (points, low, edge))
-    if not all(np.isfinite(one.numpy()).all() for one in (of, corner, edges)):
+    if not all(_is_near(one) for one in (of, corner, edges)):
         return None
-    distance, number = torch.empty(cells**3, dtype=torch.float64), torch.empty(cells**3, dtype=torch.int64)
+    distance, number = room(cells**3, dtype=torch.float64), room(cells**3, dtype=torch.int64)
     if found.steps.nearest_to_cells(
         of.data_ptr(), len(of), corner.data_ptr(), edges.data_ptr(), cells, distance.data_ptr(), number.data_ptr()
     ):
@@ -375,11 +367,11 @@ def kernel_sums(places: Tensor, normals: Tensor, lengths: Tensor, weights: Tenso
     """(N, N): the sum over the lengths (L,) of weights (L,) times the squared exponential kernel of that length, at
     places (N, 3) and normals (N, 3) whose kernel has the length 1; None where there is no compiled code for it."""
     found = variant()
-    if found is None:
+    if found is None or places.device.type != "cpu":
         return None
     x, u = (part.float().T.contiguous() for part in (places, normals))
     factors, weighted = (-0.5 / lengths.square()).float(), weights.float().contiguous()
-    n, sums = len(places), torch.empty(len(places), len(places))
+    n, sums = len(places), room(len(places), len(places))
     found.steps.kernel_sums(
         x.data_ptr(), u.data_ptr(), n, factors.data_ptr(), weighted.data_ptr(), len(lengths), sums.data_ptr()
     )

@@ -168,14 +168,16 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
 def native_pair(surfaces: SurfacePair, T: Sim3) -> compiled.Pair | None:
     """The surfaces for compiled code, at poses T; None: it does not work here."""
     A, B = surfaces.scene_samples, surfaces.object_samples
-    steps, seen = compiled.steps_for(A.points, B.points, T.scale.float()), A.unobserved
+    poses = (part.float() for part in (T.scale, T.rotation, T.translation))
+    parts = (A.points, A.values, A.normals, B.points, B.values, B.normals)
+    steps, seen = compiled.steps_for(*parts, *poses), A.unobserved
     if steps is None or not (seen is None or isinstance(seen, WorkingObservation)):
         return None
     known = None if seen is None else seen.compiled()
     of_scene, of_object = ((one.points, one.values, one.normals) for one in (A, B))
     hidden = None if seen is None else A.hidden
-    parts = of_scene, of_object, surfaces.scene, surfaces.obj, known, hidden
-    return compiled.Pair(steps, *parts, surfaces.ahead, EVIDENCE.min_inlier_cosine)
+    given = of_scene, of_object, surfaces.scene, surfaces.obj, known, hidden
+    return compiled.Pair(steps, *given, surfaces.ahead, EVIDENCE.min_inlier_cosine)
 
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3, ahead: float) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,7 +7,6 @@ to compare thousands of poses; the fields themselves decide afterwards.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.native import steps as compiled
-from regnf_core.native.steps import Kept, NativeModel
+from regnf_core.native.steps import NativeModel
 from regnf_core.robust.constants import FEATURES, SEARCH
 from regnf_core.robust.working_frame import Samples, on_host
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
@@ -51,14 +50,13 @@ class DistanceGrid(Bundle):
         planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)
         return cls(planes, *(corner[:, None] for corner in (low, high, edge)))
 
-    @cached_property
-    def _compiled(self) -> Kept:
-        return compiled.planes(_CELLS, self.low, self.high, self.edge, self.planes)
-
     def native_model(self) -> NativeModel | None:
         """The same for compiled code, where it works."""
         steps = compiled.steps_for(self.planes)
-        return None if steps is None else NativeModel(steps.grid, self._compiled, checked=False)
+        if steps is None:
+            return None
+        described = compiled.planes(_CELLS, self.low, self.high, self.edge, self.planes)
+        return NativeModel(steps.grid, described, checked=False)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (M,) and gradient (M, 3) at points (M, 3): the nearest cell's, carried on to the point."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
+import signal
+import threading
 import weakref
 from dataclasses import replace
 from typing import Any, Literal
@@ -217,6 +220,35 @@ def test_an_error_of_a_field_or_of_a_step_ends_a_minimization(plainly: Any) -> N
         assert len(steps) == 2
 
 
+@pytest.mark.parametrize("grid", [False, True])
+def test_an_interrupt_ends_a_minimization(grid: bool) -> None:
+    """One that comes while compiled code runs, and one in a field of Python's."""
+    surfaces, T = pair(partial=False, grid=grid, seed=7)
+    many = replace(surfaces, scene_samples=samples(4000, torch.Generator().manual_seed(1)))
+    timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        minimize(many, T, (0.1,) * 100_000)
+    timer.join()
+
+
+@pytest.mark.parametrize("default", [torch.float64, torch.float16])
+def test_torch_s_defaults_change_nothing(default: torch.dtype, plainly: Any) -> None:
+    surfaces, T = pair(partial=True, grid=True, seed=3)
+    field = voxel_grid(torch.rand(6, 5, 4, generator=torch.Generator().manual_seed(2)))
+    points = torch.rand(50, 3)
+    expected = residuals(surfaces, T), minimize(surfaces, T, (0.1, 0.1)), field.signed_distance_and_gradient(points)
+    torch.set_default_dtype(default)
+    try:
+        found = residuals(surfaces, T), minimize(surfaces, T, (0.1, 0.1)), field.signed_distance_and_gradient(points)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert_alike(found[0], expected[0])
+    assert_bundles_alike(found[1], expected[1], 0.0, 0.0)
+    for one, other in zip(found[2], expected[2], strict=True):
+        torch.testing.assert_close(one, other)
+
+
 def test_nothing_waits_for_a_collection_of_garbage() -> None:
     surfaces, T = pair(partial=False, grid=False, seed=7)
     scene = Blob()
@@ -297,6 +329,22 @@ def test_nearest_points_to_cells(cells: int, count: int, plainly: Any) -> None:
     np.testing.assert_allclose((points[found[1]] - centers).norm(dim=-1), distance, rtol=1e-12)
     assert plainly(compiled.nearest_to_cells, points, low, edge, cells) is None
     assert compiled.nearest_to_cells(points * float("nan"), low, edge, cells) is None
+
+
+def test_as_many_nearest_as_there_are_points(plainly: Any) -> None:
+    points = torch.randn(9, 3, generator=torch.Generator().manual_seed(1)).double()
+    found = compiled.nearest(points, points[:2], 9)
+    assert found is not None
+    assert [sorted(row) for row in found[1].tolist()] == [list(range(9))] * 2
+    assert compiled.nearest(points * 1e160, points[:2], 9) is None, "squares that are not finite"
+
+
+def test_surfaces_without_samples_have_no_score(plainly: Any) -> None:
+    surfaces, T = pair(partial=False, grid=True, seed=3)
+    empty = replace(surfaces, object_samples=surfaces.object_samples[:0])
+    for found in (minimize(empty, T, (0.1,)), plainly(minimize, empty, T, (0.1,))):
+        assert bool(found.scores.isnan().all())
+    assert len(minimize(surfaces, T[:0], (0.1,)).scores) == 0
 
 
 def test_what_is_not_finite_is_left_to_the_other_search(plainly: Any) -> None:
