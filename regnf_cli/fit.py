@@ -133,11 +133,7 @@ def fit(
             fitted = reconstruct(images, files, wanted, progress=report, **rest)
         print_report(asdict(fitted))
         return
-    of_images = snapshots, sdfstudio, pictures, start, refine_poses, device, bounds, depth_unit, intrinsics, axes
-    if of_images != _OF_IMAGES_UNSAID:
-        named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device, --bounds, --depth-unit,"
-        named += " --intrinsics, --layout and --camera-axes"
-        raise InvalidOptionsError(f"{named} are for images")
+    _require_unsaid(snapshots, sdfstudio, pictures, start, refine_poses, device, bounds, depth_unit, intrinsics, axes)
     options = FitOptions(**settings)
     if table_log2 is not None:
         options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
@@ -148,6 +144,14 @@ def fit(
         say("sampling exact distances")
         figures = fit_field(target.field, output, options, progress=report, source=target.source, **rest)
     print_report(asdict(figures))
+
+
+def _require_unsaid(*of_images: object) -> None:
+    """Raises InvalidOptionsError where an option of images was given for a mesh."""
+    if of_images != _OF_IMAGES_UNSAID:
+        named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device, --bounds, --depth-unit,"
+        named += " --intrinsics, --layout and --camera-axes"
+        raise InvalidOptionsError(f"{named} are for images")
 
 
 @contextmanager

@@ -135,7 +135,7 @@ async def read_text(model: type[_Model], text: bytes, most_values: int = MOST_VA
 _FIRST_PAUSE_S = 0.02
 _MAX_PAUSE_S = 0.25
 _SLOWER = 1.1
-"""Each pause is longer than the one before by this factor: an answer comes within a twentieth of the time it took."""
+"""Each pause is longer than the one before by this factor: an answer comes within a tenth of the time it took."""
 _Value = TypeVar("_Value")
 
 
