@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, WithJsonSc
 
 from regnf_core.errors import verdict_hint, verdict_in_words
 from regnf_core.field_notes import FieldNotes
+from regnf_core.options import Acceptance
 from regnf_core.version import __version__
 
 if TYPE_CHECKING:
@@ -133,7 +134,8 @@ class RegistrationResult(_Posed):
     there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
     symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
     viewers · surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection
-    was made in, where the scene is a recording.
+    was made in, where the scene is a recording · level: the strictest named level of the option
+    ``acceptance`` that the probability reaches; None: none.
     covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
     becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
     place of the scene's origin: the farther that is from the object, the larger are the entries of t, however well the
@@ -160,6 +162,7 @@ class RegistrationResult(_Posed):
     considered: Considered | None = None
     surroundings: SurfaceSamples | None = None
     camera: CameraView | None = None
+    level: Acceptance | None = None
 
     @property
     def T_camera_object(self) -> Sim3 | None:
@@ -173,9 +176,9 @@ class RegistrationResult(_Posed):
 
     @property
     def probability(self) -> float | None:
-        """That the answer is right, 0..1: that the pose, or one of the alternatives that place nearly the same surface,
-        is within 5 % of the object's diameter, or equal to that by the object's symmetry. What the option
-        ``min_probability`` is compared with. None from the preset `paper`."""
+        """That the answer is right, 0..1: that the pose or one of the alternatives is within 5 % of the object's
+        diameter, or equal to that by the object's symmetry. It decides the verdict: see the option ``acceptance``. None
+        from the preset `paper`."""
         return self.metrics.get("probability")
 
 
@@ -329,9 +332,13 @@ class ResultDocument(Outgoing):
     verdict_hint: str = Field(default="", description="What to do next, for people; empty for a registered result.")
     probability: float | None = Field(
         default=None,
-        description="0..1: that the pose, or one of the alternatives that place nearly the same surface, is right, "
-        "within 5 % of the object's diameter. No answer below `options.robust.min_probability` is accepted. "
-        "Null from the preset `paper`.",
+        description="0..1: that the pose or one of the alternatives is right, within 5 % of the object's diameter. It "
+        "decides the verdict: see `options.robust.acceptance`. Null from the preset `paper`.",
+    )
+    level: Acceptance | None = Field(
+        default=None,
+        description="The strictest named level of `options.robust.acceptance` that the probability reaches, whichever "
+        "was asked for; null: none.",
     )
     T_scene_object: TransformDocument = Field(
         description="The object's pose in the scene: object to scene coordinates."
@@ -407,6 +414,7 @@ def result_document(
         verdict_detail=verdict_in_words(result.verdict_reason, result.verdict_limit),
         verdict_hint=verdict_hint(result.verdict_reason, result.options),
         probability=None if result.probability is None else json_number(result.probability),
+        level=result.level,
         **_both_ways(result),
         center_scene=result.center_scene.tolist(),
         center_object=center.tolist(),

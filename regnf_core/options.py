@@ -25,6 +25,7 @@ _UNIT_TOLERANCE = 0.01
 """How far a scale that follows from a unit may be off: sensors' errors of scale are within."""
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
+Acceptance = Literal["default", "strict"]
 _Ratio = Annotated[float, Gt(0), Le(1)]
 _Share = Annotated[float, Ge(0), Le(1)]
 _Scale = Annotated[float, Ge(1e-6), Le(1e6)] | None
@@ -144,26 +145,12 @@ class RobustOptions(_Group):
     reliable and the pose less accurate."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
     """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
-    min_probability: _Share = 0.7
-    """Minimum ``probability`` (0..1) of an answer; below it: LOW_PROBABILITY. Increase it for fewer wrong poses; an
-    answer below it is never accepted. For detections in images it is 0.9 at least."""
-    share_limits_below: _Share = 0.9
-    """Below this probability (0..1) the three limits that follow, of shares, must be kept too. 1: always, 0: never."""
-    min_inlier_share: _Ratio = 0.6
-    """Minimum share (0..1) of inliers, in each direction, below the probability ``share_limits_below``; less:
-    LOW_OVERLAP. Decrease it where the object in the scene is damaged or covered."""
-    min_explained_share: _Ratio = 0.4
-    """Minimum share (0..1) of the surface in the box that the object explains, below the probability
-    ``share_limits_below``; less: SCENE_UNEXPLAINED. Decrease it for boxes that hold other objects too."""
-    max_free_space_violations: _Ratio = 0.2
-    """Maximum share (0..1) of the object's surface in the scene's free space, below the probability
-    ``share_limits_below``; more: FREE_SPACE_VIOLATED. Increase it where the scene's field lacks parts of the
-    object."""
-    max_occluded_share: _Ratio = 0.85
-    """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
-    Increase it for objects that were observed from one side only. Whatever it says, no pose is accepted at which more
-    than 0.95 is hidden: of such poses the probability knows nothing. For detections in images the probability knows of
-    hidden objects: the limit is 0.98 of the surface there, and this option says nothing."""
+    acceptance: Acceptance = "default"
+    """Which answers are accepted. `default`: about one of a hundred accepted answers is wrong. `strict`: about one of
+    five hundred; fewer answers are accepted."""
+    min_probability: _Share | None = None
+    """Minimum ``probability`` (0..1) of an answer, in place of a named level of ``acceptance``; below it: `rejected`.
+    null: what the level says."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score, and they are at most 20 times less likely. Increase it to list less exact symmetry equivalents

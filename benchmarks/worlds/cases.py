@@ -22,7 +22,7 @@ from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core.fields.build import open_field
 from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.observation import ObservedField, observation_of, stored_observation
+from regnf_core.fields.observation import Observation, ObservedField, observation_of, stored_observation
 
 ObservedBy = Literal["images", "cameras", "map", "nothing"]
 """What tells what was seen of a scene: the walk's images, where its cameras stood alone, the map's own file, or
@@ -35,32 +35,33 @@ class WorldCase:
     """A registration with what is known of it.
 
     facts: what tables group by · points: (N, 3) of the object's true surface, its frame · near: symmetries, with those
-    that nearly hold.
+    that nearly hold · seen: what the walk's images saw, whatever the scene is told of it, scene frame.
     """
 
     case: Case
     facts: dict[str, Any]
     points: Tensor
     near: Symmetries
+    seen: Observation
 
 
 def cases_of(home: Path, by: ObservedBy = "images") -> Iterator[WorldCase]:
     """All cases of a world's folder. by: what tells what was seen of the scene."""
     world = json.loads((home / WORLD).read_text())
-    scene = TransformedField(
-        _observed(home, _scene(home, world), by), Sim3.from_matrix(world["T_scene_room"]).inverse()
-    )
     T_scene_room = Sim3.from_matrix(world["T_scene_room"])
+    scene = TransformedField(_observed(home, _scene(home, world), by), T_scene_room.inverse())
+    seen = _by_images(home).seen_in(T_scene_room.inverse())
     told = {"observed": observation_of(scene) is not None, "observed_by": by}
     for number, known in enumerate(world["cases"]):
-        case = _case(home, number, (world, known), scene, T_scene_room)
+        case = _case(home, number, (world, known), scene, seen)
         yield replace(case, facts=case.facts | told)
 
 
 def _case(
-    home: Path, number: int, said: tuple[dict[str, Any], dict[str, Any]], scene: SdfField, T_scene_room: Sim3
+    home: Path, number: int, said: tuple[dict[str, Any], dict[str, Any]], scene: SdfField, seen: Observation
 ) -> WorldCase:
     world, known = said
+    T_scene_room = Sim3.from_matrix(world["T_scene_room"])
     T_object_model = Sim3.from_matrix(known["T_object_model"])
     with np.load(home / f"object-{number}.npz") as file:
         arrays = {name: file[name] for name in file.files}
@@ -83,7 +84,7 @@ def _case(
         exact,
     )
     points = T_object_model.apply(torch.from_numpy(arrays["surface"]))
-    return WorldCase(case, _facts(home, number, world, known), points, near)
+    return WorldCase(case, _facts(home, number, world, known), points, near, seen)
 
 
 def _object(home: Path, number: int, kind: str, arrays: dict[str, Any], T_object_model: Sim3) -> SdfField:
@@ -116,8 +117,12 @@ def _observed(home: Path, field: SdfField, by: ObservedBy) -> SdfField:
         return ObservedField(field, None)
     if by == "cameras":
         return ObservedField(field, observation_of_cameras(field, read_cameras(home)))
+    return ObservedField(field, _by_images(home))
+
+
+def _by_images(home: Path) -> Observation:
     grid, words = read_observation_grid(home)
-    return ObservedField(field, stored_observation(grid, torch.from_numpy(words)))
+    return stored_observation(grid, torch.from_numpy(words))
 
 
 def _scaled(factor: float) -> Sim3:

@@ -250,24 +250,19 @@ class EvidenceConstants:
 class VerdictConstants:
     """Of the verdict (verdict/answer.py, verdict/evaluation.py). What is enough is an option."""
 
-    # Share of unexplained surface near the object without noise, where it is known what was seen: what was measured is
-    # there. [early fits]
-    unexplained: float = 0.05
-    # Shares for each diameter of noise (root mean square of the inliers' residuals), in addition: where a map is noisy,
-    # what lies on the object cannot be told from a part of another one. [random worlds]
-    unexplained_per_noise: float = 20.0
+    # The least probability of an accepted answer, by the level's name. [random worlds]
+    default_probability: float = 0.9
+    strict_probability: float = 0.98
+    # Shares that nearly all right poses keep. They say why a probability is low, and decide nothing. [random worlds]
+    usual_occluded: float = 0.85
+    usual_free: float = 0.2
+    usual_inliers: float = 0.6
+    usual_unexplained: float = 0.1
+    usual_explained: float = 0.4
     # Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, the field
     # itself says what was hidden, and the verdict is that of scenes of which it is known. Of the 282 right poses that
     # the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth image]
     mostly_hidden: float = 0.5
-    # Share of the object's samples that may be hidden, wherever they lie: of 696 right poses of scenes of which it is
-    # known none has more than .935, so the probability knows nothing of poses beyond. [random worlds]
-    max_hidden: float = 0.95
-    # The same where a detection in an image says which surface is the thing's. [simulated frames]
-    max_hidden_of_thing: float = 0.98
-    # The least probability there: of 737 answers, eighths of the objects left out, 5 of 327 from here on are wrong, 9
-    # of 49 from .8 to it, and 21 of 53 from .6 to .8. [simulated frames]
-    min_probability_of_thing: float = 0.9
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
     # better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right
     # after it, and 11 instead of 17 answers are wrong. [random worlds]

@@ -35,7 +35,7 @@ from regnf_core.robust.search.bounds import (
     start_rotations,
 )
 from regnf_core.robust.search.distance_grid import feature_seeds
-from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates, pose_covariance
+from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates, level_of, pose_covariance
 from regnf_core.robust.working_frame import Samples, WorkingFrame, fixed_generator
 
 _GEMAN_MCCLURE = -2.0
@@ -208,6 +208,7 @@ def result_of(
         center_object=model.frame.center.clone(),
         covariance=pose_covariance(problem, evaluation),
         symmetry=model.symmetry.on("cpu").group(),
+        level=level_of(evaluation.metrics["probability"]),
     )
 
 

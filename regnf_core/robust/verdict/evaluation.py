@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.document import Alternative, Considered, ConsideredPose, Verdict
 from regnf_core.geometry.metrics import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RegistrationOptions, RobustOptions
+from regnf_core.options import Acceptance, RegistrationOptions, RobustOptions
 from regnf_core.robust.constants import REFINEMENT, RELATION, VERDICT
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.loss import adaptive_width
@@ -21,99 +21,97 @@ from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors, with_known_scale
 from regnf_core.robust.verdict.evidence import HeldOut, gather_evidence, pose_features
 
-# The verdict on a pose: whether it is probable enough, and where it is not, what is wrong with it in words.
-#
-# The probability (`verdict/answer.py`) holds all the evidence together. Below the option ``min_probability`` nothing
-# is accepted. Below ``share_limits_below`` a pose has to keep the limits of three shares too, which are options:
-# another object of the same kind, a chair in another chair's place, may be as probable, but little of its surface
-# agrees, or much of it stands in free space. In addition
-#
-# - the object must stand within the detection, give or take;
-# - little of the object may be left that was seen: of such poses the probability knows nothing;
-# - the scene may have surface within the object's hull that belongs to another, similar object. It fits as well, so
-#   this is asked for by itself where it is known what was seen. Elsewhere a field may have invented that surface.
+# The verdict on an answer: one gate, its probability (`verdict/answer.py`), which holds all the evidence together. The
+# option ``acceptance`` names the least one, or ``min_probability`` gives it. What speaks most against a rejected pose is
+# its reason. Beside the gate, a pose must stand within the detection, give or take: elsewhere, nothing was asked for.
 
 
 @dataclass(frozen=True)
 class PoseVerdict:
     """A verdict and its reason (a stable UPPER_SNAKE word).
 
-    margin: by what share 0..1 the narrowest of its limits was kept; negative where it was not, that is, where the pose
-    is rejected · broken: the limit that was not kept, in words with both numbers; "" where the reason says it all.
+    broken: what a rejected pose lacks, in words with numbers; "" where the reason says it all · margin: by how much the
+    probability is above its limit; negative for a rejected pose, -1 outside of the detection.
     """
 
     verdict: Verdict
     reason: str
+    broken: str
     margin: float
-    broken: str = ""
+
+
+LEVELS: dict[Acceptance, float] = {"default": VERDICT.default_probability, "strict": VERDICT.strict_probability}
+"""The least probability of an answer by the name of its level."""
+
+
+def least_probability(options: RobustOptions) -> float:
+    """Of an accepted answer."""
+    return LEVELS[options.acceptance] if options.min_probability is None else options.min_probability
+
+
+def level_of(probability: float) -> Acceptance | None:
+    """The strictest level that an answer of this probability reaches; None: none."""
+    return max((name for name, least in LEVELS.items() if probability >= least), key=LEVELS.__getitem__, default=None)
 
 
 @dataclass(frozen=True)
-class _Limit:
-    """A number of a pose and what it may be. name: in words · upper: whether the limit is the most that is allowed."""
+class _Usual:
+    """A number of right poses and what it usually is at least, or at most. name: in words."""
 
     reason: str
     name: str
-    value: float
+    metric: str
     limit: float
-    upper: bool = False
+    upper: bool = True
 
-    @property
-    def slack(self) -> float:
-        """By how much it is kept, negative where it is not; -1 for a number that is none."""
-        slack = self.limit - self.value if self.upper else self.value - self.limit
-        return -1.0 if math.isnan(slack) else slack
-
-    def __str__(self) -> str:
-        value, limit = f"{self.value:.3g}", f"{self.limit:.3g}"
-        if value == limit:  # 0.6996 is not "0.7, at least 0.7"
-            value, limit = str(self.value), str(self.limit)
-        rule = f"at most {limit} is allowed" if self.upper else f"at least {limit} is needed"
-        return f"{self.name} {value}, {rule}"
+    def broken(self, told: dict[str, float]) -> str:
+        """That it is not so, in words; "" where it is."""
+        value = told[self.metric]
+        if (value <= self.limit) if self.upper else (value >= self.limit):
+            return ""
+        return f"{self.name} {value:.3g}, usual is {self.limit:g} or {'less' if self.upper else 'more'}"
 
 
-_MOST_HIDDEN = {False: VERDICT.max_hidden, True: VERDICT.max_hidden_of_thing}
+_USUAL = (
+    _Usual("TOO_LITTLE_SURFACE", "occluded share", "occluded_share_object", VERDICT.usual_occluded),
+    _Usual("FREE_SPACE_VIOLATED", "share in free space", "free_space_violations", VERDICT.usual_free),
+    _Usual("LOW_OVERLAP", "object inliers", "inlier_share_object", VERDICT.usual_inliers, upper=False),
+    _Usual("LOW_OVERLAP", "scene inliers", "inlier_share_scene", VERDICT.usual_inliers, upper=False),
+    _Usual("SURFACE_UNEXPLAINED", "unexplained share", "unexplained_share_scene", VERDICT.usual_unexplained),
+    _Usual("SCENE_UNEXPLAINED", "explained share", "explained_share_scene", VERDICT.usual_explained, upper=False),
+)
+"""What explains a rejection, the first that holds: the probability decides, these say why it is low."""
 
 
 def evaluate_pose(
-    held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float, of_thing: bool = False
+    held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float
 ) -> PoseVerdict:
     """The verdict on pose number ``index``, which ``rivals`` other poses equal.
 
-    probability: that the pose or one of its rivals is right, 0..1 · of_thing: an image showed the object from one side,
-    and a mask or a box said where. Most of it is hidden then, and what was said is off by some pixels: the probability
-    has learned from such poses, so neither rejects one by itself.
-    Written so that a number that is not finite can only lead to a rejection.
+    probability: that the pose or one of its rivals is right, 0..1. Written so that a number that is not finite can only
+    lead to a rejection.
     """
-    told, hidden = held_out.of(index), float(held_out.features["hidden"][index])
-    limits = [_Limit("TOO_LITTLE_SURFACE", "hidden share", hidden, _MOST_HIDDEN[of_thing], True)]
-    if not of_thing:
-        occluded, most = told["occluded_share_object"], options.max_occluded_share
-        limits.insert(0, _Limit("TOO_LITTLE_SURFACE", "occluded share", occluded, most, True))
-    if not of_thing and (held_out.evidence.partial or hidden > VERDICT.mostly_hidden):
-        allowed = VERDICT.unexplained + VERDICT.unexplained_per_noise * told["residual_rms"]
-        unexplained = told["unexplained_share_scene"]
-        limits.append(_Limit("SURFACE_UNEXPLAINED", "unexplained share", unexplained, allowed, True))
-    if options.share_limits_below >= 1.0 or not probability >= options.share_limits_below:
-        free, enough = told["free_space_violations"], options.min_inlier_share
-        explained = told["explained_share_scene"]
-        limits += [
-            _Limit("FREE_SPACE_VIOLATED", "share in free space", free, options.max_free_space_violations, True),
-            _Limit("LOW_OVERLAP", "object inliers", told["inlier_share_object"], enough),
-            _Limit("LOW_OVERLAP", "scene inliers", told["inlier_share_scene"], enough),
-            _Limit("SCENE_UNEXPLAINED", "explained share", explained, options.min_explained_share),
-        ]
-    least = max(options.min_probability, VERDICT.min_probability_of_thing) if of_thing else options.min_probability
-    limits.append(_Limit("LOW_PROBABILITY", "probability", probability, least))
-    margin = min(one.slack for one in limits)
+    least = least_probability(options)
+    margin = probability - least if math.isfinite(probability) else -1.0
     if not bool(held_out.admitted[index]):
-        return PoseVerdict("rejected", "OUTSIDE_DETECTION", -1.0)
-    broken = next((one for one in limits if not one.slack >= 0.0), None)
-    if broken is not None:
-        return PoseVerdict("rejected", broken.reason, margin, str(broken))
+        return PoseVerdict("rejected", "OUTSIDE_DETECTION", "", -1.0)
+    if not margin >= 0.0:
+        return PoseVerdict("rejected", *_reason(held_out.of(index), probability, least), margin)
     if rivals:
-        return PoseVerdict("ambiguous", "SEVERAL_POSES_AGREE", margin)
-    return PoseVerdict("registered", "SURFACES_AGREE", margin)
+        return PoseVerdict("ambiguous", "SEVERAL_POSES_AGREE", "", margin)
+    return PoseVerdict("registered", "SURFACES_AGREE", "", margin)
+
+
+def _reason(told: dict[str, float], probability: float, least: float) -> tuple[str, str]:
+    """Why a probability is low, and the same in words."""
+    value, limit = f"{probability:.3g}", f"{least:.3g}"
+    if value == limit:  # 0.6996 is not "0.7, at least 0.7"
+        value, limit = str(probability), str(least)
+    words = f"probability {value}, at least {limit} is needed"
+    for usual in _USUAL:
+        if broken := usual.broken(told):
+            return usual.reason, f"{words}; {broken}"
+    return "LOW_PROBABILITY", words
 
 
 # The poses that a registration has looked at to the end, with what speaks for and against each: for people to look at.
@@ -132,7 +130,7 @@ def considered_poses(
     poses = []
     for number in chosen.tolist():
         likely = float(answer.probability[number])
-        found = evaluate_pose(held_out, number, 0, options, likely, problem.view.of_thing)
+        found = evaluate_pose(held_out, number, 0, options, likely)
         T = problem.in_field_frames(candidates.T[number])
         metrics = {**held_out.of(number), "probability": likely}
         poses.append(ConsideredPose(T, found.reason, metrics, found.broken))
@@ -215,7 +213,7 @@ def evaluate_candidates(
     scores = held_out.evidence.numbers["score"]
     answer = choose(problem, candidates, held_out.features, scores, options.robust.rival_margin)
     winner, likely = answer.winner, float(answer.probability[answer.winner])
-    found = evaluate_pose(held_out, winner, len(answer.rivals), options.robust, likely, problem.view.of_thing)
+    found = evaluate_pose(held_out, winner, len(answer.rivals), options.robust, likely)
     T = problem.in_field_frames(candidates.T[winner])
     metrics = {
         **held_out.of(winner),

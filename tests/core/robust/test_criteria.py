@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,9 +16,9 @@ from regnf_core import RegistrationResult, register, register_batch
 from regnf_core.document import result_document
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import LibraryObject, model_object, search_library
-from regnf_core.options import RegistrationOptions, RobustOptions
+from regnf_core.options import Acceptance, RegistrationOptions, RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.verdict.evaluation import PoseVerdict, evaluate_pose
+from regnf_core.robust.verdict.evaluation import LEVELS, PoseVerdict, evaluate_pose, level_of
 from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidence
 from regnf_core.robust.working_frame import Samples
 from tests.core.analytic import chair, chair_pose, room, table
@@ -58,20 +57,19 @@ def evidence_of(scene_to_object: list[float], object_to_scene: list[float]) -> E
 ALIKE = evidence_of([0.0] * 10, [0.0] * 10)
 
 
-def told(evidence: Evidence, hidden: float = 0.0, unexplained: float = 0.0, admitted: bool = True) -> HeldOut:
-    features = {"hidden": torch.tensor([hidden]).double(), "unexplained": torch.tensor([unexplained]).double()}
+def told(evidence: Evidence, unexplained: float = 0.0, admitted: bool = True) -> HeldOut:
+    features = {"unexplained": torch.tensor([unexplained]).double()}
     return HeldOut(evidence, features, torch.tensor([admitted]))
 
 
 def verdict_on(
     evidence: Evidence = ALIKE,
     probability: float = 0.99,
-    hidden: float = 0.0,
     unexplained: float = 0.0,
     rivals: int = 0,
     **options: Any,
 ) -> PoseVerdict:
-    return evaluate_pose(told(evidence, hidden, unexplained), 0, rivals, RobustOptions(**options), probability)
+    return evaluate_pose(told(evidence, unexplained), 0, rivals, RobustOptions(**options), probability)
 
 
 @pytest.mark.parametrize(
@@ -92,45 +90,31 @@ FREE = evidence_of([0.0] * 10, [0.0] * 7 + [0.1] * 3)
 """Three tenths of the object are where the scene is free."""
 
 
-@pytest.mark.parametrize(
-    ("probability", "below", "rivals", "verdict", "reason"),
-    [
-        *((enough, enough, 0, "registered", "SURFACES_AGREE") for enough in (0.5, 0.9, 0.95)),
-        *((enough, enough, 1, "ambiguous", "SEVERAL_POSES_AGREE") for enough in (0.5, 0.9, 0.95)),
-        *((enough - 0.01, enough, 0, "rejected", "FREE_SPACE_VIOLATED") for enough in (0.5, 0.9, 0.95)),
-        (1.0, 1.0, 0, "rejected", "FREE_SPACE_VIOLATED"),  # always
-        (0.7, 0.0, 0, "registered", "SURFACES_AGREE"),  # never
-    ],
-)
-def test_from_the_probability_of_the_options_on_shares_do_not_count(
-    probability: float, below: float, rivals: int, verdict: str, reason: str
-) -> None:
-    found = verdict_on(FREE, probability, rivals=rivals, share_limits_below=below, min_probability=0.2)
-    assert (found.verdict, found.reason) == (verdict, reason)
+@given(probability=st.floats(0.0, 1.0), least=st.floats(0.0, 1.0), rivals=st.integers(0, 3), alike=st.booleans())
+def test_the_probability_alone_decides(probability: float, least: float, rivals: int, alike: bool) -> None:
+    found = verdict_on(ALIKE if alike else FREE, probability, rivals=rivals, min_probability=least)
+    accepted = ("ambiguous", "SEVERAL_POSES_AGREE") if rivals else ("registered", "SURFACES_AGREE")
+    if probability >= least:
+        assert (found.verdict, found.reason) == accepted
+    else:
+        assert (found.verdict, found.reason) == ("rejected", "LOW_PROBABILITY" if alike else "FREE_SPACE_VIOLATED")
+    assert found.margin == pytest.approx(probability - least)
+    assert (found.margin < 0.0) == (found.verdict == "rejected")
 
 
-@given(
-    probability=st.floats(0.0, 1.0),
-    least=st.floats(0.0, 1.0),
-    below=st.floats(0.0, 1.0),
-    shares=st.floats(0.01, 1.0),
-    rivals=st.integers(0, 3),
-)
-def test_no_answer_below_the_minimum_is_accepted(
-    probability: float, least: float, below: float, shares: float, rivals: int
-) -> None:
-    options: dict[str, Any] = {
-        "min_probability": least,
-        "share_limits_below": below,
-        "min_inlier_share": shares,
-        "max_free_space_violations": shares,
-    }
-    found = verdict_on(FREE, probability, rivals=rivals, **options)
-    assert found.verdict == "rejected" or probability >= least
-    sound = verdict_on(ALIKE, probability, rivals=rivals, **options)
-    assert (sound.verdict == "rejected") == (probability < least)
-    if probability < least:
-        assert sound.reason == "LOW_PROBABILITY"
+@pytest.mark.parametrize("name", ["default", "strict"])
+def test_a_level_is_a_least_probability_with_a_name(name: Acceptance) -> None:
+    least = LEVELS[name]
+    assert verdict_on(probability=least, acceptance=name).verdict == "registered"
+    assert verdict_on(probability=least - 1e-9, acceptance=name).verdict == "rejected"
+    assert verdict_on(probability=0.3, acceptance=name, min_probability=0.3).verdict == "registered"
+
+
+def test_the_level_of_a_probability_is_the_strictest_that_it_reaches() -> None:
+    assert 0.5 < LEVELS["default"] < LEVELS["strict"] < 1.0
+    assert level_of(LEVELS["default"] - 1e-9) is None
+    assert level_of(LEVELS["default"]) == level_of(LEVELS["strict"] - 1e-9) == "default"
+    assert level_of(LEVELS["strict"]) == level_of(1.0) == "strict"
 
 
 @pytest.mark.parametrize(
@@ -146,89 +130,30 @@ def test_a_rejection_says_the_number_and_its_limit(probability: float, least: fl
 
 
 def test_a_pose_outside_of_the_detection_is_rejected_first() -> None:
-    found = evaluate_pose(told(FREE, admitted=False), 0, 0, RobustOptions(), 0.2)
+    found = evaluate_pose(told(FREE, admitted=False), 0, 0, RobustOptions(), 1.0)
     assert (found.verdict, found.reason, found.margin) == ("rejected", "OUTSIDE_DETECTION", -1.0)
 
 
-def test_by_default_a_pose_below_nine_tenths_has_to_keep_the_share_limits() -> None:
-    assert verdict_on(probability=0.7).verdict == "registered"
-    assert verdict_on(probability=0.7).margin == 0.0
-    less = verdict_on(probability=0.69)
-    assert (less.verdict, less.reason, round(less.margin, 6)) == ("rejected", "LOW_PROBABILITY", -0.01)
-    assert verdict_on(FREE, probability=0.69).reason == "FREE_SPACE_VIOLATED"
-    assert verdict_on(FREE, probability=0.89).reason == "FREE_SPACE_VIOLATED"
-    assert verdict_on(FREE, probability=0.9).verdict == "registered"
-
-
-@pytest.mark.parametrize(("hidden", "verdict"), [(0.94, "registered"), (0.96, "rejected"), (float("nan"), "rejected")])
-def test_where_nearly_nothing_was_observed_no_probability_helps(hidden: float, verdict: str) -> None:
-    judged = verdict_on(hidden=hidden)
-    assert judged.verdict == verdict
-    assert (judged.reason == "TOO_LITTLE_SURFACE") is (verdict == "rejected")
-
-
-def test_the_share_that_may_be_occluded_is_an_option() -> None:
-    nine_occluded = evidence_of([0.0] * 10, [0.0] + [-0.2] * 9)
-    assert verdict_on(nine_occluded).reason == "TOO_LITTLE_SURFACE"
-    assert verdict_on(nine_occluded, max_occluded_share=0.9).verdict == "registered"
-
-
-def test_surface_of_a_similar_object_is_allowed_by_the_noise_where_it_was_seen() -> None:
-    found = evidence_of([0.002] * 10, [0.002] * 10)
-    assert verdict_on(found, unexplained=0.3).verdict == "registered"  # a field may have invented it
-    seen = replace(found, partial=True)
-    assert verdict_on(seen, unexplained=0.089).verdict == "registered"  # 0.05 + 20 * 0.002
-    outcome = verdict_on(seen, unexplained=0.1)
-    assert (outcome.verdict, outcome.reason) == ("rejected", "SURFACE_UNEXPLAINED")
-    assert outcome.margin == pytest.approx(0.05 + 20 * 0.002 - 0.1, abs=1e-6)
-    # A field of one depth image: what is mostly hidden says itself what was seen.
-    assert verdict_on(found, unexplained=0.1, hidden=0.6).reason == "SURFACE_UNEXPLAINED"
-    assert verdict_on(found, unexplained=0.1, hidden=0.4).verdict == "registered"
-
-
 @pytest.mark.parametrize(
-    ("option", "limit", "kept", "margin", "reason", "evidence"),
+    ("evidence", "unexplained", "reason", "said"),
     [
-        ("max_free_space_violations", 0.29, 0.31, -0.01, "FREE_SPACE_VIOLATED", FREE),
-        # Four tenths of what stands there are another shape; of the object, three in twenty do not agree.
-        ("min_inlier_share", 0.61, 0.59, -0.01, "LOW_OVERLAP", evidence_of([0.0] * 6 + [0.06] * 4, [0.0] * 10)),
-        ("min_inlier_share", 0.86, 0.84, -0.01, "LOW_OVERLAP", evidence_of([0.0] * 10, [0.0] * 17 + [0.02] * 3)),
+        (evidence_of([0.0] * 10, [0.0] + [-0.2] * 9), 0.0, "TOO_LITTLE_SURFACE", "occluded share 0.9, usual is 0.85 or less"),
+        (FREE, 0.0, "FREE_SPACE_VIOLATED", "share in free space 0.3, usual is 0.2 or less"),
+        # Half of what stands there is another shape; of the object, half does not agree.
+        (evidence_of([0.0] * 5 + [0.06] * 5, [0.0] * 10), 0.0, "LOW_OVERLAP", "scene inliers 0.5, usual is 0.6 or more"),
+        (ALIKE, 0.3, "SURFACE_UNEXPLAINED", "unexplained share 0.3, usual is 0.1 or less"),
         # Most of what stands in the box is something else.
-        (
-            "min_explained_share",
-            0.34,
-            0.33,
-            5 / 15 - 0.34,
-            "SCENE_UNEXPLAINED",
-            evidence_of([0.0] * 5 + [0.5] * 10, [0.0] * 10),
-        ),
+        (evidence_of([0.0] * 5 + [0.5] * 10, [0.0] * 10), 0.0, "SCENE_UNEXPLAINED", "explained share 0.333, usual is 0.4 or more"),
+        (ALIKE, 0.0, "LOW_PROBABILITY", ""),
     ],
-)
-def test_the_limits_are_options(
-    option: str, limit: float, kept: float, margin: float, reason: str, evidence: Evidence
+)  # fmt: skip
+def test_the_shares_say_why_a_pose_is_rejected_and_decide_nothing(
+    evidence: Evidence, unexplained: float, reason: str, said: str
 ) -> None:
-    within, beyond = (RegistrationOptions.from_dict({"robust": {option: value}}).robust for value in (kept, limit))
-    assert evaluate_pose(told(evidence), 0, 0, within, 0.8).verdict == "registered"
-    outcome = evaluate_pose(told(evidence), 0, 0, beyond, 0.8)
-    assert (outcome.verdict, outcome.reason) == ("rejected", reason)
-    assert outcome.margin == pytest.approx(margin, abs=1e-6)
-
-
-@given(
-    scene_to_object=st.lists(st.floats(-0.2, 0.2), min_size=4, max_size=12),
-    object_to_scene=st.lists(st.floats(-0.2, 0.2), min_size=4, max_size=12),
-    probability=st.floats(0.0, 1.0),
-    hidden=st.floats(0.0, 1.0),
-    limit=st.floats(0.01, 1.0),
-)
-def test_the_margin_is_negative_for_rejections_alone(
-    scene_to_object: list[float], object_to_scene: list[float], probability: float, hidden: float, limit: float
-) -> None:
-    limits = ("min_inlier_share", "min_explained_share", "max_free_space_violations")
-    options: dict[str, Any] = dict.fromkeys(limits, limit)
-    outcome = verdict_on(evidence_of(scene_to_object, object_to_scene), probability, hidden, **options)
-    assert (outcome.margin < 0.0) == (outcome.verdict == "rejected")
-    assert -1.0 <= outcome.margin <= 1.0
+    rejected = verdict_on(evidence, 0.5, unexplained)
+    assert (rejected.verdict, rejected.reason) == ("rejected", reason)
+    assert rejected.broken.removeprefix("probability 0.5, at least 0.9 is needed").removeprefix("; ") == said
+    assert verdict_on(evidence, 1.0, unexplained).verdict == "registered"
 
 
 def test_numbers_that_are_none_are_rejected() -> None:
