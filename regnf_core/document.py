@@ -183,11 +183,27 @@ class RegistrationResult(_Posed):
 
 
 @dataclass(frozen=True)
+class Difference:
+    """What tells the candidate that comes first and another one apart: the surface of either that lies off the other.
+
+    differs: its share 0..1 of both surfaces · seen: share of both surfaces that does and was seen, or seen not to be
+    there · favor: -1..1, the share of what was seen that speaks for the first candidate less that which speaks for the
+    other · distinguishable: whether enough was seen of it.
+    """
+
+    differs: float
+    seen: float
+    favor: float
+    distinguishable: bool
+
+
+@dataclass(frozen=True)
 class Candidate:
     """What a search tells about one object.
 
     stage: the last stage that it reached · score: 0..1, smaller is better, comparable only within a stage. Verdict,
     reason, transform and probability are those of a registration, for ``refined`` objects; None for the others.
+    difference: from the candidate that comes first, for other ``refined`` ones.
     """
 
     name: str
@@ -197,6 +213,7 @@ class Candidate:
     verdict_reason: str | None = None
     T_object_scene: Sim3 | None = None
     probability: float | None = None
+    difference: Difference | None = None
 
     @property
     def T_scene_object(self) -> Sim3 | None:
@@ -265,6 +282,15 @@ class SymmetryDocument(Outgoing):
     continuous: bool = Field(description="Whether every turn about the axis is one.")
 
 
+class DifferenceDocument(Outgoing):
+    """What tells a candidate from the one that comes first: the surface of either that lies off the other."""
+
+    differs: float = Field(description="Its share of both surfaces, 0..1.")
+    seen: float = Field(description="The share of both surfaces that differs and was seen, or seen not to be there.")
+    favor: float = Field(description="-1..1: how much more of what was seen speaks for the first than for this one.")
+    distinguishable: bool = Field(description="Whether enough of it was seen to tell the two apart.")
+
+
 class CandidateDocument(Outgoing):
     """What a search found out about one object of a library."""
 
@@ -277,6 +303,9 @@ class CandidateDocument(Outgoing):
     verdict: Verdict | None = Field(default=None, description="Of refined ones.")
     verdict_reason: str | None = Field(default=None, description="Of refined and unusable ones.")
     probability: float | None = Field(default=None, description="Of refined ones, as the result's.")
+    difference: DifferenceDocument | None = Field(
+        default=None, description="Of refined ones but the first: what tells it from that."
+    )
     T_scene_object: TransformDocument | None = Field(default=None, description="Of refined ones.")
     T_object_scene: TransformDocument | None = Field(default=None, description="Its inverse.")
 
@@ -461,6 +490,7 @@ def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) 
             verdict=one.verdict,
             verdict_reason=one.verdict_reason,
             probability=one.probability,
+            difference=None if one.difference is None else DifferenceDocument(**asdict(one.difference)),
             **_both_ways(one),
         )
         for one in ranking

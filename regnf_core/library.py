@@ -14,7 +14,7 @@ from functools import partial
 
 import torch
 
-from regnf_core.document import Candidate, ProgressCallback, RegistrationResult
+from regnf_core.document import Candidate, Difference, ProgressCallback, RegistrationResult
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
@@ -31,10 +31,11 @@ from regnf_core.robust.pipeline import (
     result_of,
     search_poses,
 )
-from regnf_core.robust.problem import make_problem, pose_bound
+from regnf_core.robust.problem import RegistrationProblem, make_problem, pose_bound
 from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.search.bounds import start_rotations
-from regnf_core.robust.verdict.evaluation import evaluate_candidates
+from regnf_core.robust.verdict.comparison import decides_for_other, difference
+from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
 from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
 
@@ -111,6 +112,7 @@ def search_library(
             evaluation = evaluate_candidates(problem, found, options)
             refined.append((evaluation, number, problem, counted.evaluations + obj.evaluations))
         refined.sort(key=lambda found: found[0].rank)
+        told_apart = _decided(refined)
     evaluation, number, problem, evaluations = refined[0]
     first = library[number]
     with run.phase("verifying"):
@@ -124,14 +126,30 @@ def search_library(
             result = with_clouds(result, scene, first.field(), detection, cloud_region(detection))
     told = (result.verdict, result.verdict_reason, result.T_object_scene, result.probability)
     ranking = [Candidate(first.name, "refined", result.metrics["score"], *told)]
-    for other, number, _, _ in refined[1:]:
+    for (other, number, _, _), apart in zip(refined[1:], told_apart, strict=True):
         told = (other.found.verdict, other.found.reason, other.T, other.metrics["probability"])
-        ranking.append(Candidate(library[number].name, "refined", other.metrics["score"], *told))
+        ranking.append(Candidate(library[number].name, "refined", other.metrics["score"], *told, apart))
     listed = {number for _, number, _, _ in refined}
     ranking += [Candidate(library[number].name, "coarse", score) for score, number, _ in coarse if number not in listed]
     listed |= {number for _, number, _ in coarse}
     ranking += [Candidate(library[n].name, "signature", apart) for n, apart in nearest if n not in listed]
     return LibrarySearch(ranking, run.finish(result))
+
+
+_Refined = tuple[Evaluation, int, RegistrationProblem, int]
+
+
+def _decided(refined: list[_Refined]) -> list[Difference]:
+    """Move the candidate that the surface speaks for by which it differs from the likeliest one to the first place.
+    Returns what tells each of the others from the first."""
+    placed = {found[1]: found[0].placed(found[2]) for found in refined}
+    for found in refined[1:]:
+        apart = difference(placed[refined[0][1]], placed[found[1]])
+        if decides_for_other(apart):
+            refined.remove(found)
+            refined.insert(0, found)
+            break
+    return [difference(placed[refined[0][1]], placed[found[1]]) for found in refined[1:]]
 
 
 def rank_by_signature(view: SceneView, models: Sequence[ObjectModel]) -> list[tuple[int, float]]:

@@ -8,7 +8,7 @@ and the best pose that a refinement from the truth leads to.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 
 from benchmarks.random_worlds.models import part_of_world
 from benchmarks.worlds.cases import ObservedBy, cases_of
-from benchmarks.worlds.questions import KINDS, Kind, Question, ask
+from benchmarks.worlds.questions import ALTERED, KINDS, Kind, Question, ask
 from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.stages import Recording, recorded
 from regnf_core import OrientedBox, RegistrationOptions, RegnfError
@@ -28,6 +28,7 @@ from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.verdict.answer import apart, choose
+from regnf_core.robust.verdict.comparison import Placed, difference
 from regnf_core.robust.verdict.evaluation import held_out_of
 
 Row = dict[str, Any]
@@ -83,6 +84,7 @@ class _Made:
     def __init__(self) -> None:
         self._views: list[tuple[OrientedBox, SceneView]] = []
         self._models: list[tuple[SdfField, ObjectModel]] = []
+        self._right: Placed | None = None
 
     def view(self, scene: SdfField, box: OrientedBox) -> SceneView:
         found = next((view for known, view in self._views if known is box), None)
@@ -90,6 +92,14 @@ class _Made:
             found = view_scene(scene, box, _OPTIONS.robust)
             self._views.append((box, found))
         return found
+
+    def compared(self, question: Question, placed: Placed) -> Row:
+        """What tells an altered object from the right one, where that was asked about before."""
+        if question.kind == "right":
+            self._right = placed
+        elif question.kind in ALTERED and self._right is not None:
+            return {"difference": asdict(difference(self._right, placed))}
+        return {}
 
     def model(self, field: SdfField) -> ObjectModel:
         found = next((model for known, model in self._models if known is field), None)
@@ -115,6 +125,9 @@ def _rows(question: Question, gathering: Gathering, made: _Made) -> Iterator[Row
     assert problem is not None
     told = {"verdict": result.verdict, "reason": result.verdict_reason}
     rows = list(_described(problem, last.candidates, question, last.winner))
+    assert last.candidates.offsets is not None
+    placed = Placed(problem.on("cpu"), last.candidates.T[last.winner], last.candidates.offsets[[last.winner]])
+    told |= made.compared(question, placed)
     differs, seen = question.seen_difference(problem, last.candidates.T[last.winner])
     for row in rows:
         row |= {**told, "differs": differs, "seen_difference": seen} if row["winner"] else told

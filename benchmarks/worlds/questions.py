@@ -67,14 +67,14 @@ class Question:
     asked: WorldCase
 
     def errors(self, problem: RegistrationProblem, T: Sim3) -> list[float]:
-        """Of poses (H,) between the working frames, diameters of the object: MSSD of the right object; of others, by how
-        much 2 % of either surface, the object's as it is placed and the true one, are off the other at least."""
+        """Of poses (H,) between the working frames, diameters of the object: MSSD of the right object; of others, how
+        far 2 % of either surface, the object's as it is placed and the true one, are off the other at least."""
         truth = self.known.case.truth
         assert truth is not None
         if self.asked.case.obj is self.known.case.obj:
-            found: list[float] = NearestTruth(problem, truth, self.known.points, self.known.case.symmetries).errors(
-                T
-            ).tolist()
+            found: list[float] = (
+                NearestTruth(problem, truth, self.known.points, self.known.case.symmetries).errors(T).tolist()
+            )
             return found
         return [float(np.quantile(far, 0.98)) for far in self._differences(problem, T)]
 

@@ -242,6 +242,14 @@ class EvidenceConstants:
     min_core: float = 0.002  # diameters: smallest core that the tail is compared with; exact fields have 0 [by hand]
     min_confirmed_in_patch: float = 0.3  # of a patch's samples, where the patch counts as confirmed [by hand]
     min_samples_in_patch: int = 5  # scene samples near a patch that it takes to cover it [by hand]
+    # Samples whose mean disagreement is looked at: 1 % of the surface, the least that a part of a similar object has.
+    # [derived]
+    place_samples: int = 16
+    least_in_place: int = 6  # of these that must have been seen [by hand]
+    worst_quantile: float = 0.975  # of the means over all places [random worlds]
+    stretch_width: float = 2.0  # of the kernel with which a stretch is fitted, over the noise [by hand]
+    usual_stretch: float = 0.05  # strain that is looked for, as a deviation [derived]
+    stretch_samples: float = 200.0  # as many errors of the samples are independent [by hand]
     min_slope: float = 1e-3  # of a gradient; a shorter one has no direction [derived]
     facing_cosine: float = -0.25  # between normals; below, surface faces the object's own: 104 degrees [early fits]
 
@@ -263,6 +271,13 @@ class VerdictConstants:
     # itself says what was hidden, and the verdict is that of scenes of which it is known. Of the 282 right poses that
     # the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth image]
     mostly_hidden: float = 0.5
+    # Share of the surfaces of two candidates that differs and was seen, where they can be told apart: the least part of
+    # a similar object is as large. [derived]
+    min_deciding: float = 0.01
+    most_differing: float = 0.5  # share of both surfaces: candidates that differ by more are not alike [by hand]
+    # Share of what was seen of the difference that must speak for the one more than for the other, to decide against
+    # their probabilities. [by hand]
+    min_favor: float = 0.2
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
     # better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right
     # after it, and 11 instead of 17 answers are wrong. [random worlds]

@@ -18,12 +18,13 @@ from regnf_core.robust.refine.loss import adaptive_width
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.answer import Answer, choose
+from regnf_core.robust.verdict.comparison import Placed
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors, with_known_scale
 from regnf_core.robust.verdict.evidence import HeldOut, gather_evidence, pose_features
 
 # The verdict on an answer: one gate, its probability (`verdict/answer.py`), which holds all the evidence together. The
-# option ``acceptance`` names the least one, or ``min_probability`` gives it. What speaks most against a rejected pose is
-# its reason. Beside the gate, a pose must stand within the detection, give or take: elsewhere, nothing was asked for.
+# option ``acceptance`` names the least one, or ``min_probability`` gives it. The reason of a rejection is the first
+# share that is not usual. Beside the gate, a pose must stand within the detection: elsewhere, nothing was asked for.
 
 
 @dataclass(frozen=True)
@@ -191,6 +192,12 @@ class Evaluation:
     def doubtful(self) -> bool:
         """Whether a further attempt is worth its time: it may find a better pose, or one that speaks against this."""
         return self.found.verdict == "rejected" or self.metrics["probability"] < VERDICT.doubtful
+
+    def placed(self, problem: RegistrationProblem) -> Placed:
+        """The best candidate, for comparing it with another object's."""
+        assert self.candidates.offsets is not None, "candidates refined on the fields have offsets"
+        one = torch.tensor([self.winner])
+        return Placed(problem, self.candidates.T[self.winner], self.candidates.offsets[one])
 
     @property
     def rank(self) -> tuple[bool, float]:

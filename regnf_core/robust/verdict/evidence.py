@@ -14,6 +14,7 @@ from torch import Tensor
 
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.exponential_map import skew
+from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import EVIDENCE
@@ -198,6 +199,10 @@ SPEAKS_FOR = {
     "confirmed": True,
     "confirmed_patches": True,
     "covered_patches": True,
+    "worst_of_object": False,
+    "worst_of_scene": False,
+    "worst_normals": False,
+    "stretch": False,
     "normals_agree_object": True,
     "normals_agree_scene": True,
     "stiffness": True,
@@ -233,9 +238,12 @@ def pose_features(problem: RegistrationProblem, T: Sim3, r: Residuals, offsets: 
     r: of the held-out samples under these poses · offsets: (H,) of the surfaces, as the residuals have them.
     """
     groups = _groups(r)
-    found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _spread(r, groups)
     A, B, n = problem.held_out.scene_samples.points, problem.held_out.object_samples.points, r.scene_count
-    found |= coverage(problem.model.extremal_points, B, T.to(A).apply(A), groups.confirmed, groups.near)
+    placed = T.to(A).apply(A)
+    within = problem.model.hull.contains(placed, EVIDENCE.hull_margin)
+    found = _agreement(r, groups) | _conflict(problem, T, r, groups, within) | _spread(r, groups)
+    found |= coverage(problem.model.extremal_points, B, placed, groups.confirmed, groups.near)
+    found |= _worst(problem, r, groups, within)
     stiffness = _stiffness(problem, T, r, groups)
     found |= {
         "normals_agree_scene": _mean(r.cosines[:, :n], groups.scene_agrees),
@@ -243,6 +251,7 @@ def pose_features(problem: RegistrationProblem, T: Sim3, r: Residuals, offsets: 
         "stiffness": stiffness[:, 0],
         "second_stiffness": stiffness[:, 1],
         "offset": offsets.abs(),
+        "stretch": _stretch(problem, T, r, groups, found["noise"]),
     }
     return {name: found[name].double() for name in SPEAKS_FOR}
 
@@ -273,11 +282,13 @@ def _agreement(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
     }
 
 
-def _conflict(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Groups) -> dict[str, Tensor]:
-    """What the object leaves open within its hull, and where it stands in free space or within matter."""
-    A, r1, r2 = problem.held_out.scene_samples, r.scene_to_object, r.object_to_scene
-    moved = T.to(A.points)
-    within = problem.model.hull.contains(moved.apply(A.points), EVIDENCE.hull_margin)
+def _conflict(
+    problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Groups, within: Tensor
+) -> dict[str, Tensor]:
+    """What the object leaves open within its hull, and where it stands in free space or within matter. within: (H, N)
+    bool, which scene samples lie within the hull."""
+    r1, r2 = r.scene_to_object, r.object_to_scene
+    moved = T.to(problem.held_out.scene_samples.points)
     beyond = within & groups.near & (r1 > EVIDENCE.agreement)
     unexplained = unexplained_samples(problem.held_out, moved, beyond)
     free = groups.observed & (r2 > EVIDENCE.coarse)
@@ -305,6 +316,76 @@ def _spread(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
         "noise": _mean(r.values.square(), agree, of_nothing=EVIDENCE.agreement**2).sqrt(),
         "tail": (tail / core.clamp_min(EVIDENCE.min_core)).log(),
     }
+
+
+# Where the surfaces disagree most. Another object agrees in most places, and nowhere in a few; errors of the right one
+# are spread. A share of all samples does not tell the two apart, the mean over a sample's neighbors does.
+
+
+def _worst(problem: RegistrationProblem, r: Residuals, groups: _Groups, within: Tensor) -> dict[str, Tensor]:
+    """How far the surfaces disagree, 0..1, at the places where they do most: the object's visible samples, the scene's
+    within the object's hull, and the object's by the normals. within: as of `_conflict`."""
+    n = r.scene_count
+    of_scene = _neighbors(problem.held_out.scene_samples.points)
+    of_object = _neighbors(problem.held_out.object_samples.points)
+    r1, r2 = ((one.abs() / EVIDENCE.coarse).clamp_max(1.0) for one in (r.scene_to_object, r.object_to_scene))
+    turned = (r.cosines[:, n:] < EVIDENCE.min_inlier_cosine).to(r2)
+    return {
+        "worst_of_object": _worst_place(r2, groups.visible, of_object),
+        "worst_of_scene": _worst_place(r1, within & groups.near, of_scene),
+        "worst_normals": _worst_place(turned, groups.visible, of_object),
+    }
+
+
+def _neighbors(points: Tensor) -> Tensor:
+    """(N, K): the nearest of the points (N, 3) to each, itself among them."""
+    return NearestNeighbors(points).query_several(points, EVIDENCE.place_samples)[1]
+
+
+def _worst_place(values: Tensor, counts: Tensor, neighbors: Tensor) -> Tensor:
+    """(H,): a high quantile of the means of the values (H, N) over the neighbors (N, K) that count (H, N)."""
+    weight = counts.to(values)
+    beside = weight[:, neighbors].sum(-1)
+    mean = (values * weight)[:, neighbors].sum(-1) / beside.clamp_min(1.0)
+    mean = torch.where(counts & (beside >= EVIDENCE.least_in_place), mean, 0.0)
+    return mean.quantile(EVIDENCE.worst_quantile, dim=1)
+
+
+# By how much another shape would fit better: one that is longer along some axis, or sheared.
+
+
+def _stretch(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Groups, noise: Tensor) -> Tensor:
+    """(H,): largest less least stretch of the affine motion that fits the samples best, besides
+    the pose. Least squares about the pose, with weights that forgive (Geman and McClure), and a prior for no stretch:
+    what nobody saw is not stretched.
+
+    r moves by g . (E p + v) under a strain E and a motion v of the object's surface, with the gradients g: the columns
+    of the Jacobian for shifts.
+    """
+    A, B, n = problem.held_out.scene_samples.points, problem.held_out.object_samples.points, r.scene_count
+    places = torch.cat([T.to(A).apply(A), B.expand(len(T), -1, -1)], 1).double()
+    gradient = torch.nn.functional.normalize(r.jacobian[..., 3:6].double(), dim=-1)
+    values, seen = r.values.double(), torch.cat([groups.near, groups.visible], 1)
+    width = EVIDENCE.stretch_width * noise.double().clamp_min(EVIDENCE.min_core)[:, None]
+    weight = seen / (1.0 + (values / width).square()).square()
+    weight = torch.cat([weight[:, :n] / groups.near.sum(1, keepdim=True).clamp_min(1),
+                        weight[:, n:] / groups.visible.sum(1, keepdim=True).clamp_min(1)], 1)  # fmt: skip
+    outer = gradient[..., :, None] * places[..., None, :]
+    strain = torch.stack([outer[..., i, j] + (outer[..., j, i] if i != j else 0.0) for i, j in _STRAINS], -1)
+    J = torch.cat([strain, torch.linalg.cross(places, gradient), gradient], -1)
+    weighted = J * (weight / weight.sum(1, keepdim=True).clamp_min(1e-9))[..., None]
+    variance = (weight * values.square()).sum(1) / weight.sum(1).clamp_min(1e-9) + EVIDENCE.min_core**2
+    prior = torch.diag(J.new_tensor([EVIDENCE.usual_stretch**-2] * 6 + [1e-6] * 6)) / EVIDENCE.stretch_samples
+    H = weighted.mT @ J + variance[:, None, None] * prior
+    step = torch.linalg.solve(H, -(weighted.mT @ values[..., None]))[..., 0]
+    E = step.new_zeros(len(step), 3, 3)
+    for number, (i, j) in enumerate(_STRAINS):
+        E[:, i, j] = E[:, j, i] = step[:, number]
+    least_to_largest = torch.linalg.eigvalsh(E)
+    return least_to_largest[:, 2] - least_to_largest[:, 0]
+
+
+_STRAINS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Groups) -> Tensor:
