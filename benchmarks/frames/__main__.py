@@ -27,7 +27,6 @@ import torch  # noqa: E402
 from benchmarks.frames.measuring import rows_of  # noqa: E402
 from benchmarks.frames.tables import markdown  # noqa: E402
 from benchmarks.random_worlds.models import PARTS  # noqa: E402
-from benchmarks.worlds.look_alikes import LOOK_ALIKE  # noqa: E402
 
 
 def main() -> None:
@@ -52,14 +51,15 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _evidence(arguments: argparse.Namespace) -> None:
-    facts = ("world", "part", "object", "model", "asked", "detection", "sensor", "views", "visible", "verdict")
+    facts = ("world", "part", "object", "model", "detection", "sensor", "visible", "verdict", "probability")
     with gzip.open(arguments.output, "wt") as file:
-        for row in _read(arguments.rows):
-            told = {name: row[name] for name in facts}
-            if row["asked"] == "altered":  # where the camera did not see, often: measured, not trained with
-                told["model"] = LOOK_ALIKE
+        for number, row in enumerate(_read(arguments.rows)):
+            told = {name: row[name] for name in facts if name in row} | {"question": row["asked"], "case": number}
+            told |= {"scene": "frames", "length": "single" if row["views"] == 1 else "few"}
+            told |= {"observed": True, "observed_by": "recording"}
             for pose in row["poses"]:
-                file.write(json.dumps({**told, **pose}) + "\n")
+                answer = {"seen_difference": row["seen_difference"]} if pose["winner"] else {}
+                file.write(json.dumps({**told, **answer, **pose}) + "\n")
 
 
 def _read(paths: Sequence[Path]) -> list[dict[str, Any]]:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 
 from benchmarks.frames import scenes
 from benchmarks.frames.scenes import Known, Simulated, View
 from benchmarks.random_worlds.mesh import Mesh, block, together
 from benchmarks.random_worlds.models import Part, families
+from benchmarks.worlds.evidence import pose_rows
+from benchmarks.worlds.questions import DIFFERS
 from benchmarks.worlds.stages import NearestTruth, recorded
 from benchmarks.worlds.stages import Recording as Kept
 from regnf_core import RegistrationOptions, RegnfError, Sim3, register
@@ -23,9 +26,6 @@ from regnf_core.detections.images import ImageDetection
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.robust import pipeline
 from regnf_core.robust.constants import SEARCH
-from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.verdict.answer import apart, choose
-from regnf_core.robust.verdict.evaluation import HeldOut, held_out_of
 from regnf_data.recordings.recording import Frame, StoredFrame
 from regnf_data.recordings.recording import Recording as Frames
 from regnf_fit.images.recorded_scene import recorded_scene
@@ -178,7 +178,7 @@ def _answered(made: Simulated, question: Question) -> Row:
         "diameter_m": round(float(result.metrics["object_diameter"]) * scale, 4),
         "metrics": {name: round(float(value), 5) for name, value in result.metrics.items()},
     }
-    return row | _poses(kept, question, scene.options)
+    return row | _poses(kept, made, question, scene.options)
 
 
 def _of_box(made: Simulated, box: OrientedBox) -> Row:
@@ -190,29 +190,52 @@ def _of_box(made: Simulated, box: OrientedBox) -> Row:
     }
 
 
-def _poses(kept: Kept, question: Question, options: RegistrationOptions) -> Row:
-    problem, last = kept.problem, kept.evaluations[-1]
+def _poses(kept: Kept, made: Simulated, question: Question, options: RegistrationOptions) -> Row:
+    """Errors up to the symmetries that nearly hold."""
+    problem, last, truth = kept.problem, kept.evaluations[-1], question.T_object_scene
     assert problem is not None
     problem = problem.on("cpu")
-    truth = question.T_object_scene
-    nearest = []
-    if truth is not None:
-        points = torch.from_numpy(question.known.surface.surface[:_POINTS])
-        nearest = [NearestTruth(problem, truth, points, symmetries) for symmetries in question.known.symmetries[::-1]]
-    poses = _described(problem, last.candidates, last.held_out, last.winner, nearest, options)
-    winner = next(pose for pose in poses if pose["winner"])
-    row = {"error": winner["mssd"], "error_exact": winner.pop("mssd_exact"), "listed_error": winner["listed_mssd"]}
-    row["best_error"] = min(pose["mssd"] for pose in poses)
+    points = torch.from_numpy(question.known.surface.surface[:_POINTS])
+
+    def errors(T: Sim3, near: bool = True) -> list[float]:
+        if truth is None:
+            return [9.0] * len(T)
+        found: list[float] = NearestTruth(problem, truth, points, question.known.symmetries[near]).errors(T).tolist()
+        return found
+
+    poses = pose_rows(kept.problem, last.candidates, errors(last.candidates.on("cpu").T), last.winner, options)
+    winner = poses[last.winner]
+    row = {"error": winner["mssd"], "listed_error": winner["listed_mssd"]}
+    row |= {"error_exact": round(errors(last.candidates.on("cpu").T[last.winner][None], near=False)[0], 5)}
+    row |= {"best_error": min(pose["mssd"] for pose in poses)}
+    row |= {"seen_difference": 1.0 if truth is not None else round(_seen_difference(made, question, last.T), 4)}
     if truth is not None and question.asked == "right":
         start = problem.in_working_frames(truth)[None]
         refined = pipeline.refine_poses(problem, start, torch.Generator().manual_seed(0))[torch.tensor([0])]
-        held_out = held_out_of(problem, refined, options)
-        poses += [
-            {**one, "found": False} for one in _described(problem, refined.on("cpu"), held_out, None, nearest, options)
-        ]
+        poses += pose_rows(problem, refined, errors(refined.on("cpu").T), None, options)
         row["truth_error"], row["truth_score"] = poses[-1]["mssd"], poses[-1]["score"]
         row |= _of_truth(problem, start)
     return row | {"poses": poses}
+
+
+def _seen_difference(made: Simulated, question: Question, T: Sim3) -> float:
+    """Share of both surfaces, the true one's and that of the object as it is placed, that differs and lies where an
+    image shows free space or surface."""
+    true = made.placed[0].points[::4]
+    mine = T.inverse().apply(torch.from_numpy(question.known.surface.surface[:_POINTS:4])).numpy()
+    size = float(np.linalg.norm(np.ptp(mine, axis=0)))
+    far = np.concatenate([KDTree(mine).query(true)[0], KDTree(true).query(mine)[0]]) > DIFFERS * size
+    places = np.concatenate([true, mine])
+    seen = np.zeros(len(places), dtype=bool)
+    for view in made.views:
+        frame = view.frame
+        local = (places - frame.T_world_camera[:3, 3]) @ frame.T_world_camera[:3, :3]
+        column, row = np.floor(frame.camera.project(local)).astype(np.int64).T
+        inside = (local[:, 2] > 0.0) & (column >= 0) & (column < frame.depth.shape[1])
+        inside &= (row >= 0) & (row < frame.depth.shape[0])
+        depth = frame.depth[row[inside], column[inside]]
+        seen[inside] |= (depth > 0.0) & (local[inside, 2] <= depth + DIFFERS * size)
+    return float((far & seen).mean())
 
 
 def _of_truth(problem: Any, truth: Sim3) -> Row:
@@ -228,36 +251,3 @@ def _of_truth(problem: Any, truth: Sim3) -> Row:
         "foreground": len(foreground),
         "foreground_right": round(float((distances.abs() < 0.04).double().mean()), 3),
     }
-
-
-def _described(
-    problem: Any,
-    candidates: PoseCandidates,
-    held_out: HeldOut,
-    winner: int | None,
-    nearest: Sequence[NearestTruth],
-    options: RegistrationOptions,
-) -> list[Row]:
-    """As benchmarks.worlds.evidence has them; errors up to the symmetries that nearly hold."""
-    candidates = candidates.on("cpu")
-    scores = held_out.evidence.numbers["score"]
-    errors = nearest[0].errors(candidates.T).tolist() if nearest else [9.0] * len(candidates)
-    elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    rivals = choose(problem, candidates, held_out.features, scores, options.robust.rival_margin).rivals
-    rows = []
-    for number in range(len(candidates)):
-        row = {
-            "mssd": round(errors[number], 5),
-            "listed_mssd": round(min(errors[one] for one in (number, *rivals)), 5),
-            "rivals": len(rivals),
-            "winner": number == winner,
-            "found": True,
-            "others": (elsewhere[number].nonzero()[:, 0] - number).tolist(),
-            "score": round(float(scores[number]), 5),
-            "features": {name: round(float(values[number]), 5) for name, values in held_out.features.items()},
-        }
-        if number == winner:
-            row["mssd_exact"] = round(float(nearest[1].errors(candidates.T[number][None])[0]), 5) if nearest else 9.0
-            row["admitted"] = bool(held_out.admitted[number])
-        rows.append(row)
-    return rows

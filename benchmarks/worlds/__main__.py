@@ -6,7 +6,8 @@
     python -m benchmarks.worlds covariance runs.jsonl [--output factors.md]
     python -m benchmarks.worlds worst FOLDER runs.jsonl --output worst.png
     python -m benchmarks.worlds evidence FOLDER --part train --output evidence.jsonl
-    python -m benchmarks.worlds train evidence.jsonl --output model.json --diagram reliability.svg
+    python -m benchmarks.worlds train evidence.jsonl --output probability.json --table left-out.md
+    python -m benchmarks.worlds trust evidence.jsonl --output trust.md --diagrams FOLDER
 
 One seed is one world; a world is made once and kept. The part `test` is for reporting: choose nothing on it.
 """
@@ -19,26 +20,28 @@ import itertools
 import json
 import multiprocessing
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before torch loads, here and in the workers
 
 from benchmarks.random_worlds.models import PARTS, part_of_world, seeds_of  # noqa: E402
 from benchmarks.random_worlds.walks import LENGTHS  # noqa: E402
-from benchmarks.worlds import covariance, tables, training  # noqa: E402
+from benchmarks.worlds import covariance, tables, training, trust  # noqa: E402
 from benchmarks.worlds.cases import OBSERVED_BY  # noqa: E402
-from benchmarks.worlds.evidence import ASKED, TRAINED, Gathering, evidence_of_world  # noqa: E402
+from benchmarks.worlds.evidence import Gathering, evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
+from benchmarks.worlds.questions import KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
 from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
 from benchmarks.worlds.worst import picture_of, worst_of  # noqa: E402
-from regnf_core.robust.verdict.answer import ProbabilityModel  # noqa: E402
 
 
 def main() -> None:
@@ -51,6 +54,7 @@ def main() -> None:
         "worst": _worst,
         "evidence": _evidence,
         "train": _train,
+        "trust": _trust,
     }
     commands[arguments.command](arguments)
 
@@ -99,29 +103,43 @@ def _homes(arguments: argparse.Namespace) -> list[Path]:
 def _evidence(arguments: argparse.Namespace) -> None:
     homes = _homes(arguments)
     known = sorted(path.parent for path in arguments.folder.glob(f"*/{WORLD}"))
-    gathering = Gathering(arguments.observed_by, arguments.cases, tuple(arguments.asked), arguments.look_alikes_every)
+    gathering = Gathering(
+        arguments.observed_by, arguments.cases, tuple(arguments.kinds), arguments.wrong, not arguments.answers_alone,
+        arguments.registration_seed, arguments.known_scale,
+    )  # fmt: skip
     work = partial(evidence_of_world, known=known, gathering=gathering)
     with arguments.output.open("a") as file:
         for rows in _in_parallel(work, homes, arguments.workers):
-            file.writelines(json.dumps(row) + "\n" for row in rows)
+            kept = [row for row in rows if row["winner"] or not arguments.answers_alone]
+            file.writelines(json.dumps(row) + "\n" for row in kept)
             file.flush()
             _say(f"{rows[0]['world'] if rows else 'a world'}: {len(rows)} poses")
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    rows, measured, beside = (
-        [json.loads(line) for path in paths for line in _text(path).splitlines()]
-        for paths in (arguments.rows, arguments.measured, arguments.beside)
-    )
-    given = arguments.alone and ProbabilityModel.from_dict(json.loads(arguments.alone.read_text())["alone"])
-    found = training.trained(rows, arguments.left_out, arguments.calibrated_on, given, measured, beside)
-    arguments.output.write_text(json.dumps(found.model, indent=1) + "\n")
+    found = training.trained(_read(arguments.rows))
+    arguments.output.write_text(json.dumps(found.models, indent=1) + "\n")
+    text = trust.trust_table(found.answers)
     if arguments.table is not None:
-        title = f"# The verdict's probability in {arguments.left_out}s that were left out"
-        arguments.table.write_text(f"{title}\n\n{found.table}")
-    if arguments.diagram is not None:
-        arguments.diagram.write_text(found.diagram)
-    _say(found.table)
+        arguments.table.write_text(f"# The verdict's probability in worlds that were left out\n\n{text}")
+    _say(text)
+
+
+def _trust(arguments: argparse.Namespace) -> None:
+    rows = _read(arguments.rows)
+    text = trust.trust_table(rows)
+    if arguments.output is None:
+        sys.stdout.write(text)
+    else:
+        arguments.output.write_text(f"# Of accepted answers, how many are wrong\n\n{text}")
+    if arguments.diagrams is not None:
+        for kind, picture in trust.reliability_diagrams(rows).items():
+            name = re.sub(r"[^a-z]+", "-", kind).strip("-")
+            (arguments.diagrams / f"reliability-{name}.svg").write_text(picture)
+
+
+def _read(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    return [json.loads(line) for path in paths for line in _text(path).splitlines()]
 
 
 def _worst(arguments: argparse.Namespace) -> None:
@@ -178,16 +196,17 @@ def _add_commands_on_worlds(commands: argparse._SubParsersAction[argparse.Argume
     making.add_argument("--start", type=int, default=0, help="leave out so many of the part's worlds")
     registering = commands.add_parser("register", help="register every object of the worlds in a folder")
     registering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
-    registering.add_argument("--registration-seed", type=int, default=0)
-    registering.add_argument("--known-scale", type=float, metavar="SHARE", help="say the scale, give or take so much")
     registering.add_argument("--quick", action="store_true", help="do not look into the stages")
     gathering = commands.add_parser("evidence", help="poses with their evidence, for `train`")
     gathering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
     gathering.add_argument("--cases", type=int, default=8, help="of each world, at most")
-    gathering.add_argument("--asked", choices=ASKED, nargs="+", default=list(TRAINED), help="the objects in each box")
-    gathering.add_argument("--look-alikes-every", type=int, default=1, help="of so many cases one has a look-alike too")
+    gathering.add_argument("--kinds", choices=KINDS, nargs="+", default=list(KINDS), help="of questions")
+    gathering.add_argument("--wrong", type=int, help="so many questions of a case that are not about the right object")
+    gathering.add_argument("--answers-alone", action="store_true", help="of the poses, keep what was answered")
     for command in (registering, gathering):
         command.add_argument("--observed-by", choices=OBSERVED_BY, default="images", help="what tells what was seen")
+        command.add_argument("--registration-seed", type=int, default=0)
+        command.add_argument("--known-scale", type=float, metavar="SHARE", help="say the scale, give or take so much")
     for command in (making, registering, gathering):
         command.add_argument("folder", type=Path)
         command.add_argument("--part", choices=PARTS, default="train")
@@ -198,25 +217,14 @@ def _add_commands_on_worlds(commands: argparse._SubParsersAction[argparse.Argume
 
 
 def _add_training(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    learning = commands.add_parser("train", help="the verdict's probability model")
-    learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
-    learning.add_argument("--measured", type=Path, nargs="*", default=[], help="the same, not trained with")
-    learning.add_argument(
-        "--beside", type=Path, nargs="*", default=[], help="the same of other scenes: trained with, not calibrated on"
-    )
-    learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
-    learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
-    learning.add_argument("--diagram", type=Path, help="the same as a picture, the reliability diagram, SVG")
-    learning.add_argument("--left-out", choices=training.LEFT_OUT, default="world", help="what is left out in turn")
-    learning.add_argument(
-        "--calibrated-on",
-        choices=training.CALIBRATED_ON,
-        default="all",
-        help="on which poses the probability must be right on average: all, or those that registrations chose",
-    )
-    learning.add_argument(
-        "--alone", type=Path, help="the model of a pose alone, by which poses lead: make the model of one among others"
-    )
+    learning = commands.add_parser("train", help="the verdict's probability models")
+    learning.add_argument("--output", type=Path, required=True, help="the models, JSON")
+    learning.add_argument("--table", type=Path, help="how far they can be trusted in worlds left out, Markdown")
+    trusting = commands.add_parser("trust", help="of accepted answers, how many are wrong")
+    trusting.add_argument("--output", type=Path, help="Markdown; otherwise it is printed")
+    trusting.add_argument("--diagrams", type=Path, help="a folder for reliability diagrams, SVG")
+    for command in (learning, trusting):
+        command.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
 
 
 def _add_commands_on_runs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

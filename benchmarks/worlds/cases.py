@@ -16,18 +16,19 @@ from benchmarks.robust.bent_field import BentField
 from benchmarks.robust.cases import Case
 from benchmarks.robust.symmetries import in_frame
 from benchmarks.symmetric_errors import Symmetries
-from benchmarks.worlds.making import SCENE, WORLD, read_cameras, read_observation_grid
+from benchmarks.worlds.making import SCENE, WORLD, read_cameras, read_observation_grid, read_recording
 from benchmarks.worlds.observing import observation_of_cameras
-from regnf_core import OrientedBox, SdfField, Sim3
+from regnf_core import OrientedBox, RegnfError, SdfField, Sim3
 from regnf_core.fields.build import open_field
 from regnf_core.fields.composite import TransformedField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import Observation, ObservedField, observation_of, stored_observation
+from regnf_fit.images.recorded_scene import recorded_scene
 
-ObservedBy = Literal["images", "cameras", "map", "nothing"]
+ObservedBy = Literal["images", "cameras", "map", "nothing", "recording"]
 """What tells what was seen of a scene: the walk's images, where its cameras stood alone, the map's own file, or
-nothing."""
-OBSERVED_BY: tuple[ObservedBy, ...] = ("images", "cameras", "map", "nothing")
+nothing. `recording`: the walk's frames are the scene, in place of the map."""
+OBSERVED_BY: tuple[ObservedBy, ...] = ("images", "cameras", "map", "nothing", "recording")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +50,26 @@ def cases_of(home: Path, by: ObservedBy = "images") -> Iterator[WorldCase]:
     """All cases of a world's folder. by: what tells what was seen of the scene."""
     world = json.loads((home / WORLD).read_text())
     T_scene_room = Sim3.from_matrix(world["T_scene_room"])
-    scene = TransformedField(_observed(home, _scene(home, world), by), T_scene_room.inverse())
+    recording = read_recording(home) if by == "recording" else None
+    map_field = (
+        None if recording else TransformedField(_observed(home, _scene(home, world), by), T_scene_room.inverse())
+    )
     seen = _by_images(home).seen_in(T_scene_room.inverse())
-    told = {"observed": observation_of(scene) is not None, "observed_by": by}
     for number, known in enumerate(world["cases"]):
+        box = known["detection"]
+        in_room = OrientedBox(
+            *(torch.tensor(box[name], dtype=torch.float64) for name in ("center", "size", "rotation"))
+        )
+        if recording is None:
+            scene = map_field
+        else:
+            try:
+                scene = TransformedField(recorded_scene(recording, in_room).field, T_scene_room.inverse())
+            except RegnfError:  # no frame shows it
+                continue
+        assert scene is not None
         case = _case(home, number, (world, known), scene, seen)
+        told = {"observed": observation_of(scene) is not None, "observed_by": by}
         yield replace(case, facts=case.facts | told)
 
 

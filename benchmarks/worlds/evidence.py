@@ -15,19 +15,21 @@ from typing import Any
 import torch
 
 from benchmarks.random_worlds.models import part_of_world
-from benchmarks.worlds.cases import ObservedBy, cases_of
+from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.questions import ALTERED, KINDS, Kind, Question, ask
 from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.stages import Recording, recorded
+from benchmarks.worlds.trust import is_right
 from regnf_core import OrientedBox, RegistrationOptions, RegnfError
 from regnf_core.fields.observation import SdfField
+from regnf_core.options import RobustOptions
 from regnf_core.progress import Run
 from regnf_core.robust import pipeline
 from regnf_core.robust.model import ObjectModel, model_object
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.scene import SceneView, view_scene
-from regnf_core.robust.verdict.answer import apart, choose
+from regnf_core.robust.verdict.answer import Relations, choose
 from regnf_core.robust.verdict.comparison import Placed, difference
 from regnf_core.robust.verdict.evaluation import held_out_of
 
@@ -39,7 +41,8 @@ _OPTIONS = RegistrationOptions(preset="robust")
 class Gathering:
     """by: what tells what was seen of the scenes · cases: of each world, at most, the first ones · kinds: of questions
     about each case · others: how many wrong questions a case has, drawn from the kinds; None: all of them · truth: add
-    the poses that refinements from the truth lead to."""
+    the poses that refinements from the truth lead to · known_scale: the right object's scale is said to lie within this
+    share of the true one; None: nothing is said."""
 
     by: ObservedBy = "images"
     cases: int = 8
@@ -47,6 +50,7 @@ class Gathering:
     others: int | None = None
     truth: bool = True
     seed: int = 0
+    known_scale: float | None = None
 
 
 def evidence_of_world(home: Path, known: Sequence[Path], gathering: Gathering) -> list[Row]:
@@ -60,10 +64,20 @@ def evidence_of_world(home: Path, known: Sequence[Path], gathering: Gathering) -
         made = _Made()
         for kind in _kinds(gathering, home, number):
             question = ask(kind, home, cases, number, others)
+            options = _options(gathering, cases[number])
             if question is not None:
                 facts = {**cases[number].facts, "question": kind, "model": question.asked.facts["object"]}
-                rows += [{**facts, **row} for row in _rows(question, gathering, made)]
+                rows += [{**facts, **row} for row in _rows(question, options, gathering, made)]
     return rows
+
+
+def _options(gathering: Gathering, known: WorldCase) -> RegistrationOptions:
+    truth = known.case.truth
+    assert truth is not None
+    if gathering.known_scale is None:
+        return _OPTIONS
+    low, high = (float(truth.scale) * (1.0 + side * gathering.known_scale) for side in (-1.0, 1.0))
+    return RegistrationOptions(preset="robust", robust=RobustOptions(min_scale=low, max_scale=high))
 
 
 def _kinds(gathering: Gathering, home: Path, number: int) -> list[Kind]:
@@ -93,9 +107,9 @@ class _Made:
             self._views.append((box, found))
         return found
 
-    def compared(self, question: Question, placed: Placed) -> Row:
-        """What tells an altered object from the right one, where that was asked about before."""
-        if question.kind == "right":
+    def compared(self, question: Question, placed: Placed, right: bool) -> Row:
+        """What tells an altered object from the right one, where that was found at a right pose before."""
+        if question.kind == "right" and right:
             self._right = placed
         elif question.kind in ALTERED and self._right is not None:
             return {"difference": asdict(difference(self._right, placed))}
@@ -109,31 +123,31 @@ class _Made:
         return found
 
 
-def _rows(question: Question, gathering: Gathering, made: _Made) -> Iterator[Row]:
+def _rows(question: Question, options: RegistrationOptions, gathering: Gathering, made: _Made) -> Iterator[Row]:
     """One row a pose."""
     case = question.asked.case
     with recorded() as kept:
         try:
             view, model = made.view(case.scene, case.detection), made.model(case.obj)
             result = pipeline.register_robust(
-                case.scene, case.obj, case.detection, _OPTIONS, gathering.seed, Run(None), None, model, view
+                case.scene, case.obj, case.detection, options, gathering.seed, Run(None), None, model, view
             )
         except RegnfError as error:
             yield {"winner": True, "verdict": "refused", "reason": error.reason, "mssd": 9.0, "features": {}}
             return
     problem, last = kept.problem, kept.evaluations[-1]
     assert problem is not None
-    told = {"verdict": result.verdict, "reason": result.verdict_reason}
-    rows = list(_described(problem, last.candidates, question, last.winner))
     assert last.candidates.offsets is not None
-    placed = Placed(problem.on("cpu"), last.candidates.T[last.winner], last.candidates.offsets[[last.winner]])
-    told |= made.compared(question, placed)
+    rows = pose_rows(problem, last.candidates, question.errors(problem, last.candidates.T), last.winner)
+    answer = rows[last.winner]
     differs, seen = question.seen_difference(problem, last.candidates.T[last.winner])
-    for row in rows:
-        row |= {**told, "differs": differs, "seen_difference": seen} if row["winner"] else told
+    told: Row = {"verdict": result.verdict, "reason": result.verdict_reason, "probability": result.probability}
+    told |= made.compared(question, last.placed(problem.on("cpu")), is_right(answer))
+    answer |= {**told, "differs": round(differs, 4), "seen_difference": round(seen, 4)}
     yield from rows
     if question.kind == "right" and gathering.truth:
-        yield from ({**row, "found": False} for row in _described(problem, _from_truth(kept, question), question, None))
+        refined = _from_truth(kept, question)
+        yield from pose_rows(problem, refined, question.errors(problem, refined.T), None)
 
 
 def _from_truth(kept: Recording, question: Question) -> PoseCandidates:
@@ -144,27 +158,37 @@ def _from_truth(kept: Recording, question: Question) -> PoseCandidates:
     return pipeline.refine_poses(problem, start, torch.Generator().manual_seed(0))[torch.tensor([0])]
 
 
-def _described(
-    problem: RegistrationProblem, candidates: PoseCandidates, question: Question, winner: int | None
-) -> Iterator[Row]:
-    """Rows of these candidates. winner: the chosen one's number.
+def pose_rows(
+    problem: RegistrationProblem,
+    candidates: PoseCandidates,
+    errors: Sequence[float],
+    winner: int | None,
+    options: RegistrationOptions = _OPTIONS,
+) -> list[Row]:
+    """Rows of these candidates. errors: (H,) · winner: the chosen one's number.
 
     A row's ``others`` are the candidates that are other answers, by how many rows they stand after it.
-    ``found``: it is one of a registration's candidates.
+    ``moved`` and ``same``: how far each candidate places the object from this one, diameters, and the share of its
+    surface that comes to lie on its own · ``found``: it is one of a registration's candidates.
     """
-    held_out = held_out_of(problem, candidates, _OPTIONS)
-    features, evidence = held_out.features, held_out.evidence
-    errors = question.errors(problem, candidates.T)
-    elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    rivals = choose(problem, candidates, features, evidence.numbers["score"], _OPTIONS.robust.rival_margin).rivals
-    for number in range(len(candidates)):
-        yield {
+    held_out = held_out_of(problem, candidates, options)
+    problem, candidates = problem.on("cpu"), candidates.on("cpu")
+    features, scores = held_out.features, held_out.evidence.numbers["score"]
+    poses = Relations.of(problem.model, candidates.T)
+    rivals = choose(problem, candidates, features, scores, options.robust.rival_margin).rivals
+    count = range(len(candidates))
+    return [
+        {
             "mssd": round(errors[number], 4),
             "listed_mssd": round(min(errors[one] for one in (number, *rivals)), 4),
             "rivals": len(rivals),
             "winner": number == winner,
-            "found": True,
-            "others": (elsewhere[number].nonzero()[:, 0] - number).tolist(),
-            "score": round(float(evidence.numbers["score"][number]), 5),
+            "found": winner is not None,
+            "others": (poses.apart[number].nonzero()[:, 0] - number).tolist(),
+            "moved": [round(one, 3) for one in poses.moved[number].tolist()],
+            "same": [1.0 if one == number else round(poses.same(one, number), 2) for one in count],
+            "score": round(float(scores[number]), 5),
             "features": {name: round(float(values[number]), 5) for name, values in features.items()},
         }
+        for number in count
+    ]

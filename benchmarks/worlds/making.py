@@ -6,11 +6,13 @@ import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.random_worlds.fusing import fuse
@@ -25,17 +27,21 @@ from benchmarks.worlds.recipe import FROM_IMAGES, RENDERED, Scene, Seen, see
 from regnf_core.errors import RegnfError
 from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.schema.description import ObservationGrid
+from regnf_data.recordings.camera import Camera
+from regnf_data.recordings.recording import Recording, StoredFrame
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.fusion import fuse_images
 from regnf_fit.options import ReconstructionOptions
 
-WORLD, SCENE, CAMERAS = "world.json", "scene.safetensors", "cameras.npz"
+WORLD, SCENE, CAMERAS, FRAMES = "world.json", "scene.safetensors", "cameras.npz", "frames.npz"
 MAX_CASES = 8
 LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
 """Of an object's surface, measured in some image from its front: what was seen less is no case."""
 LEAST_VOXELS = 20.0
 """Across an object: what is smaller is no case."""
 _SCALES = (0.05, 20.0)
+_STEP_M = 1e-4
+"""Of depths as they are kept: 65535 steps are farther than any sensor's."""
 _REACH = 1.9
 """Of the bounds that images are fitted in, in the units of the fit: its grid ends at 2."""
 _TRAINED = (90, 450)
@@ -84,6 +90,7 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
     scene = _write_scene(task.scene, world, seen, home, rng)
     _write_observation(seen, home)
     _write_cameras(seen, home)
+    _write_frames(seen, home)
     # As many scenes stay in their own frame as do not.
     T_scene_room = similarity(rng, (0.2, 5.0)) if rng.random() < 0.5 else np.eye(4)
     maker = ObjectMaker(world, seen, home, task.objects, LEAST_SEEN[task.length])
@@ -203,6 +210,29 @@ def read_cameras(home: Path) -> PinholeCameras:
     """Where the cameras of the walk are thought to have stood, in the world, as :func:`make` has written it."""
     with np.load(home / CAMERAS) as file:
         return PinholeCameras(**{part.name: torch.from_numpy(file[part.name]) for part in fields(PinholeCameras)})
+
+
+def _write_frames(seen: Seen, home: Path) -> None:
+    depths = np.round(seen.taken.depths / _STEP_M).astype(np.uint16)
+    np.savez_compressed(
+        home / FRAMES, depths=depths, intrinsics=seen.taken.sensor.intrinsics, T_world_camera=seen.taken.estimated
+    )
+
+
+def read_recording(home: Path) -> Recording:
+    """The walk's frames, in the room's frame and meters, by the estimated poses."""
+    with np.load(home / FRAMES) as file:
+        depths, intrinsics, poses = (file[name] for name in ("depths", "intrinsics", "T_world_camera"))
+    camera = Camera(intrinsics, depths.shape[1:])
+    frames = [
+        StoredFrame(f"{number:04d}", camera, pose, partial(_in_meters, depth))
+        for number, (depth, pose) in enumerate(zip(depths, poses, strict=True))
+    ]
+    return Recording("walk", "walk", tuple(frames))
+
+
+def _in_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
+    return steps * np.float32(_STEP_M)
 
 
 def read_object_mesh(home: Path, number: int) -> Mesh:

@@ -47,7 +47,7 @@ _REACH = 0.05
 _LONGER = (0.03, 0.1)
 _RESIZED = (0.7, 1.4)
 """Factors along each axis of a package."""
-_DIFFERS = 0.03
+DIFFERS = 0.03
 """Diameters: surface farther from the other surface differs."""
 _DRAWN = 24
 """Parametric things among which the most similar one is looked for; as many more are objects of other worlds."""
@@ -82,7 +82,7 @@ class Question:
         """Of one pose: the share of both surfaces that differs, and the share that differs and was seen."""
         far = self._differences(problem, T[None])[0]
         places = torch.from_numpy(np.concatenate(self._surfaces(problem, T)))
-        differs, seen = far > _DIFFERS, (self.known.seen.at(places) != UNSEEN).numpy()
+        differs, seen = far > DIFFERS, (self.known.seen.at(places) != UNSEEN).numpy()
         return float(differs.mean()), float((differs & seen).mean())
 
     def _surfaces(self, problem: RegistrationProblem, T: Sim3) -> tuple[Array, Array]:

@@ -1,22 +1,20 @@
-"""The probability model of the verdict, trained on evidence from random worlds: ``python -m benchmarks.worlds train``.
+"""The probability models of the verdict, trained on evidence from random worlds: ``python -m benchmarks.worlds train``.
 
 Logistic regression on monotone ramps: each feature's range is cut at quantiles, and each piece has a ramp whose weight
-is at least 0, so the sum is monotone in every feature. Worlds are left out in turn to see what the model says of rooms
-that it does not know; what it says of them is then made right on average (Platt's scaling on the left-out logits).
+is at least 0, so the sum is monotone in every feature. Eighths of the worlds are left out in turn to see what the model
+says of rooms that it does not know; what it says of them is then made right on average (Platt's scaling).
 
-Look-alikes and other objects of a similar shape are measured, not trained with: in a noisy map the right object cannot
-be told from one that differs by a part, or by little everywhere, so how probable it is would be a matter of how many
-such objects the training has.
-
-A model knows a pose alone, or it is given such a model and knows one feature more: the lead that those log odds give a
-pose over the other answers among the same candidates.
+First a model of a pose alone is made, of all rows. It chooses the answers, as the engine does, and tells by how much
+they lead. Then a model of answers is made for each kind of scene. Wrong objects are learned from like wrong poses,
+but for those whose difference nobody saw: how probable they are is a matter of how many of them are asked for.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,33 +22,28 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.robust.judging import SUCCESS
-from benchmarks.worlds.calibration import calibration_table, measured_line
-from benchmarks.worlds.comparing import compared_line
-from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.recipe import parts_of_name
-from benchmarks.worlds.reliability import reliability_diagram
-from benchmarks.worlds.similar_objects import SIMILAR
+from benchmarks.worlds.trust import Row, cannot_be_told
+from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import VERDICT
-from regnf_core.robust.verdict.answer import LEAD, SPEAKS_FOR_AMONG, ProbabilityModel
+from regnf_core.robust.verdict.answer import (
+    LEAD,
+    SPEAKS_FOR_AMONG,
+    Answer,
+    PoseOdds,
+    ProbabilityModel,
+    Relations,
+    answer_of,
+    apart_from_answer,
+    leads,
+)
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
 Array = NDArray[np.float64]
-LeftOut = Literal["world", "part", "eighth"]
-LEFT_OUT: tuple[LeftOut, ...] = ("world", "part", "eighth")
-CalibratedOn = Literal["all", "chosen"]
-CALIBRATED_ON: tuple[CalibratedOn, ...] = ("all", "chosen")
-
 PIECES = 5
 """Ramps for each feature, between its quantiles."""
 PENALTY = 1e-3
 """Of the squared weights."""
-
-
-MEASURED = {
-    LOOK_ALIKE: "Look-alikes, which lack a part or have one more, some of them where the cameras did not see",
-    SIMILAR: "The most similar ones of some dozens of other objects",
-}
-"""What rows are not trained with, by their model, and what tables call them."""
 OF_OTHERS = 0.5
 """Weight of poses that no registration chose."""
 BESIDE = 0.1
@@ -112,7 +105,7 @@ class Ramps:
         """As the model's file keeps it: features that do not count are left out."""
         terms = {}
         for name, knots, weights in zip(self.names, self.knots, self.weights, strict=True):
-            if weights.sum() < 1e-3:
+            if weights.sum() < 1e-3 or (np.diff(_rounded(knots)) <= 0.0).any():  # or it is the same in all rows
                 continue
             values = np.concatenate([[-weights.sum()], np.cumsum(weights) - weights.sum()])
             if not SPEAKS_FOR_AMONG[name]:
@@ -123,83 +116,109 @@ class Ramps:
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """model: as its file keeps it, by its name · table, diagram: how well the probabilities hold in worlds that were
-    left out, Markdown and SVG."""
+    """models: of a pose alone and of answers among their candidates, by kind of scene, as the file keeps them ·
+    answers: the rows of the answers that these models choose, each with the probability of a model that has not learned
+    from its world."""
 
-    model: dict[str, Any]
-    table: str
-    diagram: str
-
-
-def trained(
-    rows: Sequence[dict[str, Any]],
-    left_out: LeftOut = "world",
-    calibrated_on: CalibratedOn = "all",
-    alone: ProbabilityModel | None = None,
-    measured: Sequence[dict[str, Any]] = (),
-    beside: Sequence[dict[str, Any]] = (),
-) -> Trained:
-    """A model from the rows of :mod:`benchmarks.worlds.evidence`.
-
-    alone: the model of a pose alone, by which poses are chosen and lead: the one that is made knows a pose ``among``
-    its candidates. None: it knows a pose ``alone`` · left_out: one world at a time, or a part with all of its meshes,
-    which no other part has, or an eighth of the worlds · calibrated_on: the poses that the probabilities are to be
-    right of on average, all or those that registrations chose · measured: further rows, which nothing is trained with;
-    objects are compared in these · beside: rows of other scenes, which are trained with at a small weight, and neither
-    calibrated on nor in the table. Of the features those count that all rows have: some rows are older than a feature.
-    """
-    own = len(rows)
-    taught = np.arange(own + len(beside) + len(measured)) < own + len(beside)
-    rows = [*rows, *beside, *measured]
-    of_model = ~taught | (np.arange(len(rows)) < own)
-    names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
-    models, chosen = np.array([row["model"] for row in rows]), np.array([row["winner"] for row in rows])
-    alike = np.isin(models, list(MEASURED))
-    counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike & taught
-    evidence = Evidence(
-        names,
-        np.array([[row["features"][name] for name in names] for row in rows]),
-        np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
-        np.where(chosen, 1.0, OF_OTHERS) * counts * np.where(of_model, 1.0, BESIDE),
-        np.array([_group(row, left_out) for row in rows]),
-        of_model & (chosen | (calibrated_on == "all")),
-    )
-    of_alone = None if alone is None else _odds(rows, alone)
-    if of_alone is not None:
-        found = np.array([row["found"] for row in rows])
-        evidence = evidence.with_feature(LEAD, _leads(rows, of_alone), found)
-    model, odds = train(evidence)
-    shown = counts & of_model
-    used = [row for row, one in zip(rows, shown, strict=True) if one]
-    table = calibration_table(used, odds[shown])
-    for asked, name in MEASURED.items():
-        table += measured_line(name, [row for row in rows if row["model"] == asked], odds[models == asked])
-        table += "" if of_alone is None else compared_line(asked, measured, of_alone[~taught])
-    named = {"alone" if alone is None else "among": model.to_dict()}
-    return Trained(named, table, reliability_diagram(used, odds[shown]))
+    models: dict[str, Any]
+    answers: list[Row]
 
 
-def _odds(rows: Sequence[dict[str, Any]], model: ProbabilityModel) -> Array:
-    """(N,) log odds that a model, made of other rows, gives each."""
-    features = {term.feature: torch.tensor([row["features"][term.feature] for row in rows]) for term in model.terms}
-    return np.asarray(model.logit(features))
+def trained(rows: Sequence[Row]) -> Trained:
+    """All models from the rows of :mod:`benchmarks.worlds.evidence`."""
+    rows = [row for row in rows if row["features"]]
+    groups = np.array([_eighth(row) for row in rows])
+    told = _told(rows)
+    features = np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows])
+    right = np.array([float(row["mssd"] <= SUCCESS) for row in rows])
+    weight = np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * told
+    everything = np.ones(len(rows), dtype=bool)
+    alone, _ = train(Evidence(tuple(SPEAKS_FOR), features, right, weight, groups, everything))
+    models: dict[str, Any] = {"alone": alone.to_dict()}
+    chosen = _answers(rows, ProbabilityModel.from_dict(models["alone"]))
+    kinds = np.array([_model_of(row) for row in rows])
+    answers: list[Row] = []
+    for kind in sorted(set(kinds[chosen.found])):
+        of_kind = kinds == kind
+        beside = (kinds == "observed") & (kind == "thing")
+        weight = np.where(chosen.winner, 1.0, OF_OTHERS) * told * chosen.found
+        weight *= np.where(of_kind, 1.0, np.where(beside, BESIDE, 0.0))
+        among = Evidence(tuple(SPEAKS_FOR), features, chosen.right, weight, groups, of_kind & chosen.winner)
+        among = among.with_feature(LEAD, chosen.leads, np.ones(len(rows)))
+        model, odds = train(among)
+        models[kind] = model.to_dict()
+        for number in np.flatnonzero(of_kind & chosen.winner):
+            said = {"probability": float(1.0 / (1.0 + np.exp(-odds[number]))), "winner": True}
+            answers.append({**rows[number], **said, "listed_mssd": float(chosen.listed[number])})
+    return Trained(models, answers)
 
 
-def _group(row: dict[str, Any], left_out: LeftOut) -> str | int:
-    seed = parts_of_name(row["world"])[1]
-    return str(row["part"]) if left_out == "part" else seed % 8 if left_out == "eighth" else seed
+def _model_of(row: Row) -> str:
+    """The name of the model that a row is for."""
+    if row["scene"] == "frames":
+        return "thing"
+    return "observed" if row["observed"] else "unobserved"
 
 
-def _leads(rows: Sequence[dict[str, Any]], odds: Array) -> Array:
-    """(N,) as :func:`regnf_core.robust.verdict.answer.leads` has them, from each row's score and ``others``."""
-    merits = odds - VERDICT.log_odds_per_score * np.array([row["score"] for row in rows])
-    best = [max((merits[number + step] for step in row["others"]), default=-np.inf) for number, row in enumerate(rows)]
-    return np.clip(merits - np.array(best), -VERDICT.most_lead, VERDICT.most_lead)
+def _eighth(row: Row) -> int:
+    """What is left out together: an eighth of the worlds, with all that was asked in each."""
+    return parts_of_name(row["world"])[1] % 8
 
 
-def _told_apart_by_rivals(row: dict[str, Any]) -> bool:
-    """A wrong pose that is listed together with a right one: the verdict `ambiguous` says so, not the probability."""
-    return bool(row["mssd"] > SUCCESS >= row["listed_mssd"])
+def _told(rows: Sequence[Row]) -> NDArray[np.bool_]:
+    """(N,): whether a row can be learned from: not those of a wrong object that was not seen to differ."""
+    hidden = {_key(row) for row in rows if row["winner"] and row["found"] and cannot_be_told(row)}
+    return np.array([_key(row) not in hidden for row in rows])
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    """Of a registration."""
+    return tuple(row.get(name) for name in ("world", "case", "question", "observed_by", "seed"))
+
+
+@dataclass(frozen=True, eq=False)
+class _Answers:
+    """What a model of poses alone chooses, for rows (N,): which are candidates, which of them are answers, whether they
+    are right (answers by what they list), their leads, and the least errors of what they list."""
+
+    found: NDArray[np.bool_]
+    winner: NDArray[np.bool_]
+    right: Array
+    leads: Array
+    listed: Array
+
+
+def _answers(rows: Sequence[Row], alone: ProbabilityModel) -> _Answers:
+    found = np.array([row["found"] for row in rows])
+    winner, leads_of = np.zeros(len(rows), dtype=bool), np.zeros(len(rows))
+    listed = np.array([row["mssd"] for row in rows])
+    candidates = np.flatnonzero(found).tolist()
+    for _, group in itertools.groupby(candidates, key=lambda number: _key(rows[number])):
+        numbers = list(group)
+        some = [rows[number] for number in numbers]
+        answer, lead = answer_in(some, alone)
+        winner[numbers[answer.winner]] = True
+        leads_of[numbers] = lead
+        listed[numbers[answer.winner]] = min(some[one]["mssd"] for one in (answer.winner, *answer.rivals))
+    return _Answers(found, winner, (listed <= SUCCESS).astype(float), leads_of, listed)
+
+
+def answer_in(candidates: Sequence[Row], alone: ProbabilityModel) -> tuple[Answer, Array]:
+    """The answer that the engine would give among these candidates with another model, and the leads (H,) of all."""
+    count = len(candidates)
+    apart = torch.zeros(count, count, dtype=torch.bool)
+    for number, row in enumerate(candidates):
+        apart[number, [number + step for step in row["others"]]] = True
+    moved = torch.tensor([row["moved"] for row in candidates])
+    same = [row["same"] for row in candidates]
+    poses = Relations(moved, apart, lambda one, other: same[one][other])
+    features = {name: torch.tensor([row["features"][name] for row in candidates]).double() for name in SPEAKS_FOR}
+    scores = torch.tensor([row["score"] for row in candidates]).double()
+    margin = RobustOptions().rival_margin
+    answer = answer_of(PoseOdds(alone, alone), features, scores, poses, margin)
+    alike = [one for one in answer.rivals if same[one][answer.winner] >= VERDICT.min_same_surface]
+    joined = apart_from_answer(apart, [answer.winner, *alike])
+    return answer, leads(-answer.demerits, joined).numpy()
 
 
 def train(evidence: Evidence) -> tuple[Ramps, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import Any
@@ -12,12 +11,8 @@ import pytest
 import torch
 from scipy.stats import spearmanr
 
-from benchmarks.worlds.calibration import auroc, calibration_table
-from benchmarks.worlds.comparing import compared_line
-from benchmarks.worlds.look_alikes import LOOK_ALIKE
-from benchmarks.worlds.reliability import reliability_diagram
-from benchmarks.worlds.similar_objects import SIMILAR
 from benchmarks.worlds.training import Evidence, train, trained
+from benchmarks.worlds.trust import auroc, is_right, reliability_diagram, trust_table
 from regnf_core.robust.verdict.answer import LEAD, ProbabilityModel
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
@@ -27,17 +22,28 @@ NAMES = list(SPEAKS_FOR)
 def row(
     number: int, error: float, winner: bool = True, others: tuple[int, ...] = (), **features: float
 ) -> dict[str, Any]:
-    """A pose of one of five worlds with this error; features that are not named are .5."""
+    """A pose of one of eight worlds with this error; features that are not named are .5. ``others``: where the other
+    candidates stand, which are other answers."""
+    places = sorted([0, *others])
     return {
         "features": dict.fromkeys(NAMES, 0.5) | features,
         "model": "chair",
+        "question": "right",
+        "observed": True,
+        "observed_by": "images",
+        "scene": "tsdf",
+        "length": "long",
+        "case": number,
         "mssd": error,
         "listed_mssd": error,
+        "seen_difference": 1.0,
         "winner": winner,
         "found": True,
         "others": list(others),
+        "moved": [0.0 if place == 0 else 1.0 for place in places],
+        "same": [1.0 if place == 0 else 0.0 for place in places],
         "score": 0.3,
-        "world": f"tsdf-{number % 5}-long",
+        "world": f"tsdf-{number % 8}-long",
     }
 
 
@@ -79,79 +85,87 @@ def test_a_feature_that_speaks_the_wrong_way_does_not_count() -> None:
     assert "hidden" not in model.to_dict()["terms"]  # more that is hidden must not make a pose likelier
 
 
-def test_a_lead_over_other_answers_counts() -> None:
+def pairs(count: int, seed: int) -> list[dict[str, Any]]:
     """Pairs of candidates that look alike, one of them right or none: the one that lies ahead of the other is right."""
-    draw = np.random.default_rng(4)
+    draw = np.random.default_rng(seed)
     rows = []
-    for number in range(400):
-        ahead = number % 2 == 0
+    for number in range(count):
+        ahead = draw.random() < 0.5
         first, second = draw.uniform(0.6, 0.9), draw.uniform(0.1, 0.3) if ahead else draw.uniform(0.6, 0.9)
         for error, step, confirmed in ((RIGHT if ahead else WRONG, 1, first), (WRONG, -1, second)):
             noise = dict(zip(NAMES, draw.uniform(0.4, 0.6, len(NAMES)), strict=True))
             rows.append(row(number, error, step == 1, (step,), **noise | {"confirmed": confirmed}))
-    alone = trained(rows)
-    among = trained(rows, alone=ProbabilityModel.from_dict(alone.model["alone"]))
-    assert LEAD in among.model["among"]["terms"]
-    assert LEAD not in alone.model["alone"]["terms"]
-    assert _auroc_of(among.table) > 0.95 > _auroc_of(alone.table)
+    return rows
 
 
-def _auroc_of(table: str) -> float:
-    return float(table.split("AUROC ")[1].split(",")[0])
+def test_a_lead_over_other_answers_counts() -> None:
+    found = trained(pairs(400, 4))
+    assert LEAD in found.models["observed"]["terms"]
+    assert LEAD not in found.models["alone"]["terms"]
+    assert len(found.answers) == 400
+    right = np.array([is_right(one) for one in found.answers])
+    assert auroc(np.array([one["probability"] for one in found.answers]), right) > 0.95
 
 
-@pytest.mark.parametrize("model", [LOOK_ALIKE, SIMILAR])
-def test_what_is_nearly_the_right_object_is_told_in_the_table_alone(model: str) -> None:
-    rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(100)]
-    alike = [{**one, "model": model, "mssd": 9.0, "listed_mssd": 9.0} for one in rows[1::2]]
+def test_each_kind_of_scene_has_a_model_of_its_own() -> None:
+    rows = pairs(160, 5)
+    of_frames = [{**one, "scene": "frames", "case": 1000 + one["case"]} for one in rows]
+    of_nothing = [{**one, "observed": False, "case": 2000 + one["case"]} for one in rows]
+    assert set(trained([*rows, *of_frames, *of_nothing]).models) == {"alone", "observed", "unobserved", "thing"}
+
+
+def test_nothing_is_learned_from_a_wrong_object_that_was_not_seen_to_differ() -> None:
+    rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(160)]
+    hidden = {"question": "part more", "mssd": 0.1, "listed_mssd": 0.1, "seen_difference": 0.0}
+    alike = [{**one, **hidden, "case": 1000 + one["case"]} for one in rows[1::2]]
     without, with_alike = trained(rows), trained([*rows, *alike])
-    assert with_alike.model == without.model
-    assert with_alike.table.startswith(without.table)
-    assert "accepted of 50: 50 at 0.8" in with_alike.table
+    for name, term in without.models["observed"]["terms"].items():
+        assert with_alike.models["observed"]["terms"][name]["values"] == pytest.approx(term["values"], abs=0.02)
+    table = trust_table(with_alike.answers)
+    assert "| part more | 80 | 0 | 0 of 0 | 0 of 0 | 80 of 80 |" in table
+    seen = [{**one, "seen_difference": 0.05} for one in alike]
+    assert max(one["probability"] for one in trained([*rows, *seen]).answers) < 0.7, "half of such answers are wrong"
 
 
-def test_nothing_is_learned_of_rows_that_are_measured() -> None:
-    rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(100)]
-    turned = [{**one, "mssd": WRONG, "listed_mssd": WRONG} for one in rows[1::2]]
-    similar = [{**one, "model": SIMILAR} for one in turned[:7]]
-    plain, measured = trained(rows), trained(rows, measured=[*turned, *similar])
-    assert measured.model == plain.model
-    assert measured.diagram == plain.diagram
-    assert measured.table.startswith(plain.table)
-    assert "accepted of 7: 7 at 0.8" in measured.table
+def answered(probability: float, error: float, **told: Any) -> dict[str, Any]:
+    return row(0, error) | {"probability": probability, "verdict": "registered"} | told
 
 
-def test_candidates_are_compared_by_hand() -> None:
-    """Four cases of both objects: the right one ahead, behind, ahead but rejected, and at a wrong pose, which does not
-    count; a fifth case has the right object alone."""
-
-    def best(case: int, model: str, score: float, verdict: str = "registered", error: float = RIGHT) -> dict[str, Any]:
-        return row(0, error) | {"case": case, "model": model, "verdict": verdict, "score": score}
-
+def test_the_table_counts_answers_by_hand() -> None:
     rows = [
-        best(0, "chair", 0.1), best(0, SIMILAR, 0.2),
-        best(1, "chair", 0.2), best(1, SIMILAR, 0.1),
-        best(2, "chair", 0.1, "rejected"), best(2, SIMILAR, 0.2),
-        best(3, "chair", 0.1, error=WRONG), best(3, SIMILAR, 0.2),
-        best(4, "chair", 0.1),
+        answered(0.99, RIGHT), answered(0.95, RIGHT), answered(0.95, 0.07), answered(0.2, RIGHT), answered(0.1, WRONG),
+        answered(0.95, WRONG, listed_mssd=RIGHT),  # one of those that it lists is right
+        answered(0.99, WRONG, question="other"), answered(0.99, WRONG, question="longer", seen_difference=0.01),
+        answered(0.99, RIGHT, winner=False), answered(0.99, RIGHT, found=False),
     ]  # fmt: skip
-    line = compared_line(SIMILAR, rows, np.zeros(len(rows)))
-    assert line == "By what candidates are compared by, the right object comes first in 1 of 3.\n"
-    by_odds = compared_line(SIMILAR, rows, np.array([0.0, 9.0, 9.0, 0.0, 0, 0, 0, 0, 0]))
-    assert "in 1 of 3" in by_odds  # the first two cases change places
-    assert compared_line(LOOK_ALIKE, rows, np.zeros(len(rows))) == ""
+    table = trust_table(rows)
+    assert "8 registrations of 1 worlds." in table
+    kinds = (
+        "| noisy cameras, long | 6 | 4 of 6 (66.7 %) | 3 of 6 (50.0 %) | 1 of 4 | 75.1 % | 1 of 6 (16.7 %) | 0 of 1 |"
+    )
+    assert kinds in table
+    assert "| noisy cameras, long | 7 | 4 of 7 (57.1 %) | 3 of 7 (42.9 %) | 2 of 5 | 81.1 % |" in table
+    assert "| longer | 1 | 0 | 0 of 0 | 0 of 0 | 1 of 1 |" in table
+    assert "| other | 1 | 0 | 1 of 1 | 1 of 1 | 0 of 0 |" in table
 
 
-def test_the_table_counts_what_was_chosen() -> None:
+def test_variants_are_counted_by_what_tells_them_apart() -> None:
+    apart = {"differs": 0.1, "seen": 0.05, "favor": 0.5, "distinguishable": True}
+    alike = {**apart, "seen": 0.0, "favor": 0.0, "distinguishable": False}
+    variant = {"question": "part more"}
+    for_the_variant = apart | {"favor": -1.0}
     rows = [
-        {"winner": True, "mssd": 0.01, "world": "a"},
-        {"winner": True, "mssd": 0.07, "world": "a"},
-        {"winner": True, "mssd": 0.5, "world": "b"},
-        {"winner": False, "mssd": 0.01, "world": "b"},
-    ]
-    table = calibration_table(rows, np.array([4.0, 3.0, -4.0, 5.0]))
-    assert "3 registrations of 2 worlds, 1 with a right pose. AUROC 1.0000" in table
-    assert "| 0.9 | 1 of 1 | 5 % | 1 of 2 | 97.5 % | 0 |" in table
+        answered(0.5, WRONG, **variant, difference=apart), answered(0.5, WRONG, **variant, difference=for_the_variant),
+        answered(0.5, WRONG, **variant, difference=alike, seen_difference=0.0),
+        answered(0.5, WRONG, **variant, difference=apart, seen_difference=0.0),
+        answered(0.5, RIGHT, **variant, difference=apart),  # its surface is within the tolerance: no other object
+    ]  # fmt: skip
+    said = trust_table(rows)
+    assert (
+        "candidates: 4. Said to be distinguishable: 3; of these, what was seen speaks for the right one in 2 of 3"
+        in said
+    )
+    assert "not seen in 2; of these, said not to be distinguishable: 1 of 2" in said
 
 
 @pytest.mark.parametrize(("scores", "expected"), [([1.0, 2.0, 3.0, 4.0], 1.0), ([4.0, 1.0, 1.0, 2.0], 0.375)])
@@ -159,11 +173,9 @@ def test_auroc_by_hand(scores: list[float], expected: float) -> None:
     assert auroc(np.array(scores), np.array([False, False, True, True])) == pytest.approx(expected)
 
 
-def test_the_diagram_shows_what_was_said_over_what_was_right() -> None:
-    """Four poses of .75, three of them right; one that no registration chose is not drawn."""
-    rows = [{"winner": True, "mssd": RIGHT if number else WRONG, "world": "a"} for number in range(4)]
-    logits = np.full(5, math.log(3.0))
-    drawn = reliability_diagram([*rows, {"winner": False, "mssd": RIGHT, "world": "a"}], logits)
+def test_the_diagram_shows_what_was_told_over_what_was_right() -> None:
+    """Four answers of .75, three of them right."""
+    drawn = reliability_diagram("a", [answered(0.75, RIGHT if number else WRONG) for number in range(4)])
     picture = ElementTree.fromstring(drawn)
     square, *points = picture.findall(".//{*}rect[@class='frame']") + picture.findall(".//{*}circle")
     assert len(points) == 1

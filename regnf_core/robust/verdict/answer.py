@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.geometry.metrics import distinct
+from regnf_core.geometry.metrics import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE, MODEL, VERDICT
 from regnf_core.robust.model import ObjectModel, SelfSymmetry
@@ -99,9 +99,7 @@ def _alike(symmetry: SelfSymmetry) -> Sim3:
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
-_ALONE = "probability-alone.json"
-_AMONG = {True: "probability-observed.json", False: "probability-unobserved.json"}
-_OF_THING = "probability-thing.json"
+_MODELS = "probability.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,12 +176,15 @@ class PoseOdds:
 def pose_odds(observed: bool, of_thing: bool = False) -> PoseOdds:
     """The models that are shipped. observed: whether it is known what was seen of the scene · of_thing: whether a
     detection said which surface is the thing's."""
-    among = _stored(_OF_THING if of_thing else _AMONG[observed], "among")
-    return PoseOdds(_stored(_ALONE, "alone"), among, None if observed else _stored(_AMONG[True], "among"))
+    models = _stored()
+    among = models["thing" if of_thing else "observed" if observed else "unobserved"]
+    return PoseOdds(models["alone"], among, None if observed else models["observed"])
 
 
-def _stored(name: str, model: str) -> ProbabilityModel:
-    return ProbabilityModel.from_dict(json.loads(files(__package__).joinpath(name).read_text())[model])
+@cache
+def _stored() -> dict[str, ProbabilityModel]:
+    stored = json.loads(files(__package__).joinpath(_MODELS).read_text())
+    return {name: ProbabilityModel.from_dict(model) for name, model in stored.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +206,26 @@ class Answer:
     probability_alone: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """How H poses lie to each other, each (H, H).
+
+    moved: how far the second places the object from the first, diameters · apart: bool, whether they are other answers,
+    see `apart` · same: see `same_surface`.
+    """
+
+    moved: Tensor
+    apart: Tensor
+    same: Callable[[int, int], float]
+
+    @classmethod
+    def of(cls, model: ObjectModel, T: Sim3) -> Relations:
+        """Of poses of an object."""
+        points = model.extremal_points
+        moved = torch.stack([displacement(T, one, points) for one in T])
+        return cls(moved, apart(T, points, model.symmetry), lambda one, other: same_surface(model, T, one, other))
+
+
 def choose(
     problem: RegistrationProblem,
     candidates: PoseCandidates,
@@ -215,25 +236,38 @@ def choose(
     """The answer from the candidates' features, each (H,), and scores (H,), all on the CPU."""
     observation = problem.view.observation
     odds = pose_odds(observation is not None, observation is not None and observation.of_thing)
+    return answer_of(odds, features, scores, Relations.of(problem.model, candidates.T), rival_margin)
+
+
+def answer_of(
+    odds: PoseOdds, features: dict[str, Tensor], scores: Tensor, poses: Relations, rival_margin: float
+) -> Answer:
+    """The answer among poses of which these relations are known."""
     alone, scores = odds.alone.logit(features), scores.double()
     demerits = -merits(alone, scores)
     winner = int(demerits.argmin())
     close = scores <= scores[winner] + rival_margin + VERDICT.rival_margin_per_score * scores[winner]
     close &= alone >= alone[winner] - VERDICT.rival_log_odds
-    points = problem.model.extremal_points
-    ranked = distinct(candidates.T, demerits, points, VERDICT.rivals_min_distance, len(candidates))
-    rivals = [number for number in ranked.tolist() if number != winner and close[number]]
-    elsewhere = apart(candidates.T, points, problem.model.symmetry)
-    likely_alone = odds.log_odds(features, scores, elsewhere).sigmoid()
-    alike = [number for number in rivals if _places_the_same(problem.model, candidates.T, number, winner)]
-    likely = odds.log_odds(features, scores, apart_from_answer(elsewhere, [winner, *alike])).sigmoid()
+    rivals = [one for one in _distinct(demerits, poses.moved) if one != winner and close[one]]
+    likely_alone = odds.log_odds(features, scores, poses.apart).sigmoid()
+    alike = [one for one in rivals if poses.same(one, winner) >= VERDICT.min_same_surface]
+    likely = odds.log_odds(features, scores, apart_from_answer(poses.apart, [winner, *alike])).sigmoid()
     return Answer(winner, rivals, scores, demerits, likely, likely_alone)
 
 
-def _places_the_same(model: ObjectModel, T: Sim3, one: int, other: int) -> bool:
-    """Whether two of the poses T (H,) place nearly the same surface in the scene, as the poses of an object do that
-    looks nearly the same when it is turned. Other poses that fit alike speak against all of them: another object's do.
-    """
+def _distinct(demerits: Tensor, moved: Tensor) -> list[int]:
+    """Numbers of the poses, the best first, but for those that lie close to a better one."""
+    chosen: list[int] = []
+    for number in demerits.argsort().tolist():
+        if all(float(moved[one, number]) >= VERDICT.rivals_min_distance for one in chosen):
+            chosen.append(number)
+    return chosen
+
+
+def same_surface(model: ObjectModel, T: Sim3, one: int, other: int) -> float:
+    """Share of the object's surface that two of the poses T (H,) place on its surface by the other one: of an object
+    that looks nearly the same when it is turned, nearly all. Other poses that fit alike speak against all of them:
+    another object's do."""
     moved = (T[one] @ T[other].inverse()).apply(model.samples.on_surface().double()).float()
     distances, _ = model.distance_grid.value_and_gradient(moved)
-    return float((distances.abs() <= EVIDENCE.agreement).float().mean()) >= VERDICT.min_same_surface
+    return float((distances.abs() <= EVIDENCE.agreement).float().mean())

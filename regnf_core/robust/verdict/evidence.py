@@ -331,9 +331,9 @@ def _worst(problem: RegistrationProblem, r: Residuals, groups: _Groups, within: 
     r1, r2 = ((one.abs() / EVIDENCE.coarse).clamp_max(1.0) for one in (r.scene_to_object, r.object_to_scene))
     turned = (r.cosines[:, n:] < EVIDENCE.min_inlier_cosine).to(r2)
     return {
-        "worst_of_object": _worst_place(r2, groups.visible, of_object),
-        "worst_of_scene": _worst_place(r1, within & groups.near, of_scene),
-        "worst_normals": _worst_place(turned, groups.visible, of_object),
+        "worst_of_object": worst_place(r2, groups.visible, of_object),
+        "worst_of_scene": worst_place(r1, within & groups.near, of_scene),
+        "worst_normals": worst_place(turned, groups.visible, of_object),
     }
 
 
@@ -342,13 +342,20 @@ def _neighbors(points: Tensor) -> Tensor:
     return NearestNeighbors(points).query_several(points, EVIDENCE.place_samples)[1]
 
 
-def _worst_place(values: Tensor, counts: Tensor, neighbors: Tensor) -> Tensor:
-    """(H,): a high quantile of the means of the values (H, N) over the neighbors (N, K) that count (H, N)."""
+def worst_place(
+    values: Tensor,
+    counts: Tensor,
+    neighbors: Tensor,
+    least: int = EVIDENCE.least_in_place,
+    quantile: float = EVIDENCE.worst_quantile,
+) -> Tensor:
+    """(H,): a high quantile of the means of the values (H, N) over the neighbors (N, K) that count (H, N), where at
+    least so many do."""
     weight = counts.to(values)
     beside = weight[:, neighbors].sum(-1)
     mean = (values * weight)[:, neighbors].sum(-1) / beside.clamp_min(1.0)
-    mean = torch.where(counts & (beside >= EVIDENCE.least_in_place), mean, 0.0)
-    return mean.quantile(EVIDENCE.worst_quantile, dim=1)
+    mean = torch.where(counts & (beside >= least), mean, 0.0)
+    return mean.quantile(quantile, dim=1)
 
 
 # By how much another shape would fit better: one that is longer along some axis, or sheared.

@@ -88,6 +88,11 @@ def test_coarse_agreement_by_hand(scene_to_object: list[float], object_to_scene:
 
 FREE = evidence_of([0.0] * 10, [0.0] * 7 + [0.1] * 3)
 """Three tenths of the object are where the scene is free."""
+HIDDEN = evidence_of([0.0] * 10, [0.0] + [-0.2] * 9)
+HALF = evidence_of([0.0] * 5 + [0.06] * 5, [0.0] * 10)
+"""Half of what stands there is another shape."""
+AMONG = evidence_of([0.0] * 5 + [0.5] * 10, [0.0] * 10)
+"""Most of what stands in the box is something else."""
 
 
 @given(probability=st.floats(0.0, 1.0), least=st.floats(0.0, 1.0), rivals=st.integers(0, 3), alike=st.booleans())
@@ -137,13 +142,11 @@ def test_a_pose_outside_of_the_detection_is_rejected_first() -> None:
 @pytest.mark.parametrize(
     ("evidence", "unexplained", "reason", "said"),
     [
-        (evidence_of([0.0] * 10, [0.0] + [-0.2] * 9), 0.0, "TOO_LITTLE_SURFACE", "occluded share 0.9, usual is 0.85 or less"),
+        (HIDDEN, 0.0, "TOO_LITTLE_SURFACE", "occluded share 0.9, usual is 0.85 or less"),
         (FREE, 0.0, "FREE_SPACE_VIOLATED", "share in free space 0.3, usual is 0.2 or less"),
-        # Half of what stands there is another shape; of the object, half does not agree.
-        (evidence_of([0.0] * 5 + [0.06] * 5, [0.0] * 10), 0.0, "LOW_OVERLAP", "scene inliers 0.5, usual is 0.6 or more"),
+        (HALF, 0.0, "LOW_OVERLAP", "scene inliers 0.5, usual is 0.6 or more"),
         (ALIKE, 0.3, "SURFACE_UNEXPLAINED", "unexplained share 0.3, usual is 0.1 or less"),
-        # Most of what stands in the box is something else.
-        (evidence_of([0.0] * 5 + [0.5] * 10, [0.0] * 10), 0.0, "SCENE_UNEXPLAINED", "explained share 0.333, usual is 0.4 or more"),
+        (AMONG, 0.0, "SCENE_UNEXPLAINED", "explained share 0.333, usual is 0.4 or more"),
         (ALIKE, 0.0, "LOW_PROBABILITY", ""),
     ],
 )  # fmt: skip

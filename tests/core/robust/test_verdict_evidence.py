@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.constants import EVIDENCE
@@ -19,9 +20,9 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.scene import view_scene
 from regnf_core.robust.verdict.answer import Answer, choose, pose_odds
-from regnf_core.robust.verdict.evidence import SPEAKS_FOR, coverage, pose_features, unexplained_samples
+from regnf_core.robust.verdict.evidence import SPEAKS_FOR, coverage, pose_features, unexplained_samples, worst_place
 from regnf_core.robust.working_frame import Samples
-from tests.core.analytic import boxes, chair, chair_pose, room
+from tests.core.analytic import boxes, chair, chair_pose, room, union
 from tests.core.robust.shapes import detection
 
 # How much of the object the agreement covers: patches counted by hand, and against a slow count.
@@ -286,3 +287,47 @@ def test_what_is_known_of_the_scene_decides_on_the_model(observation: object | N
     said, other = (pose_odds(known).log_odds(features, scores, apart).sigmoid()[0] for known in (True, False))
     assert said != other
     assert float(found.probability[0]) == pytest.approx(float(said if observation else other), abs=1e-9)
+
+
+# Where the surfaces disagree most, and by how much another shape would fit better.
+
+
+@pytest.mark.parametrize("growth", [1.0, 1.06])
+def test_a_longer_object_is_a_stretch(growth: float) -> None:
+    """A box in a room of its own, against a box that is longer along x."""
+    half = torch.tensor([0.3, 0.2, 0.25])
+    there = boxes([((-half).tolist(), half.tolist())])
+    longer = half * torch.tensor([growth, 1.0, 1.0])
+    obj = boxes([((-longer).tolist(), longer.tolist())])
+    box = OrientedBox(torch.zeros(3).double(), 2.0 * half.double(), torch.eye(3).double())
+    problem = make_problem(view_scene(there, box, OPTIONS), model_object(obj, OPTIONS), there, obj, OPTIONS)
+    found = features_at(problem, problem.in_working_frames(Sim3.identity()))
+    assert found["stretch"] == pytest.approx(growth - 1.0, abs=0.006)
+
+
+def test_the_worst_place_by_hand() -> None:
+    """Two poses, ten samples, each with its two neighbors: of the first pose, one place disagrees wholly."""
+    neighbors = torch.arange(10)[:, None] + torch.tensor([0, 1, 2])
+    neighbors = neighbors.clamp_max(9)
+    values = torch.zeros(2, 10)
+    values[0, 3:6] = 1.0
+    values[1, ::2] = 0.5
+    counts = torch.ones(2, 10, dtype=torch.bool)
+    worst = worst_place(values, counts, neighbors, least=3, quantile=1.0)
+    torch.testing.assert_close(worst, torch.tensor([1.0, 1.0 / 3.0]))
+    counts[0, 4] = False  # what was not seen does not count, nor do places with too little else
+    torch.testing.assert_close(
+        worst_place(values, counts, neighbors, least=3, quantile=1.0)[0], torch.tensor(1.0 / 3.0)
+    )
+    torch.testing.assert_close(worst_place(values, counts, neighbors, least=2, quantile=1.0)[0], torch.tensor(1.0))
+
+
+def test_a_part_more_disagrees_in_its_place(problem: RegistrationProblem) -> None:
+    right = features_at(problem, truth(problem))
+    for name in ("worst_of_object", "worst_of_scene", "worst_normals"):
+        assert right[name] < 0.3, name
+    scene, obj = room(chair_pose()), union([chair(), boxes([([-0.25, -0.25, 0.35], [-0.05, -0.05, 0.45])])])
+    other = make_problem(problem.view, model_object(obj, OPTIONS), scene, obj, OPTIONS)
+    wrong = features_at(other, other.in_working_frames(chair_pose()))
+    assert wrong["worst_of_object"] > 0.8
+    assert wrong["object_agrees"] > 0.85, "the share of all samples hardly tells it"
