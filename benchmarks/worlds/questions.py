@@ -68,7 +68,7 @@ class Question:
 
     def errors(self, problem: RegistrationProblem, T: Sim3) -> list[float]:
         """Of poses (H,) between the working frames, diameters of the object: MSSD of the right object; of others, how
-        far 2 % of either surface, the object's as it is placed and the true one, are off the other at least."""
+        far half a percent of both surfaces, the object's as it is placed and the true one, are off the other at least."""
         truth = self.known.case.truth
         assert truth is not None
         if self.asked.case.obj is self.known.case.obj:
@@ -76,7 +76,7 @@ class Question:
                 NearestTruth(problem, truth, self.known.points, self.known.case.symmetries).errors(T).tolist()
             )
             return found
-        return [float(np.quantile(far, 0.98)) for far in self._differences(problem, T)]
+        return [float(np.quantile(far, 0.995)) for far in self._differences(problem, T)]
 
     def seen_difference(self, problem: RegistrationProblem, T: Sim3) -> tuple[float, float]:
         """Of one pose: the share of both surfaces that differs, and the share that differs and was seen."""

@@ -138,6 +138,7 @@ def trained(rows: Sequence[Row]) -> Trained:
     chosen = _answers(rows, ProbabilityModel.from_dict(models["alone"]))
     kinds = np.array([_model_of(row) for row in rows])
     answers: list[Row] = []
+    told_of = {_key(row): row for row in rows if row["winner"] and row["found"]}  # of the engine's own answers
     for kind in sorted(set(kinds[chosen.found])):
         of_kind = kinds == kind
         beside = (kinds == "observed") & (kind == "thing")
@@ -149,7 +150,9 @@ def trained(rows: Sequence[Row]) -> Trained:
         models[kind] = model.to_dict()
         for number in np.flatnonzero(of_kind & chosen.winner):
             said = {"probability": float(1.0 / (1.0 + np.exp(-odds[number]))), "winner": True}
-            answers.append({**rows[number], **said, "listed_mssd": float(chosen.listed[number])})
+            answers.append(
+                {**told_of[_key(rows[number])], **rows[number], **said, "listed_mssd": float(chosen.listed[number])}
+            )
     return Trained(models, answers)
 
 
