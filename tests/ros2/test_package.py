@@ -42,6 +42,7 @@ def result(verdict: str = "registered", alternatives: tuple[Sim3, ...] = ()) -> 
         "alternatives": [{"T_object_scene": one.to_dict()} for one in alternatives],
         "covariance": (1e-4 * np.eye(7)).tolist(),
         "probability": 0.97,
+        "level": "default",
     }
 
 
