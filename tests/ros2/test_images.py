@@ -349,7 +349,7 @@ def test_a_map_that_tf_does_not_know_at_that_time_is_said(robot: Robot, monkeypa
 def test_several_detections_of_one_image_are_one_array(robot: Robot) -> None:
     things = [("lamp", OUTLINE), ("coffee cup", OUTLINE), ("chair", OUTLINE)]
     array = robot.see(masks(12.5, (H, W), *things))
-    assert [one.id.partition("/scale")[0] for one in array.detections] == ["coffee cup/1", "chair/2"]
+    assert [one.id.partition("/level")[0] for one in array.detections] == ["coffee cup/1", "chair/2"]
     assert [robot.answers.json("request", n)["object"] for n in (0, 1)] == [CUP, CHAIR]
     assert robot.answers.sent[0]["depth"] == robot.answers.sent[1]["depth"]
     assert robot.answers.deleted == [f"/recordings/{FRAME}"]
