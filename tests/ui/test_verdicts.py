@@ -44,15 +44,8 @@ def test_numbers_are_the_documents(visit: Visit) -> None:
     page.locator("input[name=direction][value=T_object_scene]").check(force=True)
     expect(page.locator("#matrix")).not_to_have_text(before, use_inner_text=True)
     assert_matrix(page, result["T_object_scene"]["matrix"])
-    for figure in (
-        "97.3 %",
-        "; level default",
-        "1.6000",
-        "93.1 %",
-        "0.41 %",
-        "12.3 s",
-        "14.0 s",
-    ):  # created 20:26:40, finished 20:26:54
+    # created 20:26:40, finished 20:26:54
+    for figure in ("97.3 %", "; level default", "1.6000", "93.1 %", "0.41 %", "12.3 s", "14.0 s"):
         expect(page.locator("#figures")).to_contain_text(figure)
     expect(page.locator("#time-total")).to_have_text("12.3 s of 14.0 s from request to result")
     about = json.loads((WEB / "metrics.json").read_text(encoding="utf-8"))
