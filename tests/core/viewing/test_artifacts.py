@@ -107,7 +107,7 @@ def test_a_ranking_is_told_with_what_is_unusable_last() -> None:
     assert (chair["object"], chair["verdict"], chair["verdict_reason"]) == ("chair", "registered", "SURFACES_AGREE")
     assert stool == {
         "object": "stool", "stage": "coarse", "score": None, "verdict": None, "verdict_reason": None,
-        "probability": None, "level": None, "T_scene_object": None, "T_object_scene": None,
+        "probability": None, "level": None, "difference": None, "T_scene_object": None, "T_object_scene": None,
     }  # fmt: skip
     assert (air["object"], air["stage"], air["verdict_reason"]) == ("air", "unusable", "NO_SURFACE_IN_OBJECT")
     assert set(air) == set(stool)
