@@ -27,7 +27,7 @@ def line_of(pair: dict, outcome) -> str:
         return json.dumps({"id": pair["id"], "error": outcome.error.reason})
     result = outcome.result
     pose = result.T_scene_object.to_dict()
-    told = {"verdict": result.verdict, "reason": result.verdict_reason, "probability": result.probability}
+    told = {name: getattr(result, name) for name in ("verdict", "verdict_reason", "probability", "level")}
     return json.dumps({"id": pair["id"], **told, "T_scene_object": pose})
 
 

@@ -30,8 +30,8 @@ def told(result: regnf.PairResult) -> dict:
     if result.error is not None:
         return {"key": result.key, "reason": result.error.reason, "hint": result.error.hint}
     poses = [result.T_object_scene, *(other.T_object_scene for other in result.alternatives)]
-    probability = result.metrics.get("probability")
-    return {"key": result.key, "job": result.job, "probability": probability, "poses": [one.tolist() for one in poses]}
+    sure = {"probability": result.probability, "level": result.level}
+    return {"key": result.key, "job": result.job, **sure, "poses": [one.tolist() for one in poses]}
 
 
 if len(sys.argv) != 4 or not Path(sys.argv[2]).is_file():

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from regnf_cli.guard import require
-from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, fail, out, reporting, show_pose, tell
+from regnf_cli.report import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, fail, in_percent, out, reporting, show_pose, tell
 from regnf_cli.serve import demo_folder
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ def _show(found: Result) -> bool:
     result = found.document
     out.print(f"verdict      {result['verdict']} ({result['verdict_reason']})")
     out.print(f"             {result['verdict_detail']}")
+    out.print(f"probability  {in_percent(result)}")
     show_pose(result)
     metrics = result["metrics"]
     errors = [

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeElapsedColumn
 from rich.table import Table
 
+from regnf_core.document import level_in_words
 from regnf_core.errors import Candidate, RegnfError, Said, hint_of
 
 # What the commands share for talking to people and to programs.
@@ -112,9 +113,9 @@ def show_result(document: dict[str, Any]) -> None:
     )
     if detail := document.get("verdict_detail"):
         _line("", detail)
-    if (probability := document.get("probability")) is not None:
-        meant = "one of the poses listed" if verdict == "ambiguous" else "the pose"
-        _line("probability", f"{100 * probability:.1f} % that {meant} is right")
+    meant = "one of the poses listed" if verdict == "ambiguous" else "the pose"
+    if sure := in_percent(document, f" that {meant} is right"):
+        _line("probability", sure)
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
     for name in ("scene", "object"):
@@ -130,6 +131,14 @@ def show_result(document: dict[str, Any]) -> None:
         out.print(table)
     for name, value in (document.get("metrics") or {}).items():
         _line(f"{name:<28}", f"{value:.6g}" if isinstance(value, float) else str(value))
+
+
+def in_percent(told: dict[str, Any], meant: str = "") -> str:
+    """Probability and level of a result or a candidate: `99.8 % (strict)`; "" where there is none."""
+    if told.get("probability") is None:
+        return ""
+    level = f" ({level_in_words(told['level'])})" if "level" in told else ""
+    return f"{100 * told['probability']:.1f} %{meant}{level}"
 
 
 def show_pose(document: dict[str, Any]) -> None:
@@ -158,12 +167,12 @@ def show_pose(document: dict[str, Any]) -> None:
 
 def show_ranking(document: dict[str, Any], top: int) -> None:
     """Print the ``top`` most likely candidates of a search, and the files that are no objects."""
-    table = Table("", "object", "score", "verdict", title="candidates", title_justify="left", box=None)
+    table = Table("", "object", "score", "probability", "verdict", title="candidates", title_justify="left", box=None)
     ranked = [one for one in document["candidates"] if one["stage"] != "unusable"]
     for number, one in enumerate(ranked[:top], 1):
         score = "-" if one["score"] is None else f"{one['score']:.4f}"
         verdict = f"{one['verdict']} ({one['verdict_reason']})" if one["verdict"] else f"not refined ({one['stage']})"
-        table.add_row(str(number), escape(one["object"]), score, escape(verdict))
+        table.add_row(str(number), escape(one["object"]), score, in_percent(one), escape(verdict))
     out.print(table)
     if len(ranked) > top:
         _line("", f"and {len(ranked) - top} more")

@@ -4,7 +4,7 @@
 
     with Client("http://127.0.0.1:8080") as client:
         result = client.register("room.ckpt", "chair.glb", {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]})
-        print(result.verdict, result.probability, result.T_scene_object)
+        print(result.verdict, result.probability, result.level, result.T_scene_object)
 
 ``AsyncClient`` has the same methods, to be awaited.
 """

@@ -20,7 +20,7 @@ from regnf_core.detections.parsing import BoxLike
 from regnf_core.document import Verdict
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.field_source import FieldSource, Role
-from regnf_core.options import OptionsLike, options_of
+from regnf_core.options import Acceptance, OptionsLike, options_of
 
 PAIRS_AT_ONCE = 500
 _BYTES_AT_ONCE = 4 << 20
@@ -79,6 +79,7 @@ class PairResult(Document):
     verdict: Verdict | None = None
     verdict_reason: str | None = None
     probability: float | None = None
+    level: Acceptance | None = None
     T_scene_object: Matrix | None = None
     T_object_scene: Matrix | None = None
     center_scene: Array | None = None

@@ -11,8 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 from pydantic import Field as MemberField
 
-from regnf_core.document import AlternativeDocument, ArtifactEntry, CandidateDocument, ResultDocument, Verdict
+from regnf_core.document import (
+    AlternativeDocument,
+    ArtifactEntry,
+    CandidateDocument,
+    ResultDocument,
+    Verdict,
+    sure_in_words,
+)
 from regnf_core.errors import RegnfError
+from regnf_core.options import Acceptance
 
 Floats = NDArray[np.float64]
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
@@ -88,6 +96,8 @@ class Job(Document):
     progress: float = 0.0
     queue_position: int | None = None
     verdict: Verdict | None = None
+    probability: float | None = None
+    level: Acceptance | None = None
     object_found: str | None = None
     error: dict[str, Any] | None = None
     warnings: dict[str, list[str]] = {}
@@ -164,7 +174,8 @@ class Result(Document, ResultDocument):
         return moved
 
     def __repr__(self) -> str:
-        return f"Result({self.verdict}, {self.verdict_reason}, scale {self.scale:.4g}, job {self.job})"
+        sure = sure_in_words(self.probability, self.level)
+        return f"Result({self.verdict}, {self.verdict_reason}{sure}, scale {self.scale:.4g}, job {self.job})"
 
 
 class Rendering(Document):

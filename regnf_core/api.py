@@ -21,7 +21,7 @@ import regnf_core.batch as engine_batch
 import regnf_core.library as engine
 from regnf_core.batch import BatchOutcome, ModeledObject
 from regnf_core.detections.parsing import BoxLike, detection_of
-from regnf_core.document import Candidate, ProgressCallback, RegistrationResult, result_document
+from regnf_core.document import Candidate, ProgressCallback, RegistrationResult, result_document, sure_in_words
 from regnf_core.editing.compose import compose as engine_compose
 from regnf_core.editing.edited_scene import EditedScene
 from regnf_core.editing.edits import Edit
@@ -231,7 +231,7 @@ class Registered(RegistrationResult):
             raise InvalidInputError("the result has no point clouds to show", reason="NO_CLOUDS", hint=hint)
 
     def __repr__(self) -> str:
-        sure = "" if self.probability is None else f", probability {self.probability:.3f}"
+        sure = sure_in_words(self.probability, self.level)
         return f"<{self.verdict}: {self.verdict_reason}, scale {self.scale:.4g}{sure}>"
 
     def _repr_png_(self) -> bytes | None:
@@ -252,7 +252,8 @@ class Registered(RegistrationResult):
         png = self._repr_png_()
         data = "" if png is None else base64.b64encode(png).decode()
         picture = f"<img alt='registration' src='data:image/png;base64,{data}'>" if data else ""
-        words = f"<b>{escape(self.verdict)}</b>: {escape(reason)} Scale {self.scale:.4g}."
+        sure = sure_in_words(self.probability, self.level)
+        words = f"<b>{escape(self.verdict)}</b>: {escape(reason)} Scale {self.scale:.4g}{sure}."
         caption = "<caption>T_scene_object, the object's pose in the scene</caption>"
         return f"<div><p>{words}</p><table>{caption}{rows}</table>{picture}</div>"
 

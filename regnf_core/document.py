@@ -74,12 +74,13 @@ class Alternative(_Posed):
 
 @dataclass(frozen=True)
 class ConsideredPose(_Posed):
-    """One pose that was refined and judged by itself, whatever rivals it has. reason, limit: as of a verdict."""
+    """One pose that was refined and judged by itself, whatever rivals it has. reason, limit, level: as of a verdict."""
 
     T_object_scene: Sim3
     reason: str
     metrics: dict[str, float]
     limit: str = ""
+    level: Acceptance | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +203,7 @@ class Candidate:
     """What a search tells about one object.
 
     stage: the last stage that it reached · score: 0..1, smaller is better, comparable only within a stage. Verdict,
-    reason, transform and probability are those of a registration, for ``refined`` objects; None for the others.
+    reason, transform, probability and level are those of a registration, for ``refined`` objects; None for the others.
     difference: from the candidate that comes first, for other ``refined`` ones.
     """
 
@@ -213,12 +214,23 @@ class Candidate:
     verdict_reason: str | None = None
     T_object_scene: Sim3 | None = None
     probability: float | None = None
+    level: Acceptance | None = None
     difference: Difference | None = None
 
     @property
     def T_scene_object(self) -> Sim3 | None:
         """The object's pose in the scene; None for the others."""
         return None if self.T_object_scene is None else self.T_object_scene.inverse()
+
+
+def level_in_words(level: Acceptance | None) -> str:
+    """Of an answer that has a probability."""
+    return level or "below both levels"
+
+
+def sure_in_words(probability: float | None, level: Acceptance | None) -> str:
+    """To follow a verdict: `, probability 0.998 (strict)`; "" where there is no probability."""
+    return "" if probability is None else f", probability {probability:.3f} ({level_in_words(level)})"
 
 
 # The document: JSON values.
@@ -263,6 +275,7 @@ class ConsideredDocument(Outgoing):
     T_object_scene: TransformDocument
     reason: str = Field(description="As of a verdict: SURFACES_AGREE, or what speaks against it.")
     detail: str = Field(default="", description="The same in words.")
+    level: Acceptance | None = Field(default=None, description="That of `metrics.probability`, as the result's.")
     metrics: dict[str, float | None] = Field(default={})
 
 
@@ -303,6 +316,7 @@ class CandidateDocument(Outgoing):
     verdict: Verdict | None = Field(default=None, description="Of refined ones.")
     verdict_reason: str | None = Field(default=None, description="Of refined and unusable ones.")
     probability: float | None = Field(default=None, description="Of refined ones, as the result's.")
+    level: Acceptance | None = Field(default=None, description="Of refined ones, as the result's.")
     difference: DifferenceDocument | None = Field(
         default=None, description="Of refined ones but the first: what tells it from that."
     )
@@ -357,7 +371,7 @@ class ResultDocument(Outgoing):
 
     verdict: Verdict
     verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
-    verdict_detail: str = Field(default="", description="The reason in words, with the limit that it does not keep.")
+    verdict_detail: str = Field(default="", description="The reason in words, with the numbers behind it.")
     verdict_hint: str = Field(default="", description="What to do next, for people; empty for a registered result.")
     probability: float | None = Field(
         default=None,
@@ -490,6 +504,7 @@ def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) 
             verdict=one.verdict,
             verdict_reason=one.verdict_reason,
             probability=one.probability,
+            level=one.level,
             difference=None if one.difference is None else DifferenceDocument(**asdict(one.difference)),
             **_both_ways(one),
         )
@@ -504,7 +519,8 @@ def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) 
 
 def _considered(one: ConsideredPose) -> dict[str, Any]:
     detail = verdict_in_words(one.reason, one.limit)
-    found = ConsideredDocument(**_both_ways(one), reason=one.reason, detail=detail, metrics=_numbers(one.metrics))
+    metrics = _numbers(one.metrics)
+    found = ConsideredDocument(**_both_ways(one), reason=one.reason, detail=detail, level=one.level, metrics=metrics)
     return found.model_dump()
 
 

@@ -35,7 +35,7 @@ from regnf_core.robust.problem import RegistrationProblem, make_problem, pose_bo
 from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.search.bounds import start_rotations
 from regnf_core.robust.verdict.comparison import decides_for_other, difference
-from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
+from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates, level_of
 from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
 
@@ -124,10 +124,11 @@ def search_library(
     if clouds:
         with run.phase("exporting"):
             result = with_clouds(result, scene, first.field(), detection, cloud_region(detection))
-    told = (result.verdict, result.verdict_reason, result.T_object_scene, result.probability)
+    told = (result.verdict, result.verdict_reason, result.T_object_scene, result.probability, result.level)
     ranking = [Candidate(first.name, "refined", result.metrics["score"], *told)]
     for (other, number, _, _), apart in zip(refined[1:], told_apart, strict=True):
-        told = (other.found.verdict, other.found.reason, other.T, other.metrics["probability"])
+        likely = other.metrics["probability"]
+        told = (other.found.verdict, other.found.reason, other.T, likely, level_of(likely))
         ranking.append(Candidate(library[number].name, "refined", other.metrics["score"], *told, apart))
     listed = {number for _, number, _, _ in refined}
     ranking += [Candidate(library[number].name, "coarse", score) for score, number, _ in coarse if number not in listed]

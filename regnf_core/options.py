@@ -262,12 +262,21 @@ def seed_of(seed: Any) -> int:
     return found
 
 
+_LIMITS_OF_SHARES = {
+    *("share_limits_below", "min_inlier_share", "min_explained_share", "max_free_space_violations"),
+    *("max_occluded_share", "max_hidden_share"),
+}
+"""Options of earlier versions."""
+
+
 def did_you_mean(location: Sequence[str | int]) -> str:
-    """A hint for an unknown option: "; did you mean `up_axis`?", or nothing where no name is near.
+    """A hint for an unknown option: "; did you mean `up_axis`?", what does its work, or nothing where no name is near.
 
     location: the option's path below ``options``, as pydantic gives it.
     """
     *group, name = (str(part) for part in location)
+    if name in _LIMITS_OF_SHARES:
+        return "; the probability alone decides: see `robust.acceptance`"
     names = _names()
     elsewhere = [other for other, known in names.items() if name in known]
     if elsewhere:

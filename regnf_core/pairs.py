@@ -31,6 +31,7 @@ _MEMBERS = (
     "verdict",
     "verdict_reason",
     "probability",
+    "level",
     "T_scene_object",
     "T_object_scene",
     "center_scene",

@@ -109,6 +109,8 @@ class JobRecord(Closed):
     phase_since: float | None = None
     verdict: str | None = None
     """Of a successful job: what its result says."""
+    probability: float | None = None
+    level: str | None = None
     object_found: str | None = None
     """Of a successful search: the SHA-256 of the object that its result is about."""
     more_webhooks: list[str] = field(default_factory=list)

@@ -17,7 +17,7 @@ _MOVES: dict[str, frozenset[str]] = {
     "accepted": frozenset({"running", "failed", "dismissed"}),
     "running": frozenset({"successful", "failed", "dismissed"}),
 }
-_TOLD_BY_RESULT = frozenset({"verdict", "object_found"})
+_TOLD_BY_RESULT = frozenset({"verdict", "probability", "level", "object_found"})
 _CHANGEABLE_IN_JOB = _TOLD_BY_RESULT | {"status", "phase", "progress", "engine", "error", "inputs", "worker"}
 _CHANGEABLE_IN_FIELD = frozenset(
     {"state", "label", "description", "report", "error", "bytes", "symmetry", "original_until", "views", "drawings"}

@@ -27,7 +27,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.document import Considered, RegistrationResult
+from regnf_core.document import Considered, RegistrationResult, level_in_words
 from regnf_core.errors import InvalidInputError, verdict_hint, verdict_in_words
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
@@ -46,7 +46,8 @@ def verdict_text(result: RegistrationResult, object_name: str | None = None) -> 
     if object_name is not None:
         lines += [f"Object: `{object_name}`", ""]
     if result.probability is not None:
-        lines += [f"Probability that the answer is right: {_percent(result.probability)}", ""]
+        sure = f"{_percent(result.probability)}, {level_in_words(result.level)}"
+        lines += [f"Probability that the answer is right: {sure}", ""]
     lines += ["T_scene_object, the object's pose in the scene (object coordinates to scene coordinates):", "", "```"]
     lines += [" ".join(f"{value: .6f}" for value in row) for row in result.T_scene_object.matrix().tolist()]
     lines += ["```", ""]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageDraw, ImageFilter, ImageFont
 from scipy import ndimage
 
-from regnf_core.document import RegistrationResult
+from regnf_core.document import RegistrationResult, sure_in_words
 from regnf_core.fields.composite import near_origin
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import SdfField
@@ -213,9 +213,7 @@ def _covered(places: Floats, most: int) -> tuple[NDArray[np.int64], NDArray[np.i
 def _caption(sheet: Image.Image, result: RegistrationResult, place: str, others: int) -> None:
     draw = ImageDraw.Draw(sheet)
     assert result.camera is not None
-    heading = result.verdict.capitalize()
-    if result.probability is not None:
-        heading += f", probability {result.probability:.2f}"
+    heading = result.verdict.capitalize() + sure_in_words(result.probability, result.level)
     note = f"{result.camera.frame}: the object is {place}"
     if others:
         note += f"; blue: {others} other pose{'s' if others > 1 else ''}"

@@ -65,6 +65,7 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
     assert found[1]["verdict"] in ("registered", "ambiguous", "rejected")
     assert len(found[1]["T_object_scene"]["matrix"]) == len(found[1]["T_scene_object"]["matrix"]) == 4
     assert found[1]["probability"] == found[1]["metrics"]["probability"]
+    assert found[1]["level"] == "strict"
     assert found[1]["metrics"]["seconds"] > 0
     assert Path(found[5]["object"]).name == "armchair.safetensors"
     assert "3 failed" in outcome.stdout
@@ -172,7 +173,7 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
                 told = {"status": "successful", "verdict": "registered", "job": f"job {one['seed']}"}
                 matrix = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
                 back = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
-                poses = {"T_scene_object": back, "T_object_scene": matrix, "probability": 0.9}
+                poses = {"T_scene_object": back, "T_object_scene": matrix, "probability": 0.9, "level": "default"}
                 yield PairResult.model_validate({"index": index, **poses, **told})
 
     monkeypatch.setattr(regnf_client, "Client", Pretended)
@@ -181,4 +182,4 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
     found = {one["line"]: one for one in results(path)}
     assert (found[1]["job"], found[3]["job"], found[2]["status"]) == ("job 1", "job 3", "failed")
     assert [found[3][name]["scale"] for name in ("T_object_scene", "T_scene_object")] == pytest.approx([2.0, 0.5])
-    assert (found[3]["probability"], found[3]["key"]) == (0.9, "c")
+    assert (found[3]["probability"], found[3]["level"], found[3]["key"]) == (0.9, "default", "c")

@@ -101,12 +101,13 @@ def candidate(name: str, stage: str, score: float | None, verdict: str | None = 
 
 
 def test_a_ranking_is_printed_as_far_as_asked(capfd: pytest.CaptureFixture[str]) -> None:
-    first, second = candidate("[a]", "refined", 0.01, "registered"), candidate("b", "coarse", 0.2)
+    sure = {"probability": 0.412, "level": None}
+    first, second = candidate("[a]", "refined", 0.01, "rejected") | sure, candidate("b", "coarse", 0.2)
     rest = [candidate("c", "signature", None), candidate("air", "unusable", None)]
     show_ranking({"candidates": [first, second, *rest]}, 2)
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]
     assert lines[2:] == [
-        ["1", "[a]", "0.0100", "registered", "(BECAUSE)"],
+        ["1", "[a]", "0.0100", "41.2", "%", "(below", "both", "levels)", "rejected", "(BECAUSE)"],
         ["2", "b", "0.2000", "not", "refined", "(coarse)"],
         ["and", "1", "more"],
         ["no", "object:", "air", "(NO_SURFACE_IN_OBJECT)"],

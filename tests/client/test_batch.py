@@ -56,7 +56,7 @@ def test_results_come_with_the_keys_of_their_requests(world: World, working: Wor
     with Client("http://localhost", transport=transport) as client:
         found = list(client.batch(requests(world, 5), progress=lambda _, share: shares.append(share)))
         assert sorted((one.index, one.key) for one in found) == [(n, f"pair {n}") for n in range(5)]
-        assert {one.verdict for one in found} == {"registered"}
+        assert {(one.verdict, one.level) for one in found} == {("registered", "default")}
         assert np.allclose(found[0].T_object_scene, RESULT["T_object_scene"]["matrix"])  # type: ignore[index, arg-type]
         assert found[0].scale == pytest.approx(2.0)
         assert (found[0].error, shares[-1]) == (None, 1.0)

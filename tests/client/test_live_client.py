@@ -42,7 +42,8 @@ def found(live_stack: Live) -> Result:
 
 
 def test_a_pose_from_files(found: Result) -> None:
-    assert found.verdict == "registered"
+    assert (found.verdict, found.level) == ("registered", "strict")
+    assert "(strict)" in repr(found)
     assert np.abs(found.T_object_scene - TRUTH).max() < 0.01
     assert found.scale == pytest.approx(float(np.cbrt(np.linalg.det(TRUTH[:3, :3]))), rel=0.002)
     point = np.array([[0.1, 0.2, 0.3]])
@@ -114,7 +115,8 @@ def test_events_as_they_come(client: Client) -> None:
     events = list(client.watch(job))
     assert events[-1].data["status"] == "successful"
     assert {event.name for event in events} == {"status", "progress"}
-    assert client.job(job).verdict == client.result(job).verdict
+    told, result = client.job(job), client.result(job)
+    assert (told.verdict, told.probability, told.level) == (result.verdict, result.probability, "strict")
     assert job.id in {one.id for one in client.jobs("successful")}
 
 

@@ -38,7 +38,7 @@ def test_every_pair_becomes_one_job_and_one_result(world: World) -> None:
     assert [one["key"] for one in found] == [f"pair {number}" for number in range(6)]
     assert len({one["job"] for one in found}) == 6
     assert found[0]["T_object_scene"] == RESULT["T_object_scene"]
-    assert (found[0]["status"], found[0]["verdict"]) == ("successful", "registered")
+    assert [found[0][told] for told in ("status", "verdict", "level")] == ["successful", "registered", "default"]
     assert found[0]["metrics"] == {"residual_rms": 0.001, "seconds": 0.0}
 
 

@@ -37,6 +37,7 @@ def test_the_document_follows_the_record(world: World) -> None:
     assert "retry-after" not in answer.headers
     assert answer.json()["expires_at"] > answer.json()["finished_at"]
     assert answer.json()["links"]["result"] == f"/jobs/{job_id}/result"
+    assert [answer.json()[told] for told in ("verdict", "probability", "level")] == ["registered", 0.95, "default"]
 
 
 def test_waiting_ends_with_the_job(world: World) -> None:

@@ -112,7 +112,7 @@ def test_a_search_over_the_wire_finds_the_object_and_keeps_what_it_learned(
     assert sorted(one["object"] for one in result["candidates"]) == sorted(names)
     first = result["candidates"][0]
     assert first["stage"] == "refined"
-    assert all(first[told] == result[told] for told in ("T_scene_object", "T_object_scene", "probability"))
+    assert all(first[told] == result[told] for told in ("T_scene_object", "T_object_scene", "probability", "level"))
     for name in names:
         field = live_client.get(f"/fields/{name}").json()
         validator("FieldDocument").validate(field)

@@ -48,7 +48,7 @@ def transform(scale: float = 1.0) -> dict[str, Any]:
 
 
 RESULT = {
-    "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.95,
+    "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.95, "level": "default",
     "T_scene_object": transform(0.5), "T_object_scene": transform(2.0), "center_scene": [0.0, 0.0, 0.0],
     "center_object": [0.0, 0.0, 0.0], "alternatives": [], "metrics": {"residual_rms": 0.001}, "seed": 0,
 }  # fmt: skip
@@ -113,8 +113,9 @@ class World:
         listed = self._put(job_id, attempt, files)
         document = {"attempt": attempt, "artifacts": listed} | {name: list(files) for name, files in later.items()}
         self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
-        verdict = json.loads(files["result.json"]).get("verdict")
-        self.records.update_job(job_id, attempt, status="successful", verdict=verdict)
+        result = json.loads(files["result.json"])
+        told = {name: result.get(name) for name in ("verdict", "probability", "level")}
+        self.records.update_job(job_id, attempt, status="successful", **told)
 
     def finish(self, job_id: str, artifacts: dict[str, bytes]) -> None:
         """What it leaves behind of what was still to come."""

@@ -19,7 +19,6 @@ from tests.option_extremes import extremes, numeric_options
         ({"sampling": {"up_axis": "y"}}, "up_axis"),
         ({"initialisation": {"draws": 3}}, "initialization"),
         ({"optimization": {"regulariser_weight": 0.5}}, "optimization.regularizer_weight"),
-        ({"robust": {"max_hidden_share": 0.5}}, "robust.max_occluded_share"),
         ({"robust": {"rotation": 300}}, "robust.rotations"),
         ({"rotations": 300}, "robust.rotations"),
         ({"upaxis": "z"}, "up_axis"),
@@ -28,6 +27,11 @@ from tests.option_extremes import extremes, numeric_options
 def test_an_unknown_option_is_refused_with_the_name_that_was_meant(values: dict[str, Any], meant: str) -> None:
     with pytest.raises(InvalidOptionsError, match=f"did you mean `{meant}`\\?"):
         RegistrationOptions.from_dict(values)
+
+
+def test_a_limit_of_a_share_is_refused_with_what_decides_now() -> None:
+    with pytest.raises(InvalidOptionsError, match=r"the probability alone decides: see `robust\.acceptance`"):
+        RegistrationOptions.from_dict({"robust": {"min_inlier_share": 0.5}})
 
 
 def test_a_name_like_none_gets_no_suggestion() -> None:
@@ -98,9 +102,7 @@ def test_every_option_that_makes_work_makes_cost(name: tuple[str, str]) -> None:
         ("optimization", "kernel_rate"), ("optimization", "regularizer_weight"), ("optimization", "stop_residual"),
         ("resampling", "own_distance"), ("resampling", "other_distance"), ("resampling", "residual"),
         ("resampling", "radius_fraction"), ("robust", "held_out_share"), ("robust", "inlier_distance"),
-        ("robust", "min_inlier_share"), ("robust", "min_explained_share"), ("robust", "max_free_space_violations"),
-        ("robust", "max_occluded_share"), ("robust", "rival_margin"), ("robust", "box_tolerance"),
-            ("robust", "min_probability"), ("robust", "share_limits_below"),
+        ("robust", "rival_margin"), ("robust", "box_tolerance"), ("robust", "min_probability"),
     }  # fmt: skip
     assert (name in found) != (name in without_work)
 

@@ -40,6 +40,7 @@ def picture(found: Sim3, depth: float = 1.0, other: Sim3 | None = None, color: b
         center_object=torch.zeros(3, dtype=torch.float64),
         verdict="registered",
         probability=0.9,
+        level="default",
     )
     sheet = overlay_picture(result, frame, BOX.vertices, BOX.faces)  # type: ignore[arg-type]
     return np.asarray(sheet, dtype=np.int64)[CAPTION:]

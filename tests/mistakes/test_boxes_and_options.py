@@ -46,6 +46,7 @@ BOXES = [
 ]  # fmt: skip
 OPTIONS = [
     Case("spelling of earlier versions", "INVALID_OPTIONS", 2, "o.json: options.initialisation", "no such option", "did you mean `initialization`", '{"initialisation": {}}'),
+    Case("limit of a share", "INVALID_OPTIONS", 2, "o.json: options.robust.min_inlier_share", "no such option", "see `robust.acceptance`", '{"robust": {"min_inlier_share": 0.5}}'),
     Case("misspelled option", "INVALID_OPTIONS", 2, "o.json: options.robust.rotation", "no such option", "did you mean `robust.rotations`", '{"robust": {"rotation": 5}}'),
     Case("option of another type", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "valid integer", "regnf manual api", '{"robust": {"rotations": "many"}}'),
     Case("option out of range", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "less than or equal to 20000", "regnf manual api", '{"robust": {"rotations": 1000000}}'),

@@ -69,6 +69,7 @@ class Answers:
         document = {
             "verdict": self.verdict,
             "probability": 0.9,
+            "level": None,
             "T_object_scene": (T_scene_camera @ T_CAMERA_OBJECT).inverse().to_dict(),
             "center_object": [0.0, 0.0, 60.0],
             "covariance": (1e-4 * np.eye(7)).tolist(),
@@ -311,7 +312,7 @@ def test_a_pose_is_published_in_the_map_where_tf_knows_it(monkeypatch: pytest.Mo
     wanted = (T_MAP_CAMERA @ T_CAMERA_OBJECT).matrix().numpy()
     (one,), (pose,), (frame,) = array.detections, robot.node.pose_out.sent, robot.node.broadcaster.sent
     assert (array.header.frame_id, array.header.stamp.sec, array.header.stamp.nanosec) == ("map", 12, 500_000_000)
-    assert (one.id, one.results[0].hypothesis.score) == ("chair/0/scale=0.001", 0.9)
+    assert (one.id, one.results[0].hypothesis.score) == ("chair/0/level=none/scale=0.001", 0.9)
     np.testing.assert_allclose(matrix(pose.pose.pose, 0.001), wanted, atol=1e-6)
     assert (frame.header.frame_id, frame.child_frame_id) == ("map", "regnf/chair_0")
     assert np.any(pose.pose.covariance)
@@ -348,7 +349,7 @@ def test_a_map_that_tf_does_not_know_at_that_time_is_said(robot: Robot, monkeypa
 def test_several_detections_of_one_image_are_one_array(robot: Robot) -> None:
     things = [("lamp", OUTLINE), ("coffee cup", OUTLINE), ("chair", OUTLINE)]
     array = robot.see(masks(12.5, (H, W), *things))
-    assert [one.id.partition("/scale")[0] for one in array.detections] == ["coffee cup/1", "chair/2"]
+    assert [one.id.partition("/level")[0] for one in array.detections] == ["coffee cup/1", "chair/2"]
     assert [robot.answers.json("request", n)["object"] for n in (0, 1)] == [CUP, CHAIR]
     assert robot.answers.sent[0]["depth"] == robot.answers.sent[1]["depth"]
     assert robot.answers.deleted == [f"/recordings/{FRAME}"]

@@ -42,6 +42,7 @@ def result(verdict: str = "registered", alternatives: tuple[Sim3, ...] = ()) -> 
         "alternatives": [{"T_object_scene": one.to_dict()} for one in alternatives],
         "covariance": (1e-4 * np.eye(7)).tolist(),
         "probability": 0.97,
+        "level": "default",
     }
 
 
@@ -124,6 +125,7 @@ def test_a_pose_is_published_in_the_map_with_its_frame(monkeypatch: pytest.Monke
     assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "regnf/chair_0", 12)
     assert frame.transform.translation.x == pose.pose.pose.position.x
     assert array.detections[0].results[0].hypothesis.score == 0.97
+    assert array.detections[0].id.startswith("chair/0/level=default/")
     assert array.detections[0].bbox.size.z == 0.7
     assert np.any(pose.pose.covariance)
 

@@ -111,6 +111,7 @@ class PretendWorker:
             "T_object_scene": _transform(np.linalg.inv(scene_object)),
             "T_scene_object": _transform(scene_object),
             "probability": 0.97,
+            "level": "default",
             "metrics": {"probability": 0.97, "residual_rms": 0.002, "seconds": {"sampling": 0.5, "optimizing": 1.5}},
             "options": {"preset": "robust", "up_axis": "z", "robust": {"rotations": 600}},
             "seed": 0,
@@ -129,7 +130,8 @@ class PretendWorker:
         ]
         self._blobs.put(f"jobs/{job.id}/manifest.json", json.dumps({"attempt": 1, "artifacts": listed}).encode())
         searched = {"object_found": found} if candidates else {}
-        self._records.update_job(job.id, 1, status="successful", verdict="registered", **searched)
+        told = {name: result[name] for name in ("verdict", "probability", "level")}
+        self._records.update_job(job.id, 1, status="successful", **told, **searched)
 
 
 def seen_by_camera(scene_object: np.ndarray[Any, Any]) -> dict[str, Any]:

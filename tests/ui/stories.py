@@ -151,7 +151,8 @@ def _ambiguous(data: Synthetic) -> dict[str, Any]:
 def _judged(data: Synthetic) -> dict[str, Any]:
     def judged(T: dict[str, Any], reason: str, probability: float, free: float) -> dict[str, Any]:
         metrics = {"probability": probability, "free_space_violations": free, "score": None}
-        return {"T_object_scene": T, "reason": reason, "detail": f"<b>{reason}</b>", "metrics": metrics}
+        level = "default" if reason == "SURFACES_AGREE" else None
+        return {"T_object_scene": T, "reason": reason, "detail": f"<b>{reason}</b>", "level": level, "metrics": metrics}
 
     tipped = sim3_document(similarity(1.0, rotation([1, 0, 0], 1.0), [0, 0, 0]) @ data.T_object_scene)
     poses = [judged(data.result["T_object_scene"], "SURFACES_AGREE", 0.97, 0.0)]
@@ -162,11 +163,12 @@ def _searched(data: Synthetic) -> dict[str, Any]:
     def candidate(number: int, stage: str, score: float | None, verdict: str | None = None) -> dict[str, Any]:
         reason = "NO_SURFACE_IN_OBJECT" if stage == "unusable" else None
         return {"object": f"{number:02x}" * 32, "stage": stage, "score": score, "verdict": verdict,
-                "verdict_reason": reason, "T_object_scene": None}  # fmt: skip
+                "verdict_reason": reason, "T_object_scene": None, "level": verdict and "strict",
+                "probability": verdict and 0.99}  # fmt: skip
 
     ranking = [
         candidate(0xA0, "refined", 0.021, "registered"),
-        candidate(0xA1, "refined", 0.34, "rejected"),
+        candidate(0xA1, "refined", 0.34, "rejected") | {"probability": 0.3, "level": None},
         *(candidate(0xB0 + k, "coarse", 0.4 + k / 100) for k in range(6)),
         *(candidate(0xC0 + k, "signature", 0.2) for k in range(3)),
         candidate(0xD0, "unusable", None),

@@ -184,7 +184,7 @@ def synthetic() -> Synthetic:
 
 def _result(T_scene_object: Array, initial: Array, artifacts: dict[str, bytes]) -> dict[str, Any]:
     return {
-        "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.973,
+        "verdict": "registered", "verdict_reason": "SURFACES_AGREE", "probability": 0.973, "level": "default",
         "center_scene": T_scene_object[:3, 3].tolist(), "center_object": [0.0, 0.0, 0.0],
         "T_object_scene": sim3_document(np.linalg.inv(T_scene_object)), "T_scene_object": sim3_document(T_scene_object),
         "T_object_scene_initial": sim3_document(initial), "alternatives": [],

@@ -103,19 +103,19 @@ def test_run_again_keeps_what_the_form_does_not_show_and_two_runs_are_compared(
     page.goto(f"{service}/jobs")
     page.get_by_role("button", name="Run again").click()
     page.get_by_label("Seed").fill("7")
-    page.locator("dialog[open] summary").click()
-    page.get_by_label("Min inlier share").fill("0.5")
+    page.get_by_label("Accept at level").select_option('"strict"')
     page.click("#again-start")
     page.wait_for_url("**/view")
     expect(page.locator("#verdict-word")).to_have_text("Registered")
     again = page.request.get(page.url.removesuffix("/view") + "/request").json()
     robust = again["options"]["robust"]
-    assert (robust["rotations"], robust["min_inlier_share"], again["seed"]) == (77, 0.5, 7)
+    assert (robust["rotations"], robust["acceptance"], again["seed"]) == (77, "strict", 7)
     assert again["ground_truth"] == {"T_object_scene": turned}
     page.set_viewport_size({"width": 600, "height": 320})
     page.goto(f"{service}/jobs")
     expect(page.locator(".tile .word")).to_have_text(["Registered", "Registered"])
-    expect(page.locator(".tile").first).to_contain_text("seed 7")
+    for part in ("seed 7", "probability 97.0 %, default"):
+        expect(page.locator(".tile").first).to_contain_text(part)
     expect(page.locator("#compare")).to_be_disabled()
     marks = page.get_by_role("checkbox", name=re.compile("^Compare"))
     expect(marks).to_have_count(2)

@@ -177,7 +177,7 @@ def test_the_result_lies_over_the_scene_and_nothing_scrolls_but_the_panel(
     expect(rows).not_to_have_count(0)
     shown = [str(one.get_attribute("placeholder")).replace(",", "") for one in rows.all()]
     defaults = [one.default for one in fields_of(RobustOptions) if not isinstance(one.default, bool | str)]
-    assert sorted(shown) == sorted("not known" if usual is None else f"{usual:g}" for usual in defaults)
+    assert sorted(shown) == sorted("not given" if usual is None else f"{usual:g}" for usual in defaults)
     give_files(page, files[:2])
     click_at(page, CHAIR)
     page.click("#register")

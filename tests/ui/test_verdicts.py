@@ -44,7 +44,8 @@ def test_numbers_are_the_documents(visit: Visit) -> None:
     page.locator("input[name=direction][value=T_object_scene]").check(force=True)
     expect(page.locator("#matrix")).not_to_have_text(before, use_inner_text=True)
     assert_matrix(page, result["T_object_scene"]["matrix"])
-    for figure in ("1.6000", "93.1 %", "0.41 %", "12.3 s", "14.0 s"):  # created 20:26:40, finished 20:26:54
+    # created 20:26:40, finished 20:26:54
+    for figure in ("97.3 %", "; level default", "1.6000", "93.1 %", "0.41 %", "12.3 s", "14.0 s"):
         expect(page.locator("#figures")).to_contain_text(figure)
     expect(page.locator("#time-total")).to_have_text("12.3 s of 14.0 s from request to result")
     about = json.loads((WEB / "metrics.json").read_text(encoding="utf-8"))
@@ -165,8 +166,8 @@ def test_a_search_shows_its_ranking(visit: Visit) -> None:
     expect(page.locator("#ranking-list li").last).to_contain_text("field b5b5b5b5")  # the names come after the rest
     shown = [text.split("\n") for text in page.locator("#ranking-list li").all_inner_texts()]
     assert shown[:3] == [
-        ["field a0a0a0a0", "Registered", "0.021"],
-        ["field a1a1a1a1", "Rejected", "0.34"],
+        ["field a0a0a0a0", "Registered, 99.0 %, strict", "0.021"],
+        ["field a1a1a1a1", "Rejected, 30.0 %, below both levels", "0.34"],
         ["field b0b0b0b0", "searched coarsely", "0.4"],
     ]
     assert len(shown) == 8
@@ -185,6 +186,7 @@ def red_share(page: Page) -> float:
 def test_a_rejected_pose_is_shown_with_what_speaks_against_it(visit: Visit) -> None:
     page = visit.open("judged")
     poses = page.locator("#considered-list label")
+    expect(poses).to_contain_text(["97.0 %, default", "2.0 %, below both levels"])
     expect(poses).to_contain_text(["The surfaces agree.", "<b>FREE_SPACE_VIOLATED</b>"])
     before = page.locator("#matrix").inner_text()
     red = red_share(page)

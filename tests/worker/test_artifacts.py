@@ -42,12 +42,24 @@ def test_a_job_has_one_result(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("result", "told"),
     [
-        ({"verdict": "registered", "object": "a1"}, {"verdict": "registered", "object_found": None}),
         (
-            {"verdict": "rejected", "object": "a1", "candidates": [{"object": "a1"}]},
-            {"verdict": "rejected", "object_found": "a1"},
+            {"verdict": "registered", "probability": 0.95, "level": "default", "object": "a1"},
+            {"verdict": "registered", "probability": 0.95, "level": "default", "object_found": None},
         ),
-        ({"verdict": "?", "object": 3, "candidates": [{}]}, {"verdict": None, "object_found": None}),
+        (
+            {
+                "verdict": "rejected",
+                "probability": 0.5,
+                "level": None,
+                "object": "a1",
+                "candidates": [{"object": "a1"}],
+            },
+            {"verdict": "rejected", "probability": 0.5, "level": None, "object_found": "a1"},
+        ),
+        (
+            {"verdict": "?", "probability": "?", "level": "?", "object": 3, "candidates": [{}]},
+            {"verdict": None, "probability": None, "level": None, "object_found": None},
+        ),
         ([], {}),
     ],
 )

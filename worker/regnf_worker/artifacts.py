@@ -6,8 +6,10 @@ import logging
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 from regnf_core.library_folder import digest_of
+from regnf_core.options import Acceptance
 from regnf_state.blobs.base import BlobStore
 from regnf_state.manifest import EDITED_FIELD, Artifact, Manifest, artifact_key, manifest_key, read_result
 from regnf_state.ownership import reference_of
@@ -59,15 +61,18 @@ def _import(context: Context, reference: str, size: int) -> None:
 _VERDICTS = ("registered", "ambiguous", "rejected")
 
 
-def told_by_result(blobs: BlobStore, manifest: Manifest) -> dict[str, str | None]:
-    """What the job's record says of its result: the verdict if it is a known one, and of a search the object found."""
+def told_by_result(blobs: BlobStore, manifest: Manifest) -> dict[str, str | float | None]:
+    """What the job's record says of its result: verdict and level if they are known ones, the probability, and of a
+    search the object found."""
     try:
         result = read_result(blobs, manifest)
     except (FileNotFoundError, UnreadableRecordError):
         return {}
-    verdict, found = result.get("verdict"), result.get("object")
+    verdict, probability, level, found = (result.get(name) for name in ("verdict", "probability", "level", "object"))
     return {
         "verdict": verdict if verdict in _VERDICTS else None,
+        "probability": probability if isinstance(probability, float) else None,
+        "level": level if level in get_args(Acceptance) else None,
         "object_found": found if isinstance(found, str) and result.get("candidates") else None,
     }
 

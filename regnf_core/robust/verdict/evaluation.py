@@ -134,7 +134,7 @@ def considered_poses(
         found = evaluate_pose(held_out, number, 0, options, likely)
         T = problem.in_field_frames(candidates.T[number])
         metrics = {**held_out.of(number), "probability": likely}
-        poses.append(ConsideredPose(T, found.reason, metrics, found.broken))
+        poses.append(ConsideredPose(T, found.reason, metrics, found.broken, level_of(likely)))
     scene = problem.view.frame.out_of(problem.held_out.scene_samples.points)
     obj = problem.model.frame.out_of(problem.held_out.object_samples.points)
     signs = held_out.evidence.scene_signs[chosen], held_out.evidence.object_signs[chosen]

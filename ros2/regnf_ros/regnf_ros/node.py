@@ -220,7 +220,7 @@ class RegisterObjects(Node):
         best = found.poses[0]
         out = Detection3D()
         out.header = array.header
-        out.id = f"{found.class_id}/{number}/scale={best.scale:.6g}"
+        out.id = f"{found.class_id}/{number}/level={found.level or 'none'}/scale={best.scale:.6g}"
         for pose in found.poses:
             hypothesis = ObjectHypothesisWithPose()
             hypothesis.hypothesis.class_id = found.class_id

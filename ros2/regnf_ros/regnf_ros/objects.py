@@ -40,14 +40,15 @@ class Found:
     """What is published of one detection. poses: the best first, then those that agree as well.
 
     box: that of the detection, or around the object where an image was searched, in the frame of the answer; of size 0
-    where the object's bounds are not known · probability: that one of the poses is right.
+    where the object's bounds are not known · probability: that one of the poses is right · level: the strictest
+    named one that it reaches; None: none.
     """
 
     class_id: str
     poses: list[ObjectPose]
     box: Box
     probability: float
-    verdict: str
+    level: str | None
 
 
 class Registrar:
@@ -114,7 +115,7 @@ def _found(class_id: str, result: dict[str, Any], box: Box, T_field_map: Matrix)
     given = result.get("covariance")
     best = pose(result, None if given is None else np.asarray(given, dtype=np.float64))
     others = [pose(one, None) for one in result.get("alternatives", [])]
-    return Found(class_id, [best, *others], box, result["probability"], result["verdict"])
+    return Found(class_id, [best, *others], box, result["probability"], result["level"])
 
 
 def _matrix(said: dict[str, Any]) -> Matrix:

@@ -98,16 +98,16 @@ def test_what_is_no_variance_has_no_deviation(chair_run: ChairRun) -> None:
 
 def test_a_ranking_is_told_with_what_is_unusable_last() -> None:
     ranking = [
-        Candidate("chair", "refined", 0.02, "registered", "SURFACES_AGREE", Sim3.identity(), 0.9),
+        Candidate("chair", "refined", 0.02, "registered", "SURFACES_AGREE", Sim3.identity(), 0.9, "default"),
         Candidate("stool", "coarse", math.inf),
     ]
     chair, stool, air = json.loads(json.dumps(ranking_document(ranking, {"air": "NO_SURFACE_IN_OBJECT"})))
     assert chair["T_object_scene"]["matrix"] == chair["T_scene_object"]["matrix"] == np.eye(4).tolist()
-    assert chair["probability"] == 0.9
+    assert (chair["probability"], chair["level"]) == (0.9, "default")
     assert (chair["object"], chair["verdict"], chair["verdict_reason"]) == ("chair", "registered", "SURFACES_AGREE")
     assert stool == {
         "object": "stool", "stage": "coarse", "score": None, "verdict": None, "verdict_reason": None,
-        "probability": None, "T_scene_object": None, "T_object_scene": None,
+        "probability": None, "level": None, "difference": None, "T_scene_object": None, "T_object_scene": None,
     }  # fmt: skip
     assert (air["object"], air["stage"], air["verdict_reason"]) == ("air", "unusable", "NO_SURFACE_IN_OBJECT")
     assert set(air) == set(stool)

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from regnf_core.document import AlternativeDocument, Outgoing, TransformDocument, UncertaintyDocument, Verdict
+from regnf_core.options import Acceptance
 from regnf_service.batches import COUNTED, BatchState
 from regnf_service.http.query import NEXT_PAGE
 from regnf_service.http.schemas.registrations import RegisterRequest
@@ -84,6 +85,7 @@ class BatchResult(Outgoing):
     verdict: Verdict | None = None
     verdict_reason: str | None = None
     probability: float | None = None
+    level: Acceptance | None = None
     T_scene_object: TransformDocument | None = None
     T_object_scene: TransformDocument | None = None
     center_scene: list[float] | None = None

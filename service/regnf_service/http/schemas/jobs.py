@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, WithJsonSchema
 
 from regnf_core.document import Outgoing, Sha256, Verdict
+from regnf_core.options import Acceptance
 from regnf_service.http.query import NEXT_PAGE
 from regnf_service.http.schemas.results import Links, Moment, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
@@ -22,8 +23,10 @@ _PHASES = ["loading", "sampling", "initializing", "optimizing", "verifying", "ex
 # said in the contract alone: a record that an older version wrote is shown as it is
 _Phase = Annotated[str, WithJsonSchema({"type": "string", "enum": _PHASES})]
 _Verdict = Annotated[str, WithJsonSchema({"type": "string", "enum": list(get_args(Verdict))})]
+_Level = Annotated[str, WithJsonSchema({"type": "string", "enum": list(get_args(Acceptance))})]
 _AS_RECORDED = (
-    "id", "kind", "status", "phase", "progress", "cancel_requested", "engine", "verdict", "object_found"
+    "id", "kind", "status", "phase", "progress", "cancel_requested", "engine",
+    "verdict", "probability", "level", "object_found",
 )  # fmt: skip
 _NOT_ASKED_AGAIN = frozenset({"version", "webhook"})
 
@@ -74,6 +77,8 @@ class JobDocument(Outgoing):
         description="What the imports of `scene` and `object` were not sure of: words; the result has sentences.",
     )
     verdict: _Verdict | None = Field(None, description="Of a successful job: its result's verdict.")
+    probability: float | None = Field(None, description="Its result's.")
+    level: _Level | None = Field(None, description="Its result's.")
     object_found: Sha256 | None = Field(
         None, description="Of a successful search: the object of its result. If that is rejected, it was none of them."
     )

@@ -145,7 +145,7 @@ def _fault(entry: Any, model: Any) -> _Fault:
         return _Fault(kind, (*place, *context["place"]), str(context["message"]), context["hint"])
     if kind == UNKNOWN_OPTION and place[0] == "options" and len(place) > 1:
         meant = did_you_mean(place[1:])
-        return _Fault(kind, place, "No such option" + meant, meant.replace("; did", "Did", 1) or _meant(place, model))
+        return _Fault(kind, place, "No such option" + meant, meant[2:3].upper() + meant[3:] or _meant(place, model))
     if kind in ("extra_forbidden", UNKNOWN_OPTION):
         return _Fault(kind, place, "This member is not known.", _meant(place, model))
     if kind == "string_pattern_mismatch" and not _FIELDS.isdisjoint(place):

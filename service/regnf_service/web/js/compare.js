@@ -25,6 +25,7 @@ function draw(jobs, results, about, names) {
   const options = results.map(({ options: given }) => ({ preset: given?.preset, up_axis: given?.up_axis, ...given?.robust }));
   const rows = [
     ['Verdict', results.map(({ verdict }) => words(verdict))],
+    ['Level', results.map(({ level, probability }) => (Number.isFinite(probability) ? level ?? 'below both levels' : null))],
     ['Why', results.map(({ verdict_reason: reason, verdict_detail: detail }) => detail || words(reason))],
     ['Seed', results.map(({ seed }) => String(seed))],
     ...rowsOf(metrics, (name) => about[name]?.title ?? words(name)),

@@ -1,12 +1,12 @@
 // The poses that were judged, rejected ones too: each to look at, with what the samples held out for that say of it.
 
 import { byId, el, fillFacts, show } from './dom.js';
-import { number, percent } from './format.js';
+import { number, percent, sure } from './format.js';
 import { readNpz } from './npz.js';
 import { inverse, readSim3 } from './sim3.js';
 
 const ROWS = [
-  ['Probability', 'probability', percent], ['Score, lower is better', 'score', (value) => number(value, 3)],
+  ['Score, lower is better', 'score', (value) => number(value, 3)],
   ['Object confirmed by the scene', 'inlier_share_object', percent], ['Scene nearby explained', 'inlier_share_scene', percent],
   ['Object in free space', 'free_space_violations', percent], ['Object not seen', 'occluded_share_object', percent],
   ['Other surface joined to it', 'unexplained_share_scene', percent],
@@ -22,7 +22,10 @@ export function offerConsidered(api, result, names, onChoose) {
   let arrays = null;
   const choose = async (index) => {
     const { metrics = {}, T_object_scene: matrix } = poses[index];
-    fillFacts(byId('considered-facts'), ROWS.map(([term, name, format]) => [term, Number.isFinite(metrics[name]) ? format(metrics[name]) : null]));
+    fillFacts(byId('considered-facts'), [
+      ['Probability', sureOf(poses[index])],
+      ...ROWS.map(([term, name, format]) => [term, Number.isFinite(metrics[name]) ? format(metrics[name]) : null]),
+    ]);
     arrays ??= names.includes('considered.npz') ? api.artifact('considered.npz').then(readNpz).catch(() => null) : null;
     const read = await arrays;
     if (!byId('considered-list').querySelectorAll('input')[index]?.checked) return; // another pose was chosen meanwhile
@@ -32,11 +35,12 @@ export function offerConsidered(api, result, names, onChoose) {
   byId('considered-list').replaceChildren(el('legend', { className: 'unseen' }, 'Candidate pose'), ...poses.map((one, i) => {
     const input = el('input', { type: 'radio', name: 'considered', value: String(i), onchange: () => choose(i) });
     const words = one.reason === AGREES ? 'The surfaces agree.' : one.detail || one.reason;
-    const sure = el('span', { className: 'mono' }, percent(one.metrics?.probability));
-    return el('label', { title: one.reason }, input, el('span', {}, words), sure);
+    return el('label', { title: one.reason }, input, el('span', {}, words), el('span', { className: 'mono' }, sureOf(one) ?? '–'));
   }));
   show(byId('considered'), poses.length > 0);
 }
+
+const sureOf = ({ metrics, level }) => (Number.isFinite(metrics?.probability) ? sure(metrics.probability, level) : null);
 
 /** No pose of this list is the one shown. */
 export function unchooseConsidered() {

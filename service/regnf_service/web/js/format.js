@@ -21,6 +21,12 @@ export function percent(share, decimals = 1) {
   return Number.isFinite(share) ? `${(share * 100).toFixed(decimals)} %` : '–';
 }
 
+/** A probability and the level that it reaches; results of earlier versions tell none. */
+export function sure(probability, level) {
+  const told = level === undefined ? '' : `, ${level ?? 'below both levels'}`;
+  return `${percent(probability)}${told}`;
+}
+
 export function seconds(value) {
   if (!Number.isFinite(value)) return '–';
   if (value < 1) return `${Math.round(value * 1000)} ms`;

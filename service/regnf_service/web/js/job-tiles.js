@@ -5,7 +5,7 @@ import { compareJobs } from './compare.js';
 import { askFirst, deletionOf } from './confirm.js';
 import { byId, el } from './dom.js';
 import { isActive, queueWords } from './documents.js';
-import { moment, seconds, words } from './format.js';
+import { moment, seconds, sure, words } from './format.js';
 import { boxOfJob, isInImage, shortOf, titleOfJob } from './names.js';
 import { overlayButton } from './overlay.js';
 import { canvasOf } from './pictures.js';
@@ -58,6 +58,7 @@ export class JobTiles {
       job.error && toldOf(job.error),
       job.status === 'accepted' && queueWords(job),
       candidates && job.object_found && job.verdict !== 'rejected' && `the likeliest of ${candidates} objects`,
+      Number.isFinite(job.probability) && `probability ${sure(job.probability, job.level)}`,
       boxOfJob(job),
       times.filter(Boolean).join(', '),
     ];

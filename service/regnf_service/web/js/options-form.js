@@ -8,7 +8,8 @@ const FIRST = {
   max_scale: 'Max. scale',
   box_tolerance: 'Box tolerance (× box edge)',
   inlier_distance: 'Inlier distance (object diameters)',
-  min_probability: 'Accept at probability ≥',
+  acceptance: 'Accept at level',
+  min_probability: 'Or at probability ≥',
   rotations: 'Rotations to start from',
 };
 const UPRIGHT = 'stands upright';
@@ -72,7 +73,7 @@ export class OptionsForm {
 function numberField({ minimum, maximum }, given, usual) {
   const range = { ...(minimum !== undefined && { min: minimum }), ...(maximum !== undefined && { max: maximum }) };
   const value = given === usual ? '' : String(given);
-  const node = el('input', { type: 'number', ...range, step: 'any', value, placeholder: usual === null ? 'not known' : number(usual) });
+  const node = el('input', { type: 'number', ...range, step: 'any', value, placeholder: usual === null ? 'not given' : number(usual) });
   return { node, read: () => (Number.isFinite(node.valueAsNumber) ? node.valueAsNumber : undefined) };
 }
 

@@ -26,10 +26,11 @@ export function showVerdict(job, result) {
   const scale = readSim3(result.T_object_scene);
   const deviation = result.uncertainty?.scale_percent;
   const { waited, worked } = timesOf(job, metrics);
-  const { probability } = result;
+  const { probability, level } = result;
   const meant = verdict === 'ambiguous' ? 'that one of the poses listed is right' : 'that the pose is right';
+  const reached = level ? `level ${level}` : 'below both levels';
   fillFacts(byId('figures'), [
-    ...(Number.isFinite(probability) ? [['Probability', figure(percent(probability, 1), meant)]] : []),
+    ...(Number.isFinite(probability) ? [['Probability', figure(percent(probability, 1), level === undefined ? meant : `${meant}; ${reached}`)]] : []),
     ['Residual RMS', figure(percent(metrics.residual_rms, 2), 'of the diameter')],
     ['Scale, object ← scene', figure(scale ? fixed(partsOf(scale).scale, 4) : '–',
       Number.isFinite(deviation) ? `± ${number(deviation, 2)} %` : '')],

@@ -1,7 +1,7 @@
 // The ranking of a search through a library: which object it most likely is, and what became of the others.
 
 import { byId, el, show } from './dom.js';
-import { number, words } from './format.js';
+import { number, sure, words } from './format.js';
 
 const SHOWN = 8;
 const STAGES = {
@@ -27,9 +27,10 @@ async function nameRows(names, rows) {
   }
 }
 
-function row({ object, stage, score, verdict, verdict_reason: reason }, i) {
+function row({ object, stage, score, verdict, verdict_reason: reason, probability, level }, i) {
   const name = el('span', { title: object, 'data-object': object }, object.slice(0, 12));
-  const end = verdict ? words(verdict) : STAGES[stage] ?? stage;
+  const judged = Number.isFinite(probability) ? `${words(verdict)}, ${sure(probability, level)}` : words(verdict);
+  const end = verdict ? judged : STAGES[stage] ?? stage;
   return el('li', { 'data-verdict': verdict ?? '', className: i === 0 ? 'first' : '' }, name,
     el('span', { title: reason ?? '' }, end),
     el('span', { className: 'mono' }, Number.isFinite(score) ? number(score, 3) : '–'));

@@ -4,7 +4,7 @@ import { ApiProblem, told } from './api.js';
 import { announce, byId, el, show } from './dom.js';
 import { queueWords } from './documents.js';
 import { followJob } from './events.js';
-import { percent, seconds, words } from './format.js';
+import { seconds, sure, words } from './format.js';
 import { Turns } from './latest.js';
 import { overlayButton, placeWords } from './overlay.js';
 import { nameOf } from './uploads.js';
@@ -77,9 +77,9 @@ export class Runs {
 
   showResult(row, name, job, result, object, took) {
     const tone = TONES[result.verdict] ?? 'wait';
-    const { probability } = result;
+    const { probability, level } = result;
     const facts = [
-      Number.isFinite(probability) && `probability ${percent(probability, 1)}`,
+      Number.isFinite(probability) && `probability ${sure(probability, level)}`,
       `scale ${result.T_object_scene.scale.toPrecision(4)}`,
       `${seconds(took / 1000)} from the click on Register`,
     ].filter(Boolean);
