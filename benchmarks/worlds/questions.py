@@ -68,7 +68,7 @@ class Question:
 
     def errors(self, problem: RegistrationProblem, T: Sim3) -> list[float]:
         """Of poses (H,) between the working frames, diameters of the object: MSSD of the right object; of others, how
-        far half a percent of both surfaces, the object's as it is placed and the true one, are off the other at least."""
+        far half a percent of both surfaces, its own as it is placed and the true one, are off the other at least."""
         truth = self.known.case.truth
         assert truth is not None
         if self.asked.case.obj is self.known.case.obj:

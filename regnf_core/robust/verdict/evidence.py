@@ -388,8 +388,9 @@ def _stretch(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Group
     E = step.new_zeros(len(step), 3, 3)
     for number, (i, j) in enumerate(_STRAINS):
         E[:, i, j] = E[:, j, i] = step[:, number]
-    least_to_largest = torch.linalg.eigvalsh(E)
-    return least_to_largest[:, 2] - least_to_largest[:, 0]
+    least, _, most = torch.linalg.eigvalsh(E).unbind(-1)
+    stretch: Tensor = most - least
+    return stretch
 
 
 _STRAINS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
