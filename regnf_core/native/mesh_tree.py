@@ -58,7 +58,7 @@ class MeshTree:
         leaves = -(-self._count // _SLOTS)
         self._arrays = {
             "vertices": torch.from_numpy((vertices - self.origin) / self.unit),
-            "faces": torch.from_numpy(faces),
+            "faces": torch.from_numpy(faces if faces.flags.writeable else faces.copy()),
             "nodes": room(steps.mesh_nodes(self._count), _NODE_NUMBERS, _SLOTS),
             "leaves": room(leaves, 9, _SLOTS, dtype=torch.float64),
             "order": room(leaves, _SLOTS, dtype=torch.int32),
@@ -110,7 +110,9 @@ class MeshTree:
         mesh = self._mesh
 
         def part(begin: int, end: int) -> None:
-            function(mesh.address, places[begin:].ctypes.data, end - begin, *(one[begin:].ctypes.data for one in results))
+            function(
+                mesh.address, places[begin:].ctypes.data, end - begin, *(one[begin:].ctypes.data for one in results)
+            )
 
         threads = min(torch.get_num_threads(), len(points) // _FEW)
         if threads < 2:
