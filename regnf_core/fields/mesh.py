@@ -17,6 +17,8 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.observation import ColorFunction, field_repr
+from regnf_core.native.mesh_tree import MeshTree
+from regnf_core.native.steps import NativeModel, steps_for
 from regnf_core.schema.kinds import MeshDescription
 
 Array = NDArray[np.float64]
@@ -27,6 +29,8 @@ _TRIED = 1000
 _ON_EDGE = 1e-6
 """A share of a triangle's corner below which a point is on the opposite edge."""
 _MOST_PARTS = 500
+_MOST_TRIANGLES = 2**30
+"""Of compiled code, which numbers them in 32 bits."""
 _DECIDED = 0.01
 """Cosine to the normal below which the winding number says the side."""
 
@@ -34,8 +38,8 @@ _DECIDED = 0.01
 class MeshField:
     """Distance to a triangle mesh; the generalized winding number says what is inside (Jacobson et al. 2013).
 
-    The mesh need not be watertight. Computed in float64 on the CPU whatever device the points come from; several times
-    slower than a small network, see docs/families.md.
+    The mesh need not be watertight. Computed on the CPU whatever device the points come from, by compiled code where
+    there is such, and else by libigl; what the two say differs by rounding, see docs/families.md.
     vertices: (V, 3), own frame · faces: (F, 3) indices, normals outward · bounds: (2, 3), lowest and highest corner of
     the region where the field has meaning; None: the mesh's own bounding box · inside_above: the winding number above
     which a point is inside · colors: (V, 3) in [0, 1], of the vertices; None: the mesh has no color.
@@ -62,6 +66,7 @@ class MeshField:
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise FieldFormatError("a mesh face names a vertex that does not exist", reason="MESH_INVALID")
         self._inside_above = inside_above
+        self._native: MeshTree | None = None
         self.colors = colors
         if colors is not None:
             self.color = self._color
@@ -108,14 +113,16 @@ class MeshField:
         queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64).reshape(-1, 3)
         if len(queries) == 0:
             return torch.zeros(0), torch.zeros(0, 3)
-        nearest = self._trees[0]
-        squared, triangles, closest = nearest.squared_distance(self.vertices, self.faces, queries)
-        distance = np.sqrt(squared)
-        sign = self._sign(queries, triangles.reshape(-1), closest, distance)
+        tree = self._sided_tree()
+        if tree is not None:
+            found = tree.signed_distance_and_gradient(queries)
+            return _as_float32(found[0]), torch.from_numpy(found[1])
+        distance, triangles, closest = self._closest(queries)
+        sign = self._sign(queries, triangles, closest, distance)
         with np.errstate(divide="ignore", invalid="ignore"):
             gradient = (queries - closest) * (sign / distance)[:, None]
         touching = distance < _ON_SURFACE
-        gradient[touching] = self._normals_and_areas(self.faces[triangles[touching].reshape(-1)])[0]
+        gradient[touching] = self._normals_and_areas(self.faces[triangles[touching]])[0]
         return _as_float32(sign * distance), _as_float32(gradient)
 
     def _sign(self, queries: Array, triangles: NDArray[Any], closest: Array, distance: Array) -> Array:
@@ -128,7 +135,38 @@ class MeshField:
         return sign
 
     def _winding_sign(self, queries: Array) -> Array:
-        return np.where(self._trees[1].winding_number(queries) > self._inside_above, -1.0, 1.0)
+        tree = self._tree()
+        number = self._trees[1].winding_number(queries) if tree is None else tree.winding_number(queries)
+        return np.where(number > self._inside_above, -1.0, 1.0)
+
+    def _closest(self, queries: Array) -> tuple[Array, NDArray[Any], Array]:
+        """Distances (N,) from points (N, 3), the closest triangles (N,), and the closest places on them (N, 3)."""
+        tree = self._tree()
+        if tree is not None:
+            return tree.closest(queries)
+        squared, triangles, closest = self._trees[0].squared_distance(self.vertices, self.faces, queries)
+        return np.sqrt(squared), triangles.reshape(-1), closest
+
+    def _tree(self) -> MeshTree | None:
+        """Compiled code's hierarchy, made once; None where there is no compiled code: libigl works then."""
+        steps = steps_for()
+        if steps is None or len(self.faces) > _MOST_TRIANGLES:
+            return None
+        if self._native is None or self._native.steps is not steps:
+            self._native = MeshTree(steps, self.vertices, self.faces, self._inside_above, _ON_SURFACE)
+        return self._native
+
+    def _sided_tree(self) -> MeshTree | None:
+        """The same, which has the normals too where they say the side."""
+        tree, normals = self._tree(), self._normals
+        if tree is not None and normals is not None and not tree.has_normals:
+            tree.use_normals(normals.of_faces, normals.of_vertices, normals.across)
+        return tree
+
+    def native_model(self) -> NativeModel | None:
+        """For compiled code."""
+        tree = self._sided_tree()
+        return None if tree is None else tree.model()
 
     @cached_property
     def _normals(self) -> _PseudoNormals | None:
@@ -146,8 +184,8 @@ class MeshField:
         points += (
             rng.normal(size=points.shape) * np.geomspace(1e-4, 0.1, _TRIED)[:, None] * np.ptp(points, axis=0).max()
         )
-        squared, triangles, closest = self._trees[0].squared_distance(self.vertices, self.faces, points)
-        sign, undecided = normals.sign(points, triangles.reshape(-1), closest, np.sqrt(squared))
+        distance, triangles, closest = self._closest(points)
+        sign, undecided = normals.sign(points, triangles, closest, distance)
         return normals if (undecided | (sign == self._winding_sign(points))).all() else None
 
     def _color(self, points: Tensor, directions: Tensor) -> Tensor:
@@ -157,8 +195,8 @@ class MeshField:
         queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64).reshape(-1, 3)
         if len(queries) == 0:
             return torch.zeros(0, 3)
-        _, triangles, closest = self._trees[0].squared_distance(self.vertices, self.faces, queries)
-        corners = self.faces[triangles.reshape(-1)]  # (N, 3)
+        _, triangles, closest = self._closest(queries)
+        corners = self.faces[triangles]  # (N, 3)
         shares = _barycentric(closest, self.vertices[corners])
         return _as_float32(np.einsum("nk,nkc->nc", shares, self.colors[corners]).clip(0.0, 1.0))
 
@@ -175,7 +213,8 @@ class MeshField:
 
     @cached_property
     def _trees(self) -> tuple[Any, Any]:
-        """The hierarchies for the closest point and for the winding number: without them each call would build both."""
+        """libigl's hierarchies for the closest point and for the winding number: without them each call would build
+        both."""
         nearest, winding = igl.AABB(), igl.FastWindingNumberBVH()
         nearest.init(self.vertices, self.faces)
         winding.init(self.vertices, self.faces)

@@ -9,6 +9,7 @@
 #include "minimize.h"
 #include "near.h"
 #include "discs.h"
+#include "mesh.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -109,7 +110,8 @@ void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float
 const regnf_steps REGNF_STEPS(REGNF_SET) = {
     places,         fill,
     begin,          next_places, next_fill, settle, step, score, end,
-    grid_distances, voxel_distances,
+    grid_distances, voxel_distances,  mesh_distances,
+    mesh_nodes,     grow_mesh,   mesh_at, mesh_closest, mesh_winding,
     nearest,        nearest_to_cells,
     kernel_sums,    nearest_discs,
 };

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 6 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 7 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -85,6 +85,19 @@ typedef struct {
     const float *values;                        /* z fastest */
 } regnf_voxels;
 
+/* A triangle mesh, with coordinates within -1 and 1 about its middle, and its hierarchy; see mesh_tree.h. */
+typedef struct {
+    int64_t triangles;
+    const double *vertices;           /* (vertices, 3) */
+    const int64_t *faces;             /* (triangles, 3) */
+    void *nodes, *leaves;             /* as many as mesh_nodes says; one for eight triangles */
+    int32_t *order;                   /* of the triangles in the leaves, eight in each */
+    double inside_above;              /* winding number of what is inside */
+    double touching;                  /* distance below which a point is on the surface */
+    const double *of_faces, *of_vertices; /* normals that say the side; NULL: the winding number does */
+    const int64_t *across;            /* (triangles, 3): the triangle beyond the edge opposite to each corner */
+} regnf_mesh;
+
 /* Two surfaces: samples of both, and what each is asked of. */
 typedef struct {
     regnf_samples scene_samples, object_samples;
@@ -115,7 +128,7 @@ typedef struct {
     float *costs, *of_scene, *of_object; /* means of |r| */
 } regnf_history;
 
-/* One set of the steps; see steps.h, minimize.h, distances.h, near.h and discs.h. */
+/* One set of the steps; see steps.h, minimize.h, distances.h, near.h, discs.h and mesh.h. */
 typedef struct {
     /* Where the samples of one surface are at all poses, (poses, samples, 3); and their residuals from the other one's
      * distances and gradients there. With NULL for both, its model is asked. */
@@ -131,7 +144,13 @@ typedef struct {
     void (*step)(void *state);
     void (*score)(const void *state, float *scores, float *sizes); /* (poses), and |residuals| (poses, total) */
     void (*end)(void *state);
-    regnf_ask *grid, *voxels;
+    regnf_ask *grid, *voxels, *mesh;
+    int64_t (*mesh_nodes)(int64_t triangles);
+    int (*grow_mesh)(const regnf_mesh *);
+    void (*mesh_at)(const regnf_mesh *, const double *points, int64_t count, double *value, float *gradient);
+    void (*mesh_closest)(const regnf_mesh *, const double *points, int64_t count, double *squares, int64_t *triangle,
+                         double *closest);
+    void (*mesh_winding)(const regnf_mesh *, const double *points, int64_t count, double *number);
     int (*nearest)(const double *points, int64_t n, const double *places, int64_t m, int64_t count, double *distance,
                    int64_t *number);
     int (*nearest_to_cells)(const double *points, int64_t n, const double *low, const double *edge, int64_t cells,

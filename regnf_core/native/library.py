@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 6
+_LAYOUT = 7
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -43,6 +43,12 @@ _STEPS: dict[str, tuple[Any, ...]] = {
     "end": (None, _ADDRESS),
     "grid": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "voxels": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "mesh": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "mesh_nodes": (_COUNT, _COUNT),
+    "grow_mesh": (ctypes.c_int, _ADDRESS),
+    "mesh_at": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "mesh_closest": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _ADDRESS),
+    "mesh_winding": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),
     "nearest": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _COUNT, _COUNT, _ADDRESS, _ADDRESS),
     "nearest_to_cells": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "kernel_sums": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),

@@ -12,6 +12,7 @@ import trimesh
 
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
+from regnf_core.native.library import SWITCH
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from tests.core.importing.archives import assert_refused
 
@@ -47,6 +48,7 @@ def test_unit_and_sign_go_round_it(tmp_path: Path) -> None:
 
 def test_a_query_looks_at_the_normals_of_touched_triangles_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """A scan has a million triangles: what looks at all of them for each batch of points takes most of the time."""
+    monkeypatch.setenv(SWITCH, "0")
     mesh = sphere()
     field = MeshField(mesh["vertices"], mesh["faces"])
     field.signed_distance(torch.zeros(1, 3))
