@@ -12,7 +12,7 @@ from regnf_core.library import LibraryObject, model_object, search_library
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.problem import make_problem
 from regnf_core.robust.scene import view_scene
-from regnf_core.robust.verdict.comparison import Placed, decides_for_other, difference
+from regnf_core.robust.verdict.comparison import Placed, compare, decides_for_other
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN
 from tests.core.analytic import AnalyticField, boxes
 
@@ -31,12 +31,12 @@ def placed(scene: SdfField, obj: AnalyticField) -> Placed:
 @pytest.mark.parametrize("there", [PLAIN, WITH_BLOCK])
 def test_a_block_more_or_less_is_told_by_its_surface(there: AnalyticField) -> None:
     right, wrong = (placed(there, obj) for obj in ((PLAIN, WITH_BLOCK) if there is PLAIN else (WITH_BLOCK, PLAIN)))
-    found = difference(right, wrong)
+    found = compare(right, wrong).difference
     assert found.distinguishable
     assert 0.02 < found.seen <= found.differs < 0.3
     assert found.favor > 0.8
     assert not decides_for_other(found)
-    other_way = difference(wrong, right)
+    other_way = compare(wrong, right).difference
     assert (other_way.differs, other_way.seen, other_way.favor) == pytest.approx(
         (found.differs, found.seen, -found.favor)
     )
@@ -44,7 +44,7 @@ def test_a_block_more_or_less_is_told_by_its_surface(there: AnalyticField) -> No
 
 
 def test_the_same_object_differs_nowhere() -> None:
-    found = difference(placed(PLAIN, PLAIN), placed(PLAIN, PLAIN))
+    found = compare(placed(PLAIN, PLAIN), placed(PLAIN, PLAIN)).difference
     assert (found.differs, found.seen, found.favor, found.distinguishable) == (0.0, 0.0, 0.0, False)
 
 
@@ -57,7 +57,7 @@ def test_what_nobody_saw_tells_nothing() -> None:
     states = torch.where(value.abs() < voxel, SURFACE, torch.where(value > 0, FREE, UNSEEN))
     states[boxes([BLOCK]).signed_distance(centers) < 4.0 * voxel] = UNSEEN
     scene = ObservedField(PLAIN, Observation(states.to(torch.uint8).view(100, 100, 100), low, voxel))
-    found = difference(placed(scene, PLAIN), placed(scene, WITH_BLOCK))
+    found = compare(placed(scene, PLAIN), placed(scene, WITH_BLOCK)).difference
     assert found.differs > 0.02
     assert not found.distinguishable
 
