@@ -153,8 +153,8 @@ class RegistrationResult(_Posed):
     there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
     symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
     viewers · surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection
-    was made in, where the scene is a recording · deciding: of a search, what tells its first two candidates apart, where
-    the first is accepted and two were refined · level: the strictest named level of the option
+    was made in, where the scene is a recording · deciding: what tells the first two candidates of a search apart,
+    where the first one is accepted and both were refined · level: the strictest named level of the option
     ``acceptance`` that the probability reaches; None: none.
     covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
     becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
