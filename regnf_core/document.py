@@ -134,12 +134,13 @@ class DecidingSurface:
     """The surface of a search's first two candidates that lies off the other one of them, where they stand.
 
     samples: (N,), scene frame · of_other (N,) bool: whose: False of the first, True of the other candidate · states
-    (N,) uint8: SHOWN, ABSENT or UNKNOWN.
+    (N,) uint8: SHOWN, ABSENT or UNKNOWN · distinguishable: as of the two's :class:`Difference`.
     """
 
     samples: SurfaceSamples
     of_other: Tensor
     states: Tensor
+    distinguishable: bool
 
 
 @dataclass(frozen=True, eq=False)

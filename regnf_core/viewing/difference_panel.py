@@ -42,6 +42,7 @@ class Deciding:
     points: Floats
     of_other: NDArray[np.bool_]
     states: NDArray[np.uint8]
+    distinguishable: bool
 
     def share(self, state: int) -> float:
         return float((self.states == state).mean()) if len(self.states) else 0.0
@@ -49,8 +50,8 @@ class Deciding:
     def conclusion(self) -> str:
         """For which candidate it speaks, as a sentence: for the one whose surface is there, or the other's is not."""
         seen = self.states != UNKNOWN
-        if not seen.any():
-            return "None of it was seen: it tells nothing."
+        if not self.distinguishable or not seen.any():
+            return "Too little of it was seen to tell the two apart."
         for_first = float(((self.states == SHOWN) != self.of_other)[seen].mean())
         return f"Of what was seen, {100 * for_first:.0f} % speaks for the first."
 

@@ -64,7 +64,12 @@ def registration_picture(result: RegistrationResult) -> Image.Image:
         result.metrics,
         None
         if found is None
-        else Deciding(_numbers(found.samples.points), found.of_other.cpu().numpy(), found.states.cpu().numpy()),
+        else Deciding(
+            _numbers(found.samples.points),
+            found.of_other.cpu().numpy(),
+            found.states.cpu().numpy(),
+            found.distinguishable,
+        ),
     )
     return _drawn(shown)
 
@@ -89,7 +94,8 @@ def stored_picture(open_file: Callable[[str], BinaryIO]) -> bytes:
     deciding = None
     with suppress(FileNotFoundError):
         vertices = _vertices(read(DIFFERENCE))
-        deciding = Deciding(_columns(vertices, "x", "y", "z"), vertices["candidate"] == 2, vertices["state"])
+        apart = document["candidates"][1]["difference"]["distinguishable"]
+        deciding = Deciding(_columns(vertices, "x", "y", "z"), vertices["candidate"] == 2, vertices["state"], apart)
     camera = document.get("camera")
     shown = _Shown(
         _cloud(read("scene_points.ply")),

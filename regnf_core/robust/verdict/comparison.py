@@ -66,7 +66,7 @@ def compare(one: Placed, other: Placed) -> Comparison:
     parts = [placed.in_scene()[side.differs] for placed, side in zip((one, other), sides, strict=True)]
     of_other = torch.cat([torch.full((len(part),), of_it) for part, of_it in zip(parts, (False, True), strict=True)])
     states = torch.cat([side.states()[side.differs] for side in sides])
-    return Comparison(found, DecidingSurface(SurfaceSamples.cat(parts), of_other, states))
+    return Comparison(found, DecidingSurface(SurfaceSamples.cat(parts), of_other, states, found.distinguishable))
 
 
 def decides_for_other(found: Difference) -> bool:

@@ -21,6 +21,7 @@ from regnf_core.document import (
     CameraView,
     Candidate,
     DecidingSurface,
+    Difference,
     ObjectSymmetry,
     ResultDocument,
     ranking_document,
@@ -166,8 +167,13 @@ def test_a_search_shows_where_its_first_two_candidates_differ(chair_run: ChairRu
     """In one more panel and a cloud, which says of each point whose it is and what the scene says there."""
     some = chair_run.result.object_samples.transformed(chair_run.result.T_scene_object)[::8]
     number = torch.arange(len(some))
-    deciding = DecidingSurface(some, number % 2 == 1, (number % 3).to(torch.uint8))
-    names = write_artifacts(replace(chair_run.result, deciding=deciding), tmp_path)
+    deciding = DecidingSurface(some, number % 2 == 1, (number % 3).to(torch.uint8), True)
+    ranking = [
+        Candidate("a", "refined", 0.0),
+        Candidate("b", "refined", 0.1, difference=Difference(0.1, 0.1, 1.0, True)),
+    ]
+    said = {"candidates": ranking_document(ranking, {})}
+    names = write_artifacts(replace(chair_run.result, deciding=deciding), tmp_path, **said)
     assert set(names) == {*NAMES, "difference.ply"}
     cloud = trimesh.load(tmp_path / "difference.ply")
     np.testing.assert_allclose(cloud.vertices, some.points, atol=1e-5)
@@ -185,15 +191,17 @@ def test_a_search_shows_where_its_first_two_candidates_differ(chair_run: ChairRu
 
 
 @pytest.mark.parametrize(
-    ("states", "said"),
+    ("states", "apart", "said"),
     [
-        ([0, 1, 1, 2], "Of what was seen, 67 % speaks for the first."),
-        ([2, 2, 2, 2], "None of it was seen: it tells nothing."),
+        ([0, 1, 1, 2], True, "Of what was seen, 67 % speaks for the first."),
+        ([0, 1, 1, 2], False, "Too little of it was seen to tell the two apart."),
     ],
 )
-def test_a_part_that_is_there_speaks_for_its_owner_else_for_the_other(states: list[int], said: str) -> None:
+def test_a_part_that_is_there_speaks_for_its_owner_else_for_the_other(
+    states: list[int], apart: bool, said: str
+) -> None:
     whose = np.array([False, True, False, True])
-    assert Deciding(np.zeros((4, 3)), whose, np.array(states, np.uint8)).conclusion() == said
+    assert Deciding(np.zeros((4, 3)), whose, np.array(states, np.uint8), apart).conclusion() == said
 
 
 def test_of_a_detection_in_an_image_too(chair_run: ChairRun, tmp_path: Path) -> None:
