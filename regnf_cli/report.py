@@ -174,10 +174,20 @@ def show_ranking(document: dict[str, Any], top: int) -> None:
         verdict = f"{one['verdict']} ({one['verdict_reason']})" if one["verdict"] else f"not refined ({one['stage']})"
         table.add_row(str(number), escape(one["object"]), score, in_percent(one), escape(verdict))
     out.print(table)
+    for number, one in enumerate(ranked[:top], 1):
+        if (found := one.get("difference")) is not None:
+            _line("", f"{number} {difference_in_words(found)}")
     if len(ranked) > top:
         _line("", f"and {len(ranked) - top} more")
     for one in document["candidates"][len(ranked) :]:
         _line("", f"no object: {one['object']} ({one['verdict_reason']})")
+
+
+def difference_in_words(difference: dict[str, Any]) -> str:
+    """Whether what was seen tells a candidate of a search from the first one, to follow its number."""
+    if not difference["distinguishable"]:
+        return "cannot be told apart from the first by what was seen"
+    return f"is told apart from the first by {100 * difference['seen']:.1f} % of the surface, which was seen"
 
 
 def axis_in_words(axis: Sequence[float]) -> str:

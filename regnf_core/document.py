@@ -124,6 +124,25 @@ class CameraView:
     object_unit: float | None = None
 
 
+SHOWN, ABSENT, UNKNOWN = range(3)
+"""What the scene says of a place of a candidate's surface: it is there, the scene is free there, or neither is clear:
+mostly since it was not seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class DecidingSurface:
+    """The surface of a search's first two candidates that lies off the other one of them, where they stand.
+
+    samples: (N,), scene frame · of_other (N,) bool: whose: False of the first, True of the other candidate · states
+    (N,) uint8: SHOWN, ABSENT or UNKNOWN · distinguishable: as of the two's :class:`Difference`.
+    """
+
+    samples: SurfaceSamples
+    of_other: Tensor
+    states: Tensor
+    distinguishable: bool
+
+
 @dataclass(frozen=True, eq=False)
 class RegistrationResult(_Posed):
     """The outcome of one registration. The object's pose in the scene is ``T_scene_object``.
@@ -135,7 +154,8 @@ class RegistrationResult(_Posed):
     there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
     symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
     viewers · surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection
-    was made in, where the scene is a recording · level: the strictest named level of the option
+    was made in, where the scene is a recording · deciding: what tells the first two candidates of a search apart,
+    where the first one is accepted and both were refined · level: the strictest named level of the option
     ``acceptance`` that the probability reaches; None: none.
     covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
     becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
@@ -164,6 +184,7 @@ class RegistrationResult(_Posed):
     surroundings: SurfaceSamples | None = None
     camera: CameraView | None = None
     level: Acceptance | None = None
+    deciding: DecidingSurface | None = None
 
     @property
     def T_camera_object(self) -> Sim3 | None:

@@ -9,12 +9,12 @@ found.ranking[0].name, found.result.T_object_scene
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 
-from regnf_core.document import Candidate, Difference, ProgressCallback, RegistrationResult
+from regnf_core.document import Candidate, ProgressCallback, RegistrationResult
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
@@ -34,7 +34,7 @@ from regnf_core.robust.pipeline import (
 from regnf_core.robust.problem import RegistrationProblem, make_problem, pose_bound
 from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.search.bounds import start_rotations
-from regnf_core.robust.verdict.comparison import decides_for_other, difference
+from regnf_core.robust.verdict.comparison import Comparison, compare, decides_for_other
 from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates, level_of
 from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
@@ -121,6 +121,8 @@ def search_library(
             result = register_robust(*pair, options, seed, Run(None), None, first.model, view)
         else:
             result = result_of(problem, evaluation, options, seed, view.evaluations + evaluations)
+            if told_apart:
+                result = replace(result, deciding=told_apart[0].surface)
     if clouds:
         with run.phase("exporting"):
             result = with_clouds(result, scene, first.field(), detection, cloud_region(detection))
@@ -129,7 +131,7 @@ def search_library(
     for (other, number, _, _), apart in zip(refined[1:], told_apart, strict=True):
         likely = other.metrics["probability"]
         told = (other.found.verdict, other.found.reason, other.T, likely, level_of(likely))
-        ranking.append(Candidate(library[number].name, "refined", other.metrics["score"], *told, apart))
+        ranking.append(Candidate(library[number].name, "refined", other.metrics["score"], *told, apart.difference))
     listed = {number for _, number, _, _ in refined}
     ranking += [Candidate(library[number].name, "coarse", score) for score, number, _ in coarse if number not in listed]
     listed |= {number for _, number, _ in coarse}
@@ -140,17 +142,17 @@ def search_library(
 _Refined = tuple[Evaluation, int, RegistrationProblem, int]
 
 
-def _decided(refined: list[_Refined]) -> list[Difference]:
+def _decided(refined: list[_Refined]) -> list[Comparison]:
     """Move the candidate that the surface speaks for by which it differs from the likeliest one to the first place.
     Returns what tells each of the others from the first."""
     placed = {found[1]: found[0].placed(found[2]) for found in refined}
     for found in refined[1:]:
-        apart = difference(placed[refined[0][1]], placed[found[1]])
-        if decides_for_other(apart):
+        apart = compare(placed[refined[0][1]], placed[found[1]])
+        if decides_for_other(apart.difference):
             refined.remove(found)
             refined.insert(0, found)
             break
-    return [difference(placed[refined[0][1]], placed[found[1]]) for found in refined[1:]]
+    return [compare(placed[refined[0][1]], placed[found[1]]) for found in refined[1:]]
 
 
 def rank_by_signature(view: SceneView, models: Sequence[ObjectModel]) -> list[tuple[int, float]]:

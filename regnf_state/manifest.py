@@ -26,6 +26,7 @@ ARTIFACTS: dict[str, str] = {
     "object_points.ply": _BINARY,
     "aligned.ply": _BINARY,
     "context_points.ply": _BINARY,
+    "difference.ply": _BINARY,
     "residuals.npz": _BINARY,
     "considered.npz": _BINARY,
     "trace.json": "application/json",

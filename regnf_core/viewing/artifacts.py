@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from regnf_core.document import IterationRecord, RegistrationResult, json_number, result_document
+from regnf_core.document import DecidingSurface, IterationRecord, RegistrationResult, json_number, result_document
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.schema.similarity import local_origin
+from regnf_core.viewing.difference_panel import DIFFERENCE, STATE_COLORS
 from regnf_core.viewing.registration_picture import FAST, OBJECT_COLOR, SCENE_COLOR, registration_picture
 
 # Point clouds as binary little-endian PLY, which every viewer reads.
@@ -22,16 +23,21 @@ _TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
 def write_ply(
-    path: Path, points: NDArray[np.float32 | np.float64], normals: NDArray[Any], colors: NDArray[np.uint8]
+    path: Path,
+    points: NDArray[np.float32 | np.float64],
+    normals: NDArray[Any],
+    colors: NDArray[np.uint8],
+    **labels: NDArray[Any],
 ) -> None:
-    """Write points (N, 3) in their own precision, unit normals (N, 3) and colors (N, 3), 0 to 255."""
+    """Write points (N, 3) in their own precision, unit normals (N, 3), colors (N, 3), 0 to 255, and labels (N,), whole
+    numbers as small, by their names."""
     columns = {
         **dict.fromkeys(("x", "y", "z"), "f8" if points.dtype == np.float64 else "f4"),
         **dict.fromkeys(("nx", "ny", "nz"), "f4"),
-        **dict.fromkeys(("red", "green", "blue"), "u1"),
+        **dict.fromkeys(("red", "green", "blue", *labels), "u1"),
     }
     vertices = np.empty(points.shape[0], dtype=[(name, f"<{code}") for name, code in columns.items()])
-    for name, values in zip(columns, np.hstack([points.astype(np.float64), normals, colors]).T, strict=True):
+    for name, values in zip(columns, [*points.T, *normals.T, *colors.T, *labels.values()], strict=True):
         vertices[name] = values
     header = [
         "ply",
@@ -58,7 +64,7 @@ def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
 CONTEXT_COLOR = (0.80, 0.82, 0.85)
 _CONTEXT, PICTURE = "context_points.ply", "preview.png"
 CLOUDS = ("scene_points.ply", "object_points.ply", "aligned.ply", "residuals.npz", _CONTEXT)
-"""What ``write_clouds`` may write."""
+"""What ``write_clouds`` may write, beside ``DIFFERENCE`` where the result has a deciding surface."""
 
 
 def write_artifacts(
@@ -102,7 +108,9 @@ def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
 def write_clouds(result: RegistrationResult, directory: Path) -> list[str]:
     """Of a result with clouds: scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both,
     scene frame, colored by source), residuals.npz, context_points.ply (the scene around the detection, if the result
-    has it). The picture can be drawn of them: ``regnf_core.viewing.registration_picture.stored_picture``.
+    has it), difference.ply (where a search's first two candidates differ, scene frame, colored by what the scene says
+    there, if the result has it). The picture can be drawn of them:
+    ``regnf_core.viewing.registration_picture.stored_picture``.
     """
     scene, obj = result.scene_samples, result.object_samples
     placed = obj.transformed(result.T_scene_object)
@@ -111,10 +119,21 @@ def write_clouds(result: RegistrationResult, directory: Path) -> list[str]:
     _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))
     arrays: dict[str, Any] = {name: _numbers(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
-    if result.surroundings is None or not len(result.surroundings.points):
-        return [name for name in CLOUDS if name != _CONTEXT]
-    _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
-    return list(CLOUDS)
+    names = [name for name in CLOUDS if name != _CONTEXT]
+    if result.surroundings is not None and len(result.surroundings.points):
+        _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
+        names.append(_CONTEXT)
+    if result.deciding is not None:
+        _write_difference(directory / DIFFERENCE, result.deciding)
+        names.append(DIFFERENCE)
+    return names
+
+
+def _write_difference(path: Path, deciding: DecidingSurface) -> None:
+    states = deciding.states.cpu().numpy()
+    colors = (255 * STATE_COLORS[states]).round().astype(np.uint8)
+    samples, whose = deciding.samples, 1 + deciding.of_other.cpu().numpy()
+    write_ply(path, _numbers(samples.points), _numbers(samples.normals), colors, candidate=whose, state=states)
 
 
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:

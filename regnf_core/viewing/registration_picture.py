@@ -1,4 +1,5 @@
-"""preview.png: the object over the scene at the start and at the end, and the residuals of both surfaces.
+"""preview.png: the object over the scene at the start and at the end, and the residuals of both surfaces; of a search
+also where its first two candidates differ.
 
 It is drawn of a result, or of its stored files. Torch-free: the front end draws it too.
 """
@@ -11,6 +12,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from regnf_core.viewing.difference_panel import DIFFERENCE, FILL, Deciding, difference_panel
 from regnf_core.viewing.splats import Floats, Surfels, nearest_surfels, paint_half, view_from
 
 if TYPE_CHECKING:
@@ -46,8 +49,10 @@ _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable
 
 
 def registration_picture(result: RegistrationResult) -> Image.Image:
-    """Three panels side by side: at the start, at the end, and the residuals of both surfaces. As the camera of the
-    detection's image sees them, if there is one; else upright in the scene's frame."""
+    """Three panels side by side: at the start, at the end, and the residuals of both surfaces; a fourth one where the
+    result has a deciding surface. As the camera of the detection's image sees them, if there is one; else upright in
+    the scene's frame."""
+    found = result.deciding
     shown = _Shown(
         (_numbers(result.scene_samples.points), _numbers(result.scene_samples.normals)),
         (_numbers(result.object_samples.points), _numbers(result.object_samples.normals)),
@@ -57,6 +62,14 @@ def registration_picture(result: RegistrationResult) -> Image.Image:
         result.options["up_axis"] or "z",
         result.verdict,
         result.metrics,
+        None
+        if found is None
+        else Deciding(
+            _numbers(found.samples.points),
+            found.of_other.cpu().numpy(),
+            found.states.cpu().numpy(),
+            found.distinguishable,
+        ),
     )
     return _drawn(shown)
 
@@ -78,6 +91,11 @@ def stored_picture(open_file: Callable[[str], BinaryIO]) -> bytes:
 
     document = json.loads(read("result.json"))
     arrays = np.load(io.BytesIO(read("residuals.npz")), allow_pickle=False)
+    deciding = None
+    with suppress(FileNotFoundError):
+        vertices = _vertices(read(DIFFERENCE))
+        apart = document["candidates"][1]["difference"]["distinguishable"]
+        deciding = Deciding(_columns(vertices, "x", "y", "z"), vertices["candidate"] == 2, vertices["state"], apart)
     camera = document.get("camera")
     shown = _Shown(
         _cloud(read("scene_points.ply")),
@@ -88,6 +106,7 @@ def stored_picture(open_file: Callable[[str], BinaryIO]) -> bytes:
         document["options"]["up_axis"] or "z",
         document["verdict"],
         document["metrics"],
+        deciding,
     )
     written = io.BytesIO()
     _drawn(shown).save(written, "PNG", compress_level=FAST)
@@ -95,15 +114,21 @@ def stored_picture(open_file: Callable[[str], BinaryIO]) -> bytes:
 
 
 def _cloud(data: bytes) -> tuple[Floats, Floats]:
-    """Points and normals (N, 3) of a binary PLY file of nothing but vertices."""
+    """Points and normals (N, 3) of a PLY file."""
+    vertices = _vertices(data)
+    return _columns(vertices, "x", "y", "z"), _columns(vertices, "nx", "ny", "nz")
+
+
+def _vertices(data: bytes) -> NDArray[Any]:
+    """The rows of a binary PLY file of nothing but vertices, by the names of their properties."""
     header, _, rows = data.partition(b"end_header\n")
     said = [line.split() for line in header.decode("ascii").splitlines()]
-    vertices = np.frombuffer(rows, np.dtype([(line[2], _PLY_TYPES[line[1]]) for line in said if line[0] == "property"]))
+    columns = [(line[2], _PLY_TYPES[line[1]]) for line in said if line[0] == "property"]
+    return np.frombuffer(rows, np.dtype(columns))
 
-    def columns(*names: str) -> Floats:
-        return np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
 
-    return columns("x", "y", "z"), columns("nx", "ny", "nz")
+def _columns(vertices: NDArray[Any], *names: str) -> Floats:
+    return np.stack([vertices[name] for name in names], axis=1).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -119,6 +144,7 @@ class _Shown:
     up_axis: str
     verdict: str
     metrics: Mapping[str, float]
+    deciding: Deciding | None
 
 
 def _drawn(shown: _Shown) -> Image.Image:
@@ -141,9 +167,15 @@ def _drawn(shown: _Shown) -> Image.Image:
         paint_half(after, in_front, view, _BACKGROUND),
         paint_half(residual, in_front, view, _BACKGROUND),  # the same discs in other colors
     ]
-    sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
-    for number, panel in enumerate(panels):
-        sheet.paste(Image.fromarray(panel), (number * _PANEL, _CAPTION))
+    pictures = [Image.fromarray(panel) for panel in panels]
+    if shown.deciding is not None:
+        around = np.concatenate([after.points, shown.deciding.points])
+        wider = view_from(direction, up, around, edge, FILL)
+        pictures.append(difference_panel(after, radius, shown.deciding, wider, edge, _BACKGROUND))
+    width = len(pictures) * _PANEL
+    sheet = Image.new("RGB", (width, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
+    for number, picture in enumerate(pictures):
+        sheet.paste(picture, (number * _PANEL, _CAPTION))
     _captions(sheet, shown)
     return sheet
 
@@ -201,6 +233,8 @@ def _captions(sheet: Image.Image, shown: _Shown) -> None:
         (shown.verdict.capitalize(), f"scale {scale:.4f}, after {int(shown.metrics['iterations'])} iterations"),
         ("Residual", "|S_object(T x) - s S_scene(x)|"),
     ]
+    if shown.deciding is not None:
+        texts.append(("Where the first two candidates differ", shown.deciding.conclusion()))
     for number, (heading, note) in enumerate(texts):
         left = number * _PANEL + 24
         draw.text((left, 16), heading, fill=_INK, font=title)

@@ -114,6 +114,18 @@ def test_a_ranking_is_printed_as_far_as_asked(capfd: pytest.CaptureFixture[str])
     ]
 
 
+def test_a_ranking_says_whether_candidates_can_be_told_apart(capfd: pytest.CaptureFixture[str]) -> None:
+    ranked = [candidate(name, "refined", 0.01, "registered") for name in "abc"]
+    ranked[1]["difference"] = {"differs": 0.05, "seen": 0.037, "favor": 1.0, "distinguishable": True}
+    ranked[2]["difference"] = {"differs": 0.05, "seen": 0.004, "favor": 0.0, "distinguishable": False}
+    show_ranking({"candidates": ranked}, 3)
+    told = [line.strip() for line in capfd.readouterr().out.splitlines()][-2:]
+    assert told == [
+        "2 is told apart from the first by 3.7 % of the surface, which was seen",
+        "3 cannot be told apart from the first by what was seen",
+    ]
+
+
 def searching() -> Answers:
     """A service whose search puts the armchair first."""
     shas = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in CHAIRS}

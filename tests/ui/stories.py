@@ -166,9 +166,10 @@ def _searched(data: Synthetic) -> dict[str, Any]:
                 "verdict_reason": reason, "T_object_scene": None, "level": verdict and "strict",
                 "probability": verdict and 0.99}  # fmt: skip
 
+    apart = {"differs": 0.05, "seen": 0.037, "favor": 1.0, "distinguishable": True}
     ranking = [
         candidate(0xA0, "refined", 0.021, "registered"),
-        candidate(0xA1, "refined", 0.34, "rejected") | {"probability": 0.3, "level": None},
+        candidate(0xA1, "refined", 0.34, "rejected") | {"probability": 0.3, "level": None, "difference": apart},
         *(candidate(0xB0 + k, "coarse", 0.4 + k / 100) for k in range(6)),
         *(candidate(0xC0 + k, "signature", 0.2) for k in range(3)),
         candidate(0xD0, "unusable", None),

@@ -46,13 +46,14 @@ def test_the_request_reaches_the_engine(
     assert (None if initial is None else initial.matrix().tolist()) == start
 
 
-@pytest.mark.parametrize("pictures", [True, False])
+@pytest.mark.parametrize(("pictures", "apart"), [(True, True), (True, False), (False, True)])
 def test_a_search_makes_clouds_for_its_pictures_alone(
-    pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pictures: bool, apart: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the winner, once the result is out."""
     calls: list[Any] = []
-    found = SimpleNamespace(ranking=[SimpleNamespace(name="c" * 64)], result="a result")
+    result = SimpleNamespace(camera=None, deciding="a surface" if apart else None)
+    found = SimpleNamespace(ranking=[SimpleNamespace(name="c" * 64)], result=result)
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.library.search_library", lambda *_, **how: calls.append(how) or found)
     monkeypatch.setattr("regnf_core.document.ranking_document", lambda *_: [])
@@ -64,6 +65,7 @@ def test_a_search_makes_clouds_for_its_pictures_alone(
     made = Engine("cpu").search(Path("scene"), several, request, lambda phase, share: None, tmp_path, {})
     assert calls == [{"clouds": False}]
     assert (made.names, bool(made.to_come)) == (["result.json"], pictures)
+    assert ("difference.ply" in made.to_come) == (pictures and apart)
     if pictures:
         assert made.finish() == ["scene", "c"]
 

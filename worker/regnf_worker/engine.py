@@ -132,6 +132,7 @@ class Engine:
         from regnf_core.fields.build import open_field
         from regnf_core.library import LibraryObject, search_library, with_late_clouds
         from regnf_core.viewing.artifacts import CLOUDS, PICTURE, write_clouds, write_result
+        from regnf_core.viewing.difference_panel import DIFFERENCE
 
         _one_thread()
 
@@ -159,7 +160,8 @@ class Engine:
             shown = with_late_clouds(result, place.field, thing, box, options)
             return [*place.draw(result, thing, folder), *write_clouds(shown, folder)]
 
-        return Made(names, (*place.pictures, *CLOUDS), finish, (PICTURE,)) if request.pictures else Made(names)
+        clouds = CLOUDS if result.deciding is None else (*CLOUDS, DIFFERENCE)
+        return Made(names, (*place.pictures, *clouds), finish, (PICTURE,)) if request.pictures else Made(names)
 
     def render(
         self,

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.document import Difference
+from regnf_core.document import ABSENT, SHOWN, UNKNOWN, DecidingSurface, Difference
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.robust.constants import EVIDENCE, VERDICT
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.residuals import Residuals, residuals
@@ -37,9 +38,23 @@ class Placed:
         places = other.T.apply(self.T.apply_inverse(points.double()))
         return other.problem.held_out.obj.value_and_gradient(places.to(points))[0].abs()
 
+    def in_scene(self) -> SurfaceSamples:
+        """The held-out samples where the pose puts them, in the scene's own frame, on the CPU."""
+        samples = self.problem.held_out.object_samples
+        own = SurfaceSamples(self.problem.model.frame.out_of(samples.points), samples.normals)
+        return own.transformed(self.problem.in_field_frames(self.T).inverse())
 
-def difference(one: Placed, other: Placed) -> Difference:
-    """What tells two candidates of one view apart. Evaluates both objects' fields at each other's samples."""
+
+@dataclass(frozen=True)
+class Comparison:
+    """What tells two candidates of one view apart, in numbers, and the surface that these are of."""
+
+    difference: Difference
+    surface: DecidingSurface
+
+
+def compare(one: Placed, other: Placed) -> Comparison:
+    """Evaluates both objects' fields at each other's samples."""
     sides = [_Side.of(one, other), _Side.of(other, one)]
     count = sum(len(side.differs) for side in sides)
     differs = sum(int(side.differs.sum()) for side in sides)
@@ -47,7 +62,11 @@ def difference(one: Placed, other: Placed) -> Difference:
     # What is there of the one and what is not there of the other speak for the one.
     for_one, for_other = (int(mine.shown.sum()) + int(its.absent.sum()) for mine, its in (sides, sides[::-1]))
     favor = (for_one - for_other) / max(seen, 1)
-    return Difference(differs / count, seen / count, favor, seen >= VERDICT.min_deciding * count)
+    found = Difference(differs / count, seen / count, favor, seen >= VERDICT.min_deciding * count)
+    parts = [placed.in_scene()[side.differs] for placed, side in zip((one, other), sides, strict=True)]
+    of_other = torch.cat([torch.full((len(part),), of_it) for part, of_it in zip(parts, (False, True), strict=True)])
+    states = torch.cat([side.states()[side.differs] for side in sides])
+    return Comparison(found, DecidingSurface(SurfaceSamples.cat(parts), of_other, states, found.distinguishable))
 
 
 def decides_for_other(found: Difference) -> bool:
@@ -73,3 +92,8 @@ class _Side:
         differs = mine.on_other(other).cpu() > EVIDENCE.agreement
         shown = differs & observed & (value.abs() <= EVIDENCE.close) & (cosine >= EVIDENCE.min_inlier_cosine)
         return cls(differs, shown, differs & observed & (value > EVIDENCE.agreement))
+
+    def states(self) -> Tensor:
+        """(M,) uint8, as in :class:`regnf_core.document.DecidingSurface`."""
+        unknown = torch.full_like(self.shown, UNKNOWN, dtype=torch.uint8)
+        return unknown.masked_fill(self.shown, SHOWN).masked_fill(self.absent, ABSENT)

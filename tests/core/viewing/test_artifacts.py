@@ -20,6 +20,8 @@ from regnf_core.document import (
     Alternative,
     CameraView,
     Candidate,
+    DecidingSurface,
+    Difference,
     ObjectSymmetry,
     ResultDocument,
     ranking_document,
@@ -28,6 +30,7 @@ from regnf_core.document import (
 from regnf_core.errors import VERDICT_REASONS
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.viewing.artifacts import write_artifacts
+from regnf_core.viewing.difference_panel import Deciding
 from regnf_core.viewing.registration_picture import stored_picture
 from regnf_core.viewing.splats import Surfels, View, nearest_surfels, paint, paint_half, render
 from tests.core.conftest import ChairRun
@@ -158,6 +161,47 @@ def test_the_picture_can_be_drawn_of_the_stored_files(folder: Path) -> None:
     with Image.open(folder / "preview.png") as first, Image.open(BytesIO(stored_picture(opened(folder)))) as image:
         apart = np.asarray(first).astype(int) - np.asarray(image)
     assert (np.abs(apart) > 8).mean() < 0.001, "clouds are stored in single precision"
+
+
+def test_a_search_shows_where_its_first_two_candidates_differ(chair_run: ChairRun, tmp_path: Path) -> None:
+    """In one more panel and a cloud, which says of each point whose it is and what the scene says there."""
+    some = chair_run.result.object_samples.transformed(chair_run.result.T_scene_object)[::8]
+    number = torch.arange(len(some))
+    deciding = DecidingSurface(some, number % 2 == 1, (number % 3).to(torch.uint8), True)
+    ranking = [
+        Candidate("a", "refined", 0.0),
+        Candidate("b", "refined", 0.1, difference=Difference(0.1, 0.1, 1.0, True)),
+    ]
+    said = {"candidates": ranking_document(ranking, {})}
+    names = write_artifacts(replace(chair_run.result, deciding=deciding), tmp_path, **said)
+    assert set(names) == {*NAMES, "difference.ply"}
+    cloud = trimesh.load(tmp_path / "difference.ply")
+    np.testing.assert_allclose(cloud.vertices, some.points, atol=1e-5)
+    data = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    assert (data["candidate"].ravel() == 1 + number.numpy() % 2).all()
+    assert (data["state"].ravel() == number.numpy() % 3).all()
+    assert len(np.unique(cloud.colors[:, :3], axis=0)) == 3
+    with Image.open(tmp_path / "preview.png") as first, Image.open(BytesIO(stored_picture(opened(tmp_path)))) as image:
+        apart = np.asarray(first).astype(int) - np.asarray(image)
+        shown = np.asarray(first.convert("RGB")).astype(int)[52:450, 3 * 480 :]
+    assert apart.shape[1] == 4 * 480
+    assert (np.abs(apart) > 8).mean() < 0.001
+    for color in (0, 115, 77), (214, 38, 31), (120, 112, 158):  # of what is not hidden
+        assert (np.abs(shown - color).max(-1) < 6).sum() > 100
+
+
+@pytest.mark.parametrize(
+    ("states", "apart", "said"),
+    [
+        ([0, 1, 1, 2], True, "Of what was seen, 67 % speaks for the first."),
+        ([0, 1, 1, 2], False, "Too little of it was seen to tell the two apart."),
+    ],
+)
+def test_a_part_that_is_there_speaks_for_its_owner_else_for_the_other(
+    states: list[int], apart: bool, said: str
+) -> None:
+    whose = np.array([False, True, False, True])
+    assert Deciding(np.zeros((4, 3)), whose, np.array(states, np.uint8), apart).conclusion() == said
 
 
 def test_of_a_detection_in_an_image_too(chair_run: ChairRun, tmp_path: Path) -> None:

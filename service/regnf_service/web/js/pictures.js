@@ -7,13 +7,13 @@ const PAPER = [225, 242]; // the least of a pixel's red, green and blue: from op
 
 /**
  * A canvas with the PNG of a blob; label: what a screen reader says of it, empty for mere decoration. panels: numbers of
- * those of its three square panels that are shown, without the captions above, which nobody can read in a small picture.
+ * those of its square panels that are shown, without the captions above, which nobody can read in a small picture.
  * onPaper: whether it is drawn on white paper, which is left out, for a page may be dark.
  */
 export async function canvasOf(blob, label, panels = null, onPaper = true) {
   const picture = await createImageBitmap(blob);
   const said = label ? { role: 'img', 'aria-label': label } : { 'aria-hidden': 'true' };
-  const step = panels ? picture.width / 3 : picture.width;
+  const step = panels ? picture.width / Math.ceil(picture.width / picture.height) : picture.width;
   const caption = panels ? picture.height - step : 0;
   const rim = caption / 3; // captions reach a little into the panels
   const [width, height] = [step - 2 * rim, picture.height - caption - 2 * rim];

@@ -1,7 +1,7 @@
 // The ranking of a search through a library: which object it most likely is, and what became of the others.
 
 import { byId, el, show } from './dom.js';
-import { number, sure, words } from './format.js';
+import { number, percent, sure, words } from './format.js';
 
 const SHOWN = 8;
 const STAGES = {
@@ -27,11 +27,18 @@ async function nameRows(names, rows) {
   }
 }
 
-function row({ object, stage, score, verdict, verdict_reason: reason, probability, level }, i) {
+function row({ object, stage, score, verdict, verdict_reason: reason, probability, level, difference }, i) {
   const name = el('span', { title: object, 'data-object': object }, object.slice(0, 12));
   const judged = Number.isFinite(probability) ? `${words(verdict)}, ${sure(probability, level)}` : words(verdict);
   const end = verdict ? judged : STAGES[stage] ?? stage;
   return el('li', { 'data-verdict': verdict ?? '', className: i === 0 ? 'first' : '' }, name,
     el('span', { title: reason ?? '' }, end),
-    el('span', { className: 'mono' }, Number.isFinite(score) ? number(score, 3) : '–'));
+    el('span', { className: 'mono' }, Number.isFinite(score) ? number(score, 3) : '–'),
+    difference ? el('span', { className: 'note' }, toldApart(difference)) : '');
+}
+
+/** Whether what was seen tells a candidate from the first one. */
+function toldApart({ distinguishable, seen }) {
+  if (!distinguishable) return 'cannot be told apart from the first by what was seen';
+  return `told apart from the first by ${percent(seen)} of the surface, which was seen`;
 }
