@@ -228,23 +228,21 @@ def _number(row: Tensor, local: Tensor, edge: int) -> Tensor:
 
 
 class VoxelBlocksField(FunctionField[VoxelBlocksFunction]):
-    """A :class:`VoxelBlocksFunction` as an SdfField, by compiled code where there is such."""
+    """A :class:`VoxelBlocksFunction` as an SdfField. Where there is compiled code, it has no use for chunks."""
 
     def native_model(self) -> NativeModel | None:
         """For compiled code, which reads the values where they are."""
-        map, steps = self.function, compiled.steps_for()
-        if steps is None or not _suits(map):
+        own, steps = self.function, compiled.steps_for()
+        if steps is None or not _suits(own):
             return None
-        index, lengths = map.index, (map.voxel_size, map.outward)
-        box = index.low, index.size
-        described = compiled.blocks(
-            box, self._slots, index.table, index.step, map.origin, lengths, map.values, map.blocks
-        )
+        box, lengths = (own.index.low, own.index.size), (own.voxel_size, own.outward)
+        table, step = own.index.table, own.index.step
+        described = compiled.blocks(box, self._slots, table, step, own.origin, lengths, own.values, own.blocks)
         return NativeModel(steps.blocks, described)
 
     @cached_property
     def _slots(self) -> Tensor:
-        """Made when it is first needed."""
+        """Made when compiled code first needs them: to open a map takes no longer."""
         steps = compiled.steps_for()
         assert steps is not None
         return compiled.block_slots(steps, self.function.index.keys, self.function.index.rows)
@@ -264,17 +262,16 @@ def _given(points: Tensor) -> Tensor:
     return points.detach().to(device="cpu", dtype=torch.float32)
 
 
-def _suits(map: VoxelBlocksFunction) -> bool:
+def _suits(function: VoxelBlocksFunction) -> bool:
     """Whether the arrays are as compiled code reads them: it trusts their sizes."""
-    values, edge, count = map.values, map.values.shape[-1], len(map.blocks)
-    whole = (map.blocks, map.index.table, map.index.keys, map.index.rows)
+    values, index, blocks = function.values, function.index, function.blocks
+    whole = (blocks, index.keys, index.rows, index.table)
     return (
-        values.device.type == "cpu"
+        all(one.device.type == "cpu" and one.is_contiguous() for one in (values, *whole))
+        and all(one.dtype == torch.int64 for one in whole)
         and values.dtype in (torch.float32, torch.float16)
-        and values.is_contiguous()
-        and values.shape == (count, edge, edge, edge)
-        and all(one.device.type == "cpu" and one.dtype == torch.int64 for one in whole)
-        and len(map.index.rows) == count
+        and values.shape == (len(blocks), *values.shape[-1:] * 3)
+        and len(index.rows) == len(blocks)
     )
 
 

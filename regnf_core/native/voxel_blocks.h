@@ -89,56 +89,73 @@ INLINE void corners_of(const regnf_blocks *map, const float *cell, cell_corners 
     }
 }
 
-/* The least that the blocks nearby allow at the corners `wanted` (a bit for each), which lie in one block that the map
- * does not have: the value of a block's nearest node, and the distance to it. */
-static void allowed_values(const regnf_blocks *map, const int64_t *rows, const cell_corners *at, int wanted,
-                           float *values) {
-    const int64_t edge = map->edge;
+/* Where corner c takes its part of an axis from: 1 for the upper one. */
+#define UPPER(c, axis) ((c) >> (2 - (axis)) & 1)
+
+/* The least that the blocks nearby allow at the corners, in place of those that are in a block that the map does not
+ * have: the value of a block's nearest node, and the distance to it. */
+static void allowed_values(const regnf_blocks *map, const int64_t *rows, const cell_corners *at, float *values) {
+    const int64_t edge = map->edge, nodes = edge * edge * edge;
     const double last = (double)(edge - 1), per_node = (double)(map->outward * map->voxel_size);
     for (int64_t i = 0; i < map->near; i++) {
         int64_t inside[3][2];
-        double squares[3][2];
-        for (int k = 0; k < 3; k++)
+        double squares[3][2], away[8];
+        float allowed[8];
+        for (int k = 0; k < 3; k++) {
+            const double begin = (double)(edge * map->blocks[3 * rows[i] + k]);
             for (int upper = 0; upper < 2; upper++) {
-                const double local = at->node[k][upper] - (double)(edge * map->blocks[3 * rows[i] + k]);
+                const double local = at->node[k][upper] - begin;
                 const double within = local < 0.0 ? 0.0 : local > last ? last : local;
                 inside[k][upper] = (int64_t)within;
                 squares[k][upper] = (local - within) * (local - within);
             }
-        for (int c = 0; c < 8; c++) {
-            const int x = c >> 2, y = c >> 1 & 1, z = c & 1;
-            if (!(wanted >> c & 1)) continue;
-            const int64_t number = ((rows[i] * edge + inside[0][x]) * edge + inside[1][y]) * edge + inside[2][z];
-            const double away = sqrt(squares[0][x] + squares[1][y] + squares[2][z]);
-            const float allowed = (float)(node_value(map, number) + per_node * away);
-            const int less = map->outward * allowed < map->outward * values[c] || allowed != allowed; /* NaN stays */
-            if (i == 0 || less) values[c] = allowed;
         }
+        for (int c = 0; c < 8; c++)
+            away[c] = squares[0][UPPER(c, 0)] + squares[1][UPPER(c, 1)] + squares[2][UPPER(c, 2)];
+        for (int c = 0; c < 8; c++) away[c] = sqrt(away[c]);
+        for (int c = 0; c < 8; c++) {
+            const int64_t row = inside[0][UPPER(c, 0)] * edge + inside[1][UPPER(c, 1)];
+            allowed[c] = node_value(map, rows[i] * nodes + row * edge + inside[2][UPPER(c, 2)]);
+        }
+        for (int c = 0; c < 8; c++) allowed[c] = (float)(allowed[c] + per_node * away[c]);
+        for (int c = 0; c < 8; c++) {
+            const int less = map->outward * allowed[c] < map->outward * values[c];
+            values[c] = (i == 0) | less | (allowed[c] != allowed[c]) ? allowed[c] : values[c]; /* NaN stays */
+        }
+    }
+}
+
+/* The values at a cell's eight corners that one block says: those of corner `of` and of all that lie in its block. */
+INLINE void values_of_block(const regnf_blocks *map, const cell_corners *at, int of, float *values) {
+    const int64_t edge = map->edge;
+    const double block[3] = {at->block[0][UPPER(of, 0)], at->block[1][UPPER(of, 1)], at->block[2][UPPER(of, 2)]};
+    const int64_t row = row_of_block(map, block);
+    if (row < 0) {
+        allowed_values(map, rows_near(map, block), at, values);
+        return;
+    }
+    int64_t along[3][2]; /* of a corner in another block, that of some node here */
+    for (int k = 0; k < 3; k++)
+        for (int upper = 0; upper < 2; upper++) along[k][upper] = (int64_t)at->local[k][upper];
+    for (int c = 0; c < 8; c++) {
+        const int64_t slab = row * edge + along[0][UPPER(c, 0)], line = slab * edge + along[1][UPPER(c, 1)];
+        values[c] = node_value(map, line * edge + along[2][UPPER(c, 2)]);
     }
 }
 
 /* The values at a cell's eight corners. */
 INLINE void corner_values(const regnf_blocks *map, const float *cell, float *values) {
-    const int64_t edge = map->edge;
     cell_corners at;
     corners_of(map, cell, &at);
     int parted = 0; /* the axes along which the upper corners lie in another block, as bits of a corner's number */
     for (int k = 0; k < 3; k++) parted |= (at.block[k][0] != at.block[k][1]) << (2 - k);
-    for (int first = 0; first < 8; first++) { /* of the corners in each block */
-        if ((first & parted) != first) continue;
-        const double block[3] = {at.block[0][first >> 2], at.block[1][first >> 1 & 1], at.block[2][first & 1]};
-        const int64_t row = row_of_block(map, block);
-        int here = 0;
-        for (int c = 0; c < 8; c++) here |= ((c & parted) == first) << c;
-        if (row < 0) {
-            allowed_values(map, rows_near(map, block), &at, here, values);
-            continue;
-        }
-        for (int c = 0; c < 8; c++) {
-            if (!(here >> c & 1)) continue;
-            const int64_t x = (int64_t)at.local[0][c >> 2], y = (int64_t)at.local[1][c >> 1 & 1];
-            values[c] = node_value(map, ((row * edge + x) * edge + y) * edge + (int64_t)at.local[2][c & 1]);
-        }
+    values_of_block(map, &at, 0, values);
+    for (int of = 1; of <= parted; of++) {
+        float others[8];
+        if ((of & parted) != of) continue;
+        values_of_block(map, &at, of, others);
+        for (int c = 0; c < 8; c++)
+            if ((c & parted) == of) values[c] = others[c];
     }
 }
 
