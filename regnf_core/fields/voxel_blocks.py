@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from scipy.spatial import cKDTree
@@ -13,6 +14,8 @@ from torch import Tensor
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.observation import OnDevice
 from regnf_core.fields.user_fields import FunctionField
+from regnf_core.native import steps as compiled
+from regnf_core.native.steps import NativeModel
 from regnf_core.schema.kinds import VoxelBlocksDescription
 
 # Which cells of an endless lattice are occupied, and which occupied cells are nearest to any other.
@@ -224,9 +227,57 @@ def _number(row: Tensor, local: Tensor, edge: int) -> Tensor:
     return ((row * edge + x) * edge + y) * edge + z
 
 
+class VoxelBlocksField(FunctionField[VoxelBlocksFunction]):
+    """A :class:`VoxelBlocksFunction` as an SdfField. Where there is compiled code, it has no use for chunks."""
+
+    def native_model(self) -> NativeModel | None:
+        """For compiled code, which reads the values where they are."""
+        own, steps = self.function, compiled.steps_for()
+        if steps is None or not _suits(own):
+            return None
+        box, lengths = (own.index.low, own.index.size), (own.voxel_size, own.outward)
+        table, step = own.index.table, own.index.step
+        described = compiled.blocks(box, self._slots, table, step, own.origin, lengths, own.values, own.blocks)
+        return NativeModel(steps.blocks, described)
+
+    @cached_property
+    def _slots(self) -> Tensor:
+        """Made when compiled code first needs them: to open a map takes no longer."""
+        steps = compiled.steps_for()
+        assert steps is not None
+        return compiled.block_slots(steps, self.function.index.keys, self.function.index.rows)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        model = self.native_model()
+        return super().signed_distance(points) if model is None else model.value(_given(points))
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        model = self.native_model()
+        if model is None:
+            return super().signed_distance_and_gradient(points)
+        return model.value_and_gradient(_given(points))
+
+
+def _given(points: Tensor) -> Tensor:
+    return points.detach().to(device="cpu", dtype=torch.float32)
+
+
+def _suits(function: VoxelBlocksFunction) -> bool:
+    """Whether the arrays are as compiled code reads them: it trusts their sizes."""
+    values, index, blocks = function.values, function.index, function.blocks
+    whole = (blocks, index.keys, index.rows, index.table)
+    return (
+        all(one.device.type == "cpu" and one.is_contiguous() for one in (values, *whole))
+        and all(one.dtype == torch.int64 for one in whole)
+        and values.dtype in (torch.float32, torch.float16)
+        and values.shape == (len(blocks), *values.shape[-1:] * 3)
+        and len(index.rows) == len(blocks)
+    )
+
+
 def build_voxel_blocks(
     description: VoxelBlocksDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None
-) -> FunctionField[VoxelBlocksFunction]:
+) -> VoxelBlocksField:
     """The field of ``description`` with its values in ``tensors``. colors: (B, R, R, R, 3) of the nodes.
 
     The values keep their device and type; the tensors must have passed :meth:`VoxelBlocksDescription.check_tensors`.
@@ -243,4 +294,4 @@ def build_voxel_blocks(
         float(description.sign),
         None if colors is None else colors.contiguous(),
     )
-    return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
+    return VoxelBlocksField(function, torch.tensor(description.function_bounds, dtype=torch.float64))

@@ -10,6 +10,7 @@
 #include "near.h"
 #include "discs.h"
 #include "mesh.h"
+#include "voxel_blocks.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -110,7 +111,8 @@ void REGNF_ELEMENTARY(REGNF_SET)(int which, const float *x, int64_t count, float
 const regnf_steps REGNF_STEPS(REGNF_SET) = {
     places,         fill,
     begin,          next_places, next_fill, settle, step, score, end,
-    grid_distances, voxel_distances,  mesh_distances,
+    grid_distances, voxel_distances,  block_distances, mesh_distances,
+    block_slots,
     mesh_nodes,     grow_mesh,   mesh_at, mesh_closest, mesh_winding,
     nearest,        nearest_to_cells,
     kernel_sums,    nearest_discs,

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 7 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 8 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -85,6 +85,25 @@ typedef struct {
     const float *values;                        /* z fastest */
 } regnf_voxels;
 
+/* A block's number within the box round all blocks, z fastest, and its row; -1: the slot is empty. */
+typedef struct {
+    int64_t number, row;
+} regnf_slot;
+
+/* Values at the nodes of blocks on an endless lattice, trilinear between them; see voxel_blocks.h. */
+typedef struct {
+    int64_t edge;               /* nodes along an edge of a block */
+    int64_t low[3], size[3];    /* the box round the blocks: its lowest one, and how many along each axis */
+    int64_t bits;               /* there are 1 << bits slots */
+    int64_t step, near;         /* the table names `near` blocks for each step^3 blocks of the box */
+    float origin[3], voxel_size, outward; /* outward: -1 where values are negative in free space */
+    int32_t half;               /* 1: values are float16 */
+    const void *values;         /* (blocks, edge, edge, edge), z fastest; float32 where they are not float16 */
+    const int64_t *blocks;      /* (blocks, 3) */
+    const regnf_slot *slots;    /* a block is in the first free one from where its number is looked for */
+    const int64_t *table;       /* rows of blocks: (size / step, rounded up, near) */
+} regnf_blocks;
+
 /* A triangle mesh, with coordinates within -1 and 1 about its middle, and its hierarchy; see mesh_tree.h. */
 typedef struct {
     int64_t triangles;
@@ -128,7 +147,7 @@ typedef struct {
     float *costs, *of_scene, *of_object; /* means of |r| */
 } regnf_history;
 
-/* One set of the steps; see steps.h, minimize.h, distances.h, near.h, discs.h and mesh.h. */
+/* One set of the steps; see steps.h, minimize.h, distances.h, voxel_blocks.h, near.h, discs.h and mesh.h. */
 typedef struct {
     /* Where the samples of one surface are at all poses, (poses, samples, 3); and their residuals from the other one's
      * distances and gradients there. With NULL for both, its model is asked. */
@@ -144,7 +163,8 @@ typedef struct {
     void (*step)(void *state);
     void (*score)(const void *state, float *scores, float *sizes); /* (poses), and |residuals| (poses, total) */
     void (*end)(void *state);
-    regnf_ask *grid, *voxels, *mesh;
+    regnf_ask *grid, *voxels, *blocks, *mesh;
+    void (*block_slots)(const int64_t *numbers, const int64_t *rows, int64_t count, int64_t bits, regnf_slot *slots);
     int64_t (*mesh_nodes)(int64_t triangles);
     int (*grow_mesh)(const regnf_mesh *);
     void (*mesh_at)(const regnf_mesh *, const double *points, int64_t count, double *value, float *gradient);

@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 7
+_LAYOUT = 8
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -43,7 +43,9 @@ _STEPS: dict[str, tuple[Any, ...]] = {
     "end": (None, _ADDRESS),
     "grid": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "voxels": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "blocks": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "mesh": (ctypes.c_int, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
+    "block_slots": (None, _ADDRESS, _ADDRESS, _COUNT, _COUNT, _ADDRESS),
     "mesh_nodes": (_COUNT, _COUNT),
     "grow_mesh": (ctypes.c_int, _ADDRESS),
     "mesh_at": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),

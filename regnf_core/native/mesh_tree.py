@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -14,12 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.native.library import Steps
-from regnf_core.native.steps import Kept, NativeModel, room
+from regnf_core.native.steps import Kept, NativeModel, in_threads, room
 
 _SLOTS, _NODE_NUMBERS = 8, 26
 """Triangles of a leaf and children of a node; four-byte numbers that a node has for each child. As in mesh_tree.h."""
-_FEW = 4096
-"""Points below which another thread does not pay."""
 _ADDRESS = ctypes.c_void_p
 _ARRAYS = ("vertices", "faces", "nodes", "leaves", "order")
 
@@ -114,10 +111,4 @@ class MeshTree:
                 mesh.address, places[begin:].ctypes.data, end - begin, *(one[begin:].ctypes.data for one in results)
             )
 
-        threads = min(torch.get_num_threads(), len(points) // _FEW)
-        if threads < 2:
-            part(0, len(points))
-            return
-        cuts = np.linspace(0, len(points), 4 * threads + 1).astype(int).tolist()
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(part, cuts[:-1], cuts[1:]))
+        in_threads(part, len(points))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +40,10 @@ _Planes: Any = _structure("Planes", cells=_I64, low=_FLOAT * 3, high=_FLOAT * 3,
 _Voxels: Any = _structure(
     "Voxels", counts=_I64 * 3, low=_FLOAT * 3, high=_FLOAT * 3, spacing=_FLOAT * 3, outward=_FLOAT, values=_ADDRESS
 )
+_Blocks: Any = _structure(
+    "Blocks", edge=_I64, low=_I64 * 3, size=_I64 * 3, bits=_I64, step=_I64, near=_I64, origin=_FLOAT * 3,
+    voxel_size=_FLOAT, outward=_FLOAT, half=_I32, values=_ADDRESS, blocks=_ADDRESS, slots=_ADDRESS, table=_ADDRESS,
+)  # fmt: skip
 _Pair: Any = _structure(
     "Pair", scene_samples=_Samples, object_samples=_Samples, scene=_ADDRESS, obj=_ADDRESS, seen=_ADDRESS,
     hidden=_ADDRESS, ahead=_FLOAT, min_cosine=_FLOAT,
@@ -60,6 +65,8 @@ _DONE, _NO_MEMORY, _NOT_FINITE = range(3)
 """As in field.h."""
 _FARTHEST = 1e150
 """Of coordinates whose squared distances are finite."""
+_FEW = 4096
+"""Points below which another thread does not pay."""
 _AT_ONCE = 2048
 """Points that a compiled model is asked for at once: what is worked out of them stays in a core's own cache."""
 
@@ -108,6 +115,42 @@ def voxels(counts: Sequence[int], low: Tensor, high: Tensor, spacing: Tensor, ou
     return Kept(_Voxels, counts=(_I64 * 3)(*counts), **given, outward=outward, values=values)
 
 
+def block_slots(steps: Steps, numbers: Tensor, rows: Tensor) -> Tensor:
+    """(S, 2) int64: where compiled code finds the rows (N,) of blocks by their numbers (N,), all different and none
+    negative. Of S, a power of two, more than half are free."""
+    bits = len(numbers).bit_length() + 1
+    slots = room(1 << bits, 2, dtype=torch.int64)
+    numbers, rows = numbers.contiguous(), rows.contiguous()
+    steps.block_slots(numbers.data_ptr(), rows.data_ptr(), len(numbers), bits, slots.data_ptr())
+    return slots
+
+
+def blocks(
+    box: tuple[Tensor, Tensor], slots: Tensor, table: Tensor, step: int, origin: Tensor, lengths: tuple[float, float],
+    values: Tensor, blocks: Tensor,
+) -> Kept:  # fmt: skip
+    """regnf_blocks. box: the lowest block and how many there are along each axis, (3,) each · slots: of `block_slots` ·
+    table: (A, B, C, K) rows of the blocks near ``step``^3 · lengths: of a voxel, and outward · values: (B, R, R, R)
+    float32 or float16 · blocks: (B, 3). Whole numbers are int64."""
+    low, size = ((_I64 * 3)(*one.tolist()) for one in box)
+    return Kept(
+        _Blocks, edge=values.shape[1], low=low, size=size, bits=len(slots).bit_length() - 1, step=step,
+        near=table.shape[3], origin=(_FLOAT * 3)(*origin.tolist()), voxel_size=lengths[0], outward=lengths[1],
+        half=values.dtype == torch.float16, values=values, blocks=blocks, slots=slots, table=table,
+    )  # fmt: skip
+
+
+def in_threads(part: Callable[[int, int], None], count: int) -> None:
+    """Call ``part`` with the begins and ends of parts of ``count`` points, in as many threads as torch has."""
+    threads = min(torch.get_num_threads(), count // _FEW)
+    if threads < 2:
+        part(0, count)
+        return
+    cuts = np.linspace(0, count, 4 * threads + 1).astype(int).tolist()
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(part, cuts[:-1], cuts[1:]))
+
+
 # A model of distances that compiled code asks.
 
 
@@ -141,7 +184,7 @@ class NativeModel:
         return NativeModel(**{**vars(self), **changes})
 
     def value(self, points: Tensor) -> Tensor:
-        """f (N,) itself, without the map, at points (N, 3) float32 on the CPU."""
+        """f (N,) itself, without the map, at points (N, 3) float32 on the CPU, in threads where they are many."""
         return self._asked(points, None)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -153,9 +196,14 @@ class NativeModel:
         points, value = points.contiguous(), room(len(points))
         assert points.dtype == torch.float32
         assert points.shape[1:] == (3,)
-        to = None if gradient is None else gradient.data_ptr()
-        if self.ask(self.described.address, points.data_ptr(), len(points), value.data_ptr(), to):
-            raise MemoryError("no memory for the evaluation of a field")
+
+        def part(begin: int, end: int) -> None:
+            to = None if gradient is None else gradient[begin:].data_ptr()
+            at, found = points[begin:].data_ptr(), value[begin:].data_ptr()
+            if self.ask(self.described.address, at, end - begin, found, to):
+                raise MemoryError("no memory for the evaluation of a field")
+
+        in_threads(part, len(points))
         return value
 
     def structure(self) -> Any:
