@@ -356,6 +356,10 @@ class SceneConstants:
     # Diagonals: so far in front of samples of a thing that images show is the object asked. The noise of depths is
     # wider than thin walls: their other face would answer. [simulated frames]
     ahead_of_thing: float = 0.02
+    # Of the option `scene_samples`: with fewer samples of what stands in the box, cells are halved, at most so often.
+    # A halving makes four of one. [derived]
+    enough_foreground: float = 0.125
+    most_further: int = 2
     min_foreground: int = 30  # samples before the support planes; with fewer, these are kept [by hand]
     # Normal roughness. Up to here a field counts as smooth and has no surface offset: a box would else pass for a
     # larger one. Accurate fits have about 0.01. [early fits]

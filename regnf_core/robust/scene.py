@@ -13,7 +13,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.bundle import Bundle, CopiedOnce
 from regnf_core.geometry.metrics import NearestNeighbors
 from regnf_core.options import RobustOptions
-from regnf_core.robust.constants import OCCLUSION, REFINEMENT, SCENE, SUPPORT_PLANES
+from regnf_core.robust.constants import OCCLUSION, REFINEMENT, SAMPLING, SCENE, SUPPORT_PLANES
 from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
 from regnf_core.robust.working_frame import (
     Samples,
@@ -23,6 +23,7 @@ from regnf_core.robust.working_frame import (
     WorkingObservation,
     fixed_generator,
     sample_scene_surface,
+    subsample,
 )
 
 # Occlusion boundaries: surface that a field shows where the space behind an observed surface begins.
@@ -323,9 +324,18 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
     The same at every call: seeds of registrations do not move the samples. Raises InvalidDetectionError
     (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION), InvalidInputError (FIELD_NOT_FINITE).
     """
-    generator = fixed_generator()
     counted = CountingField(scene)
-    sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
+    for further in range(SCENE.most_further + 1):
+        view = _sampled_view(counted, detection, options.scene_samples, further)
+        if len(view.foreground) >= options.scene_samples * SCENE.enough_foreground:
+            break
+    return replace(view, evaluations=counted.evaluations)
+
+
+def _sampled_view(scene: SdfField, detection: OrientedBox, limit: int, further: int) -> SceneView:
+    """The view with at most ``limit`` samples of the foreground. further: by how many halvings the cells are finer."""
+    generator = fixed_generator()
+    sampled = sample_scene_surface(scene, detection, limit * 4**further, generator, SAMPLING.levels + further)
     everything, known = sampled.samples, observation_of(scene)
     observation = None if known is None else WorkingObservation(known, sampled.frame)
     unobserved: UnobservedTest | None = observation
@@ -348,4 +358,5 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
     if len(foreground) < SCENE.min_foreground:
         foreground = observed if len(observed) >= SCENE.min_foreground else everything
     share = float(removed.float().mean())
-    return SceneView(sampled.frame, detection, foreground, sampled.spacing, share, counted.evaluations, observation)
+    foreground = subsample(foreground, limit, generator)
+    return SceneView(sampled.frame, detection, foreground, sampled.spacing, share, 0, observation)

@@ -310,7 +310,7 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     if extent is not None:
         low, high = torch.maximum(low, extent[0]), torch.minimum(high, extent[1])
     inner = crop_to_surface(field.value, low, high, SAMPLING.object_base)
-    cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels)
+    cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels, limit // 4)
     found = _samples_near(field, cells, limit, generator)
     missed = _of_missed_faces(field, cells, found)
     found, missed = (
@@ -333,10 +333,11 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
 
 
 def sample_scene_surface(
-    scene: SdfField, detection: OrientedBox, limit: int, generator: torch.Generator
+    scene: SdfField, detection: OrientedBox, limit: int, generator: torch.Generator, levels: int = SAMPLING.levels
 ) -> SampledField:
     """At most ``limit`` samples of the scene within the grown box; working frame: the box's center, its diagonal 1.
 
+    levels: how often cells are subdivided.
     Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
     InvalidInputError (FIELD_NOT_FINITE).
     """
@@ -357,7 +358,7 @@ def sample_scene_surface(
         edge = known.voxel / detection.diagonal
         low, high = low.maximum(seen.amin(0) - edge), high.minimum(seen.amax(0) + edge)
         low, high = (low, high) if bool((high > low).all()) else (-half, half)
-    cells, space = surface_cells(value, low, high, SAMPLING.scene_base, SAMPLING.levels)
+    cells, space = surface_cells(value, low, high, SAMPLING.scene_base, levels)
     cells = Cells(cells.centers @ rotation.T, cells.values, cells.edge)
     found = _samples_near(field, cells, limit, generator)
     axes = rotation.to(found.points)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 import torch
@@ -67,6 +68,8 @@ class FreeSpace:
 _REACH = 1.15 * 0.5 * 3**0.5
 """Cells whose |value| is beyond this many edges hold no surface; neural fields overstate distances a little."""
 _MAX_CROPS = 8
+_MOST_FURTHER = 2
+"""Subdivisions for small surface: what has less than a sixteenth of the samples is smaller than fields resolve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,24 +90,28 @@ class Cells(Bundle):
 
 
 def surface_cells(
-    value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int
+    value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int, enough: int = 0
 ) -> tuple[Cells, FreeSpace]:
-    """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times.
+    """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times,
+    and further while there are no more than ``enough``.
 
     ``value`` gives the signed distance (N,) at points (N, 3). There may be no such cells. The second result is the free
     space that the values show, on a grid of the finest cells.
     """
-    cells = _grid(value, low, high, base)
-    start = cells.extent()[0]
-    finest = cells.edge / 2**levels
-    size = ((cells.extent()[1] - start) / finest).round().long().tolist()
-    space = FreeSpace(start, finest, torch.zeros(size, dtype=torch.bool))
-    for level in range(levels + 1):
-        if level > 0:
-            cells = _split(value, cells.near())
-        space.mark(cells.centers[cells.values > _REACH * cells.edge], 2 ** (levels - level))
+    cells, coarse = _grid(value, low, high, base), []
+    start, end = cells.extent()
+    for level in count():
+        coarse.append(cells.centers[cells.values > _REACH * cells.edge])
+        near = cells.near()
+        if level >= levels and (len(near.values) > enough or level == levels + _MOST_FURTHER):
+            break
+        cells = _split(value, near)
+    size = ((end - start) / cells.edge).round().long().tolist()
+    space = FreeSpace(start, cells.edge, torch.zeros(size, dtype=torch.bool))
+    for halved, centers in enumerate(reversed(coarse)):
+        space.mark(centers, 2**halved)
     space.mark(cells.centers[cells.values > 0], 1)
-    return cells.near(), space
+    return near, space
 
 
 def crop_to_surface(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int) -> tuple[Tensor, Tensor]:
