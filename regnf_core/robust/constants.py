@@ -359,6 +359,7 @@ class SceneConstants:
     # Of the option `scene_samples`: with fewer samples of what stands in the box, cells are halved, at most so often.
     # A halving makes four of one. [derived]
     enough_foreground: float = 0.125
+    thick: float = 2.0  # cell edges: what is thinner needs finer cells too, or its faces share them [derived]
     most_further: int = 2
     min_foreground: int = 30  # samples before the support planes; with fewer, these are kept [by hand]
     # Normal roughness. Up to here a field counts as smooth and has no surface offset: a box would else pass for a

@@ -327,7 +327,9 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
     counted = CountingField(scene)
     for further in range(SCENE.most_further + 1):
         view = _sampled_view(counted, detection, options.scene_samples, further)
-        if len(view.foreground) >= options.scene_samples * SCENE.enough_foreground:
+        extent = (view.foreground.points @ detection.rotation.to(view.foreground.points)).aminmax(dim=0)
+        thick = float((extent.max - extent.min).min()) >= SCENE.thick * view.spacing
+        if thick and len(view.foreground) >= options.scene_samples * SCENE.enough_foreground:
             break
     return replace(view, evaluations=counted.evaluations)
 

@@ -68,6 +68,8 @@ class FreeSpace:
 _REACH = 1.15 * 0.5 * 3**0.5
 """Cells whose |value| is beyond this many edges hold no surface; neural fields overstate distances a little."""
 _MAX_CROPS = 8
+_THIN = 3.5
+"""Edges: near both faces of a plate that is thinner than two edges lie no more cells."""
 _MOST_FURTHER = 2
 """Subdivisions for small surface: what has less than a sixteenth of the samples is smaller than fields resolve."""
 
@@ -84,6 +86,11 @@ class Cells(Bundle):
         """The cells that may hold surface."""
         return self[self.values.abs() <= _REACH * self.edge]
 
+    def few_or_thin(self, enough: int) -> bool:
+        """Whether there are no more than ``enough`` cells, or the two faces of a thin thing share them."""
+        low, high = self.extent()
+        return len(self.values) <= enough or float((high - low).min()) < _THIN * self.edge
+
     def extent(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner (3,) of all cells."""
         return self.centers.amin(0) - self.edge / 2, self.centers.amax(0) + self.edge / 2
@@ -93,7 +100,7 @@ def surface_cells(
     value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int, enough: int = 0
 ) -> tuple[Cells, FreeSpace]:
     """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times,
-    and further while there are no more than ``enough``.
+    and further while there are no more than ``enough`` or they are a thin layer.
 
     ``value`` gives the signed distance (N,) at points (N, 3). There may be no such cells. The second result is the free
     space that the values show, on a grid of the finest cells.
@@ -103,7 +110,7 @@ def surface_cells(
     for level in count():
         coarse.append(cells.centers[cells.values > _REACH * cells.edge])
         near = cells.near()
-        if level >= levels and (len(near.values) > enough or level == levels + _MOST_FURTHER):
+        if level >= levels and (enough == 0 or level == levels + _MOST_FURTHER or not near.few_or_thin(enough)):
             break
         cells = _split(value, near)
     size = ((end - start) / cells.edge).round().long().tolist()
