@@ -30,7 +30,7 @@ from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.verdict.answer import Relations, choose
-from regnf_core.robust.verdict.comparison import Placed, difference
+from regnf_core.robust.verdict.comparison import Placed, compare
 from regnf_core.robust.verdict.evaluation import held_out_of
 
 Row = dict[str, Any]
@@ -112,7 +112,7 @@ class _Made:
         if question.kind == "right" and right:
             self._right = placed
         elif question.kind in ALTERED and self._right is not None:
-            return {"difference": asdict(difference(self._right, placed))}
+            return {"difference": asdict(compare(self._right, placed)[0])}
         return {}
 
     def model(self, field: SdfField) -> ObjectModel:

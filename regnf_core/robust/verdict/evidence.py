@@ -202,6 +202,8 @@ SPEAKS_FOR = {
     "worst_of_object": False,
     "worst_of_scene": False,
     "worst_normals": False,
+    "excess_of_object": False,
+    "excess_of_scene": False,
     "stretch": False,
     "normals_agree_object": True,
     "normals_agree_scene": True,
@@ -253,6 +255,9 @@ def pose_features(problem: RegistrationProblem, T: Sim3, r: Residuals, offsets: 
         "offset": offsets.abs(),
         "stretch": _stretch(problem, T, r, groups, found["noise"]),
     }
+    # The same disagreement tells more where the surfaces agree closely elsewhere.
+    usual = (found["noise"] + 2.0 * EVIDENCE.min_core) / EVIDENCE.coarse
+    found |= {f"excess_of_{side}": found[f"worst_of_{side}"] / usual for side in ("object", "scene")}
     return {name: found[name].double() for name in SPEAKS_FOR}
 
 
