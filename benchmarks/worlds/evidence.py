@@ -112,7 +112,7 @@ class _Made:
         if question.kind == "right" and right:
             self._right = placed
         elif question.kind in ALTERED and self._right is not None:
-            return {"difference": asdict(compare(self._right, placed)[0])}
+            return {"difference": asdict(compare(self._right, placed).difference)}
         return {}
 
     def model(self, field: SdfField) -> ObjectModel:
