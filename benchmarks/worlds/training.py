@@ -124,17 +124,19 @@ class Trained:
     answers: list[Row]
 
 
-def trained(rows: Sequence[Row]) -> Trained:
-    """All models from the rows of :mod:`benchmarks.worlds.evidence`."""
+def trained(rows: Sequence[Row], prior: dict[str, ProbabilityModel] | None = None) -> Trained:
+    """All models from the rows of :mod:`benchmarks.worlds.evidence`. prior: the models of before, by name: what is
+    learned is how these rows differ from them; a kind of scene without rows keeps its model."""
+    prior = prior or {}
     rows = [row for row in rows if row["features"]]
     groups = np.array([_eighth(row) for row in rows])
     told = _told(rows)
     features = np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows])
     right = np.array([float(row["mssd"] <= SUCCESS) for row in rows])
-    weight = np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * told
+    weight = np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * told * _balance(rows)
     everything = np.ones(len(rows), dtype=bool)
-    alone, _ = train(Evidence(tuple(SPEAKS_FOR), features, right, weight, groups, everything))
-    models: dict[str, Any] = {"alone": alone.to_dict()}
+    evidence = Evidence(tuple(SPEAKS_FOR), features, right, weight, groups, everything)
+    models: dict[str, Any] = {"alone": train(evidence, prior.get("alone"))[0].to_dict()}
     chosen = _answers(rows, ProbabilityModel.from_dict(models["alone"]))
     kinds = np.array([_model_of(row) for row in rows])
     answers: list[Row] = []
@@ -142,11 +144,11 @@ def trained(rows: Sequence[Row]) -> Trained:
     for kind in sorted(set(kinds[chosen.found])):
         of_kind = kinds == kind
         beside = (kinds == "observed") & (kind == "thing")
-        weight = np.where(chosen.winner, 1.0, OF_OTHERS) * told * chosen.found
+        weight = np.where(chosen.winner, 1.0, OF_OTHERS) * told * chosen.found * _balance(rows)
         weight *= np.where(of_kind, 1.0, np.where(beside, BESIDE, 0.0))
         among = Evidence(tuple(SPEAKS_FOR), features, chosen.right, weight, groups, of_kind & chosen.winner)
         among = among.with_feature(LEAD, chosen.leads, np.ones(len(rows)))
-        model, odds = train(among)
+        model, odds = train(among, prior.get(kind))
         models[kind] = model.to_dict()
         for number in np.flatnonzero(of_kind & chosen.winner):
             said = {"probability": float(1.0 / (1.0 + np.exp(-odds[number]))), "winner": True}
@@ -154,6 +156,14 @@ def trained(rows: Sequence[Row]) -> Trained:
                 {**told_of[_key(rows[number])], **rows[number], **said, "listed_mssd": float(chosen.listed[number])}
             )
     return Trained(models, answers)
+
+
+def _balance(rows: Sequence[Row]) -> Array:
+    """(N,): weights by which there are as many wrong questions as right ones, however many were asked."""
+    right = np.array([row["question"] == "right" for row in rows])
+    answers = np.array([row["winner"] and row["found"] for row in rows])
+    wrong = max(int((answers & ~right).sum()), 1)
+    return np.where(right, 1.0, max(int((answers & right).sum()), 1) / wrong)
 
 
 def _model_of(row: Row) -> str:
@@ -224,34 +234,50 @@ def answer_in(candidates: Sequence[Row], alone: ProbabilityModel) -> tuple[Answe
     return answer, leads(-answer.demerits, joined).numpy()
 
 
-def train(evidence: Evidence) -> tuple[Ramps, Array]:
-    """The model, and the log odds (N,) that it gives each row when the row's group is left out."""
+def train(evidence: Evidence, prior: ProbabilityModel | None = None) -> tuple[Ramps, Array]:
+    """The model, and the log odds (N,) that it gives each row when the row's group is left out.
+
+    prior: what an earlier model has learned from other rows; what these rows do not tell stays as it has it.
+    """
     left_out = np.zeros(len(evidence.right))
     for group in np.unique(evidence.group):
         of_group = evidence.group == group
-        left_out[of_group] = _fit(evidence[~of_group].counted).logit(evidence.features[of_group])
+        left_out[of_group] = _fit(evidence[~of_group].counted, prior).logit(evidence.features[of_group])
     slope, shift = _platt(left_out[evidence.calibrated], evidence[evidence.calibrated])
-    return _fit(evidence.counted).scaled(slope, shift), slope * left_out + shift
+    return _fit(evidence.counted, prior).scaled(slope, shift), slope * left_out + shift
 
 
-def _fit(evidence: Evidence) -> Ramps:
+def _fit(evidence: Evidence, prior: ProbabilityModel | None) -> Ramps:
     turned = evidence.features * evidence.signs
-    knots = np.stack([_knots(column) for column in turned.T])
-    design = _design(turned, knots)
-    start = np.zeros(design.shape[1] + 1)
+    known = {} if prior is None else {term.feature: term for term in prior.terms}
+    knots, expected = [], []
+    for name, sign, column in zip(evidence.names, evidence.signs, turned.T, strict=True):
+        if name in known:
+            places, values = known[name].knots.numpy(), known[name].values.numpy()
+            if sign < 0:
+                places, values = -places[::-1], values[::-1]
+            knots.append(places)
+            expected.append(np.diff(values))
+        else:
+            knots.append(_knots(column))
+            expected.append(np.zeros(PIECES))
+    design = _design(turned, np.stack(knots))
+    start = np.append(np.concatenate(expected), 0.0 if prior is None else prior.bias)
     bounds = [(0.0, None)] * design.shape[1] + [(None, None)]
-    found = minimize(_loss, start, (design, evidence), jac=True, bounds=bounds, method="L-BFGS-B")
-    return Ramps(evidence.names, evidence.signs, knots, found.x[:-1].reshape(len(knots), -1), float(found.x[-1]))
+    found = minimize(_loss, start, (design, evidence, start[:-1]), jac=True, bounds=bounds, method="L-BFGS-B")
+    weights = found.x[:-1].reshape(len(knots), -1)
+    return Ramps(evidence.names, evidence.signs, np.stack(knots), weights, float(found.x[-1]))
 
 
-def _loss(p: Array, design: Array, evidence: Evidence) -> tuple[float, Array]:
-    """Weighted mean of the log loss, plus the penalty; and its gradient."""
+def _loss(p: Array, design: Array, evidence: Evidence, expected: Array) -> tuple[float, Array]:
+    """Weighted mean of the log loss, plus the penalty on what differs from the ``expected`` weights; its gradient."""
     w = evidence.weight / evidence.weight.sum()
     z = design @ p[:-1] + p[-1]
     losses = np.logaddexp(0.0, np.where(evidence.right == 1, -z, z))
     off = w * (1.0 / (1.0 + np.exp(-z)) - evidence.right)
-    value = float(w @ losses + PENALTY * p[:-1] @ p[:-1])
-    return value, np.append(design.T @ off + 2 * PENALTY * p[:-1], off.sum())
+    change = p[:-1] - expected
+    value = float(w @ losses + PENALTY * change @ change)
+    return value, np.append(design.T @ off + 2 * PENALTY * change, off.sum())
 
 
 def _platt(logits: Array, evidence: Evidence) -> tuple[float, float]:

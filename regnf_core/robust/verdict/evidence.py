@@ -213,6 +213,8 @@ SPEAKS_FOR = {
     "free": False,
     "matter_inside": False,
     "unexplained": False,
+    "attached": False,
+    "worst_attached": False,
     "hidden": False,
     "noise": False,
     "tail": False,
@@ -294,8 +296,10 @@ def _conflict(
     bool, which scene samples lie within the hull."""
     r1, r2 = r.scene_to_object, r.object_to_scene
     moved = T.to(problem.held_out.scene_samples.points)
-    beyond = within & groups.near & (r1 > EVIDENCE.agreement)
+    beyond = groups.near & (r1 > EVIDENCE.agreement)
     unexplained = unexplained_samples(problem.held_out, moved, beyond)
+    attached = unexplained & ~within
+    of_scene = _neighbors(problem.held_out.scene_samples.points)
     free = groups.observed & (r2 > EVIDENCE.coarse)
     seen_through = free
     if problem.view.observation is not None:
@@ -304,7 +308,9 @@ def _conflict(
         seen_through = groups.observed & ~measured & (r2 > EVIDENCE.close)
     return {
         "hull_explained": _share(within & (r1.abs() <= EVIDENCE.agreement), within, of_nothing=1.0),
-        "unexplained": _share(unexplained, groups.near),
+        "unexplained": _share(unexplained & within, groups.near),
+        "attached": _share(attached, groups.near),
+        "worst_attached": worst_place(attached.to(r1), groups.near, of_scene),
         "matter_inside": _share(groups.near & (r1 < -EVIDENCE.agreement), groups.near),
         "free": _share(free, groups.visible),
         "seen_through": _share(seen_through, groups.visible),
