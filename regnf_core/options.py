@@ -146,8 +146,8 @@ class RobustOptions(_Group):
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
     """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
     acceptance: Acceptance = "default"
-    """Which answers are accepted. `default`: about one of a hundred accepted answers is wrong. `strict`: about one of
-    five hundred; fewer answers are accepted."""
+    """Which answers are accepted: those whose ``probability`` reaches this named level. `strict` is for those to whom a
+    wrong pose costs more than a missed one."""
     min_probability: _Share | None = None
     """Minimum ``probability`` (0..1) of an answer, in place of a named level of ``acceptance``; below it: `rejected`.
     null: what the level says."""

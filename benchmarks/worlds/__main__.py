@@ -42,6 +42,7 @@ from benchmarks.worlds.questions import KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
 from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
 from benchmarks.worlds.worst import picture_of, worst_of  # noqa: E402
+from regnf_core.robust.verdict.answer import ProbabilityModel  # noqa: E402
 
 
 def main() -> None:
@@ -117,8 +118,11 @@ def _evidence(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    found = training.trained(_read(arguments.rows))
-    arguments.output.write_text(json.dumps(found.models, indent=1) + "\n")
+    stored = {} if arguments.prior is None else json.loads(arguments.prior.read_text())
+    found = training.trained(
+        _read(arguments.rows), {name: ProbabilityModel.from_dict(one) for name, one in stored.items()}
+    )
+    arguments.output.write_text(json.dumps(stored | found.models, indent=1) + "\n")
     text = trust.trust_table(found.answers)
     if arguments.table is not None:
         arguments.table.write_text(f"# The verdict's probability in worlds that were left out\n\n{text}")
@@ -219,6 +223,9 @@ def _add_commands_on_worlds(commands: argparse._SubParsersAction[argparse.Argume
 def _add_training(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     learning = commands.add_parser("train", help="the verdict's probability models")
     learning.add_argument("--output", type=Path, required=True, help="the models, JSON")
+    learning.add_argument(
+        "--prior", type=Path, help="models of before, which the new ones differ from by what rows tell"
+    )
     learning.add_argument("--table", type=Path, help="how far they can be trusted in worlds left out, Markdown")
     trusting = commands.add_parser("trust", help="of accepted answers, how many are wrong")
     trusting.add_argument("--output", type=Path, help="Markdown; otherwise it is printed")

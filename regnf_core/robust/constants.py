@@ -259,10 +259,10 @@ class VerdictConstants:
     """Of the verdict (verdict/answer.py, verdict/evaluation.py). What is enough is an option."""
 
     # The least probability of an accepted answer, by the level's name. [random worlds]
-    default_probability: float = 0.9
-    strict_probability: float = 0.98
+    default_probability: float = 0.8
+    strict_probability: float = 0.95
     # Shares that nearly all right poses keep. They say why a probability is low, and decide nothing. [random worlds]
-    usual_occluded: float = 0.85
+    usual_hidden: float = 0.9
     usual_free: float = 0.2
     usual_inliers: float = 0.6
     usual_unexplained: float = 0.1

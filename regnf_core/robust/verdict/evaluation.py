@@ -74,7 +74,7 @@ class _Usual:
 
 
 _USUAL = (
-    _Usual("TOO_LITTLE_SURFACE", "occluded share", "occluded_share_object", VERDICT.usual_occluded),
+    _Usual("TOO_LITTLE_SURFACE", "hidden share", "hidden", VERDICT.usual_hidden),
     _Usual("FREE_SPACE_VIOLATED", "share in free space", "free_space_violations", VERDICT.usual_free),
     _Usual("LOW_OVERLAP", "object inliers", "inlier_share_object", VERDICT.usual_inliers, upper=False),
     _Usual("LOW_OVERLAP", "scene inliers", "inlier_share_scene", VERDICT.usual_inliers, upper=False),
@@ -97,7 +97,8 @@ def evaluate_pose(
     if not bool(held_out.admitted[index]):
         return PoseVerdict("rejected", "OUTSIDE_DETECTION", "", -1.0)
     if not margin >= 0.0:
-        return PoseVerdict("rejected", *_reason(held_out.of(index), probability, least), margin)
+        told = held_out.of(index) | {"hidden": float(held_out.features["hidden"][index])}
+        return PoseVerdict("rejected", *_reason(told, probability, least), margin)
     if rivals:
         return PoseVerdict("ambiguous", "SEVERAL_POSES_AGREE", "", margin)
     return PoseVerdict("registered", "SURFACES_AGREE", "", margin)
