@@ -131,7 +131,8 @@ def trained(rows: Sequence[Row], prior: dict[str, ProbabilityModel] | None = Non
     rows = [row for row in rows if row["features"]]
     groups = np.array([_eighth(row) for row in rows])
     told = _told(rows)
-    features = np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows])
+    # Of a feature that rows are older than nothing is learned: it stays as the prior has it.
+    features = np.array([[row["features"].get(name, 0.0) for name in SPEAKS_FOR] for row in rows])
     right = np.array([float(row["mssd"] <= SUCCESS) for row in rows])
     weight = np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * told * _balance(rows)
     everything = np.ones(len(rows), dtype=bool)
@@ -225,7 +226,9 @@ def answer_in(candidates: Sequence[Row], alone: ProbabilityModel) -> tuple[Answe
     moved = torch.tensor([row["moved"] for row in candidates])
     same = [row["same"] for row in candidates]
     poses = Relations(moved, apart, lambda one, other: same[one][other])
-    features = {name: torch.tensor([row["features"][name] for row in candidates]).double() for name in SPEAKS_FOR}
+    features = {
+        name: torch.tensor([row["features"].get(name, 0.0) for row in candidates]).double() for name in SPEAKS_FOR
+    }
     scores = torch.tensor([row["score"] for row in candidates]).double()
     margin = RobustOptions().rival_margin
     answer = answer_of(PoseOdds(alone, alone), features, scores, poses, margin)

@@ -247,6 +247,10 @@ class EvidenceConstants:
     place_samples: int = 16
     least_in_place: int = 6  # of these that must have been seen [by hand]
     worst_quantile: float = 0.975  # of the means over all places [random worlds]
+    # Share of unexplained surface near the object without noise, and for each diameter of noise in addition: where a
+    # map is noisy, what lies on the object cannot be told from a part of another one. [random worlds]
+    unexplained: float = 0.05
+    unexplained_per_noise: float = 20.0
     stretch_width: float = 2.0  # of the kernel with which a stretch is fitted, over the noise [by hand]
     usual_stretch: float = 0.05  # strain that is looked for, as a deviation [derived]
     stretch_samples: float = 200.0  # as many errors of the samples are independent [by hand]

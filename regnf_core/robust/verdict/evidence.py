@@ -213,6 +213,7 @@ SPEAKS_FOR = {
     "free": False,
     "matter_inside": False,
     "unexplained": False,
+    "unexplained_beyond_noise": False,
     "attached": False,
     "worst_attached": False,
     "hidden": False,
@@ -260,6 +261,10 @@ def pose_features(problem: RegistrationProblem, T: Sim3, r: Residuals, offsets: 
     # The same disagreement tells more where the surfaces agree closely elsewhere.
     usual = (found["noise"] + 2.0 * EVIDENCE.min_core) / EVIDENCE.coarse
     found |= {f"excess_of_{side}": found[f"worst_of_{side}"] / usual for side in ("object", "scene")}
+    inlier = (r.values.abs() <= EVIDENCE.score_width) & torch.cat([groups.near, groups.visible], 1)
+    closely = _mean(r.values.square(), inlier, of_nothing=EVIDENCE.score_width**2).sqrt()
+    allowed = EVIDENCE.unexplained + EVIDENCE.unexplained_per_noise * closely
+    found["unexplained_beyond_noise"] = (found["unexplained"] - allowed).clamp_min(0.0)
     return {name: found[name].double() for name in SPEAKS_FOR}
 
 

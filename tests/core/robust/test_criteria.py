@@ -163,7 +163,7 @@ def test_the_shares_say_why_a_pose_is_rejected_and_decide_nothing(
 def test_numbers_that_are_none_are_rejected() -> None:
     nothing = float("nan")
     assert verdict_on(probability=nothing).verdict == "rejected"
-    assert verdict_on(evidence_of([nothing] * 5, [nothing] * 5), probability=0.8).verdict == "rejected"
+    assert verdict_on(evidence_of([nothing] * 5, [nothing] * 5), probability=0.7).verdict == "rejected"
 
 
 # The option ``min_probability`` on every way to an answer: none below it is accepted, and those from it on are.
