@@ -133,7 +133,8 @@ def _rows(question: Question, options: RegistrationOptions, gathering: Gathering
                 case.scene, case.obj, case.detection, options, gathering.seed, Run(None), None, model, view
             )
         except RegnfError as error:
-            yield {"winner": True, "verdict": "refused", "reason": error.reason, "mssd": 9.0, "features": {}}
+            nothing = {"mssd": 9.0, "listed_mssd": 9.0, "seen_difference": 1.0, "probability": 0.0, "features": {}}
+            yield {"winner": True, "found": True, "verdict": "refused", "reason": error.reason, **nothing}
             return
     problem, last = kept.problem, kept.evaluations[-1]
     assert problem is not None
