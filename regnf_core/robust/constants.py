@@ -247,9 +247,9 @@ class EvidenceConstants:
     place_samples: int = 16
     least_in_place: int = 6  # of these that must have been seen [by hand]
     worst_quantile: float = 0.975  # of the means over all places [random worlds]
-    # Share of unexplained surface near the object without noise, and for each diameter of noise in addition: where a
-    # map is noisy, what lies on the object cannot be told from a part of another one. [random worlds]
-    unexplained: float = 0.05
+    unexplained: float = 0.05  # share of the surface near the object that noise does not explain, at least [early fits]
+    # Shares for each diameter of noise in addition: where a map is noisy, what lies on the object cannot be told from a
+    # part of another one. [random worlds]
     unexplained_per_noise: float = 20.0
     stretch_width: float = 2.0  # of the kernel with which a stretch is fitted, over the noise [by hand]
     usual_stretch: float = 0.05  # strain that is looked for, as a deviation [derived]
@@ -264,13 +264,14 @@ class VerdictConstants:
 
     # The least probability of an accepted answer, by the level's name. [random worlds]
     default_probability: float = 0.8
-    strict_probability: float = 0.95
-    # Shares that nearly all right poses keep. They say why a probability is low, and decide nothing. [random worlds]
+    strict_probability: float = 0.95  # the same of the stricter level [random worlds]
+    # Shares that nearly all right poses keep say why a probability is low, and decide nothing. Of the object's surface
+    # that may be hidden: [random worlds]
     usual_hidden: float = 0.9
-    usual_free: float = 0.2
-    usual_inliers: float = 0.6
-    usual_unexplained: float = 0.1
-    usual_explained: float = 0.4
+    usual_free: float = 0.2  # share of the object's visible surface in free space, at most [main pairs]
+    usual_inliers: float = 0.6  # share of inliers in each direction, at least [main pairs]
+    usual_unexplained: float = 0.1  # share of the surface near the object that is not the object's, at most [by hand]
+    usual_explained: float = 0.4  # share of the surface in the box that the object explains, at least [main pairs]
     # Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, the field
     # itself says what was hidden, and the verdict is that of scenes of which it is known. Of the 282 right poses that
     # the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth image]
@@ -360,11 +361,11 @@ class SceneConstants:
     # Diagonals: so far in front of samples of a thing that images show is the object asked. The noise of depths is
     # wider than thin walls: their other face would answer. [simulated frames]
     ahead_of_thing: float = 0.02
-    # Of the option `scene_samples`: with fewer samples of what stands in the box, cells are halved, at most so often.
-    # A halving makes four of one. [derived]
+    # Of the option `scene_samples`: with fewer samples of what stands in the box, cells are halved. A halving makes
+    # four of one. [derived]
     enough_foreground: float = 0.125
     thick: float = 2.0  # cell edges: what is thinner needs finer cells too, or its faces share them [derived]
-    most_further: int = 2
+    most_further: int = 2  # halvings at most: cells of a hundredth of the box [by hand]
     min_foreground: int = 30  # samples before the support planes; with fewer, these are kept [by hand]
     # Normal roughness. Up to here a field counts as smooth and has no surface offset: a box would else pass for a
     # larger one. Accurate fits have about 0.01. [early fits]

@@ -133,8 +133,8 @@ def answered(probability: float, error: float, **told: Any) -> dict[str, Any]:
 
 def test_the_table_counts_answers_by_hand() -> None:
     rows = [
-        answered(0.99, RIGHT), answered(0.95, RIGHT), answered(0.95, 0.07), answered(0.2, RIGHT), answered(0.1, WRONG),
-        answered(0.95, WRONG, listed_mssd=RIGHT),  # one of those that it lists is right
+        answered(0.99, RIGHT), answered(0.9, RIGHT), answered(0.9, 0.07), answered(0.2, RIGHT), answered(0.1, WRONG),
+        answered(0.9, WRONG, listed_mssd=RIGHT),  # one of those that it lists is right
         answered(0.99, WRONG, question="other"), answered(0.99, WRONG, question="longer", seen_difference=0.01),
         answered(0.99, RIGHT, winner=False), answered(0.99, RIGHT, found=False),
     ]  # fmt: skip

