@@ -143,12 +143,13 @@ _Refined = tuple[Evaluation, int, RegistrationProblem, int]
 
 
 def _decided(refined: list[_Refined]) -> list[Comparison]:
-    """Move the candidate that the surface speaks for by which it differs from the likeliest one to the first place.
-    Returns what tells each of the others from the first."""
+    """Move the candidate that the surface speaks for by which it differs from the likeliest one to the first place,
+    but no rejected one before an accepted one. Returns what tells each of the others from the first."""
     placed = {found[1]: found[0].placed(found[2]) for found in refined}
     for found in refined[1:]:
         apart = compare(placed[refined[0][1]], placed[found[1]])
-        if decides_for_other(apart.difference):
+        worse = found[0].rank[0] and not refined[0][0].rank[0]
+        if decides_for_other(apart.difference) and not worse:
             refined.remove(found)
             refined.insert(0, found)
             break

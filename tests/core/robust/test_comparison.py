@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 
-from regnf_core.document import ABSENT, SHOWN, UNKNOWN
+from regnf_core import library
+from regnf_core.document import ABSENT, SHOWN, UNKNOWN, Difference
 from regnf_core.fields.observation import Observation, ObservedField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
@@ -87,8 +91,8 @@ def test_what_nobody_saw_tells_nothing() -> None:
 @pytest.mark.parametrize("there", ["plain", "with block"])
 def test_a_search_puts_the_one_first_that_its_difference_speaks_for(there: str) -> None:
     shapes = {"plain": PLAIN, "with block": WITH_BLOCK}
-    library = [LibraryObject(name, lambda field=field: field, model_object(field)) for name, field in shapes.items()]
-    found = search_library(shapes[there], BOX, library, clouds=False)
+    objects = [LibraryObject(name, lambda field=field: field, model_object(field)) for name, field in shapes.items()]
+    found = search_library(shapes[there], BOX, objects, clouds=False)
     assert found.ranking[0].name == there
     assert found.ranking[0].difference is None
     second = found.ranking[1].difference
@@ -96,3 +100,18 @@ def test_a_search_puts_the_one_first_that_its_difference_speaks_for(there: str) 
     assert second.favor > 0.0
     assert found.result.deciding is not None
     assert len(found.result.deciding.states) > 0
+
+
+@pytest.mark.parametrize(("first_rejected", "second_rejected", "first"), [(0, 0, 2), (0, 1, 1), (1, 1, 2), (1, 0, 2)])
+def test_a_rejected_candidate_never_comes_before_an_accepted_one(
+    monkeypatch: pytest.MonkeyPatch, first_rejected: int, second_rejected: int, first: int
+) -> None:
+    """All that was seen of the difference speaks for the second."""
+    apart = SimpleNamespace(difference=Difference(0.1, 0.05, -1.0, True))
+    monkeypatch.setattr(library, "compare", lambda one, other: apart)
+    refined: list[Any] = [
+        (SimpleNamespace(rank=(bool(rejected), 0.0), placed=lambda problem: None), number, None, 0)
+        for number, rejected in ((1, first_rejected), (2, second_rejected))
+    ]
+    assert library._decided(refined) == [apart]
+    assert refined[0][1] == first

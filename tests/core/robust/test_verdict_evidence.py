@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,13 +14,13 @@ from torch import Tensor
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.robust.constants import EVIDENCE
+from regnf_core.robust.constants import EVIDENCE, VERDICT
 from regnf_core.robust.model import model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.scene import view_scene
-from regnf_core.robust.verdict.answer import Answer, choose, pose_odds
+from regnf_core.robust.verdict.answer import LEAD, Answer, choose, pose_odds
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR, coverage, pose_features, unexplained_samples, worst_place
 from regnf_core.robust.working_frame import Samples
 from tests.core.analytic import boxes, chair, chair_pose, room, union
@@ -258,7 +259,11 @@ def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> No
     found = answer([0.0, 0.12, 0.6], [0.2, 0.21, 0.5])
     single = answer([0.0, 0.6], [0.2, 0.5])
     assert (found.winner, found.rivals) == (0, [1])
-    assert float(found.probability_alone[0].logit()) < float(found.probability[0].logit()) - 0.5
+    # Alone it leads by 0.01 in the score; with the other in one answer by more than is told apart.
+    term = next(one for one in pose_odds(True).among.terms if one.feature == LEAD)
+    lost = term(np.array([VERDICT.most_lead])) - term(np.array([0.01 * VERDICT.log_odds_per_score]))
+    assert lost[0] > 0.5
+    assert float(found.probability[0].logit() - found.probability_alone[0].logit()) == pytest.approx(lost[0], abs=1e-4)
     assert float(found.probability[0]) == pytest.approx(float(single.probability_alone[0])), "as if it were alone"
     assert float(found.probability[2]) == pytest.approx(float(found.probability_alone[2])), "it is not listed"
 
@@ -275,8 +280,8 @@ def test_poses_that_place_other_surface_compete_though_both_are_listed(
 
 
 def test_what_fits_by_its_score_and_is_much_less_likely_is_no_rival() -> None:
-    much_less = {name: [1.0, 0.0] if better else [0.0, 1.0] for name, better in SPEAKS_FOR.items()}
-    found = answer([0.0, 0.5], [0.2, 0.2], **much_less)
+    against = {"seen_through": [0.0, 0.9], "free": [0.0, 0.5], "object_agrees": [1.0, 0.2], "confirmed": [1.0, 0.1]}
+    found = answer([0.0, 0.5], [0.2, 0.2], **against, scene_agrees=[1.0, 0.2])
     assert (found.winner, found.rivals) == (0, [])
 
 
