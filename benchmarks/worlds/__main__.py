@@ -147,8 +147,7 @@ def _read(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def _worst(arguments: argparse.Namespace) -> None:
-    runs = [json.loads(line) for path in arguments.runs for line in path.read_text().splitlines()]
-    picture_of(worst_of(runs, arguments.count), arguments.folder).save(arguments.output)
+    picture_of(worst_of(_read(arguments.runs), arguments.count), arguments.folder).save(arguments.output)
 
 
 def _text(path: Path) -> str:
@@ -237,7 +236,7 @@ def _add_training(commands: argparse._SubParsersAction[argparse.ArgumentParser])
 def _add_commands_on_runs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     showing = commands.add_parser("worst", help="a picture of the wrong poses that the engine was surest of")
     showing.add_argument("folder", type=Path, help="of the worlds")
-    showing.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")
+    showing.add_argument("runs", type=Path, nargs="+", help="what `register` or `evidence` wrote")
     showing.add_argument("--count", type=int, default=10)
     showing.add_argument("--output", type=Path, required=True, help="an image file")
     reporting = commands.add_parser("report", help="tables of runs")

@@ -31,9 +31,21 @@ _TRUE, _FOUND = (40, 160, 70), (215, 60, 50)
 
 
 def worst_of(runs: Sequence[Run], count: int) -> list[Run]:
-    """The runs that list no right pose, those first whose probability was highest: the engine was surest of them."""
+    """The answers about right objects that list no right pose, those with the highest probability first.
+
+    runs: what `register` wrote, or `evidence`.
+    """
+    runs = [_of_evidence(run) if "question" in run else run for run in runs]
     wrong = [run for run in runs if "metrics" in run and min(run["listed_mssd"], run["mssd_share"]) > SUCCESS]
     return sorted(wrong, key=lambda run: -float(run["metrics"]["probability"]))[:count]
+
+
+def _of_evidence(row: Run) -> Run:
+    """A row of `evidence` as a run of `register`; without metrics where it is no answer about the right object."""
+    if row["question"] != "right" or not (row["winner"] and row["found"]):
+        return {}
+    told = {"metrics": {"probability": row["probability"]}, "mssd_share": row["mssd"]}
+    return {"seed": 0, "known_scale": None, **row, **told}
 
 
 def picture_of(runs: Sequence[Run], folder: Path) -> Image.Image:

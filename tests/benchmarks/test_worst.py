@@ -24,6 +24,14 @@ def test_the_worst_are_those_the_engine_was_surest_of() -> None:
     assert worst_of([less, surest], 1) == [surest]
 
 
+def test_of_evidence_the_answers_about_right_objects_count() -> None:
+    row = {"question": "right", "winner": True, "found": True, "probability": 0.9, "mssd": 0.4, "listed_mssd": 0.4}
+    others = [row | {"question": "other"}, row | {"winner": False}, row | {"mssd": 0.01, "listed_mssd": 0.01}]
+    (worst,) = worst_of([*others, row], 5)
+    assert worst["metrics"]["probability"] == 0.9
+    assert worst["mssd_share"] == 0.4
+
+
 def test_what_is_nearer_hides_what_is_behind() -> None:
     x, z = np.meshgrid(np.linspace(-1.0, 1.0, 200), np.linspace(-1.0, 1.0, 200))
     wall = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
