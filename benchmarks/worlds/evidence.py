@@ -32,6 +32,7 @@ from regnf_core.robust.scene import SceneView, view_scene
 from regnf_core.robust.verdict.answer import Relations, choose
 from regnf_core.robust.verdict.comparison import Placed, compare
 from regnf_core.robust.verdict.evaluation import held_out_of
+from regnf_core.version import ENGINE_REVISION
 
 Row = dict[str, Any]
 _OPTIONS = RegistrationOptions(preset="robust")
@@ -66,7 +67,8 @@ def evidence_of_world(home: Path, known: Sequence[Path], gathering: Gathering) -
             question = ask(kind, home, cases, number, others)
             options = _options(gathering, cases[number])
             if question is not None:
-                facts = {**cases[number].facts, "question": kind, "model": question.asked.facts["object"]}
+                facts = {"revision": ENGINE_REVISION, **cases[number].facts, "question": kind, "seed": gathering.seed}
+                facts["model"] = question.asked.facts["object"]
                 rows += [{**facts, **row} for row in _rows(question, options, gathering, made)]
     return rows
 

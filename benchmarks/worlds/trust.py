@@ -48,18 +48,27 @@ def kind_of(row: Row) -> str:
 
 
 def trust_table(rows: Sequence[Row]) -> str:
-    """Markdown. rows: of :mod:`benchmarks.worlds.evidence`; of each registration the one of its answer counts."""
-    answers = [row for row in rows if row["winner"] and row["found"]]
+    """Markdown. rows: of :mod:`benchmarks.worlds.evidence`; of each registration the one of its answer counts, and
+    seeds other than 0 only where seeds are compared."""
+    every = [row for row in rows if row["winner"] and row["found"]]
+    answers = [row for row in every if row.get("seed", 0) == 0]
     told = [row for row in answers if not cannot_be_told(row)]
     parts = [
-        f"{len(answers)} registrations of {len({row['world'] for row in answers})} worlds.",
+        f"{len(answers)} registrations of {len({row['world'] for row in answers})} worlds{_revisions(answers)}.",
         _of_kinds(told, [row for row in told if row["question"] == "right"], "The right object is asked for."),
         _of_kinds(told, told, "Right and wrong questions together."),
         _of_questions(answers),
         _of_variants(answers),
+        _of_seeds(every),
         _calibration(told),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _revisions(rows: Sequence[Row]) -> str:
+    """Of the engine, where rows have them."""
+    found = sorted({row["revision"] for row in rows if "revision" in row})
+    return f", engine revision {', '.join(map(str, found))}" if found else ""
 
 
 def _groups(rows: Sequence[Row], key: Callable[[Row], str]) -> Iterator[tuple[str, list[Row]]]:
@@ -118,6 +127,28 @@ def _of_variants(answers: Sequence[Row]) -> str:
         f"Variants beside the right object as candidates: {len(compared)}. Said to be distinguishable: {len(seen)}; of "
         f"these, what was seen speaks for the right one in {_percent(first, len(seen))}. What differs was not seen in "
         f"{len(unseen)}; of these, said not to be distinguishable: {_percent(said, len(unseen))}."
+    )
+
+
+def _of_seeds(answers: Sequence[Row]) -> str:
+    """Of questions that were asked with several seeds of the registration: how often two seeds have one verdict."""
+    asked: dict[tuple[Any, ...], list[Row]] = {}
+    for row in answers:
+        key = tuple(row.get(name) for name in ("world", "case", "question", "observed_by"))
+        asked.setdefault(key, []).append(row)
+    pairs = [
+        (one, other)
+        for rows in asked.values()
+        for one, other in itertools.combinations(rows, 2)
+        if one.get("seed") != other.get("seed")
+    ]
+    if not pairs:
+        return ""
+    same = sum(one["verdict"] == other["verdict"] for one, other in pairs)
+    alike = sum(_accepted(one, LEVELS["default"]) == _accepted(other, LEVELS["default"]) for one, other in pairs)
+    return (
+        f"Two seeds of a registration have the same verdict in {_percent(same, len(pairs))} of the pairs, and both or "
+        f"neither are accepted in {_percent(alike, len(pairs))}."
     )
 
 

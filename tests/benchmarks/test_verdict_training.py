@@ -168,6 +168,16 @@ def test_variants_are_counted_by_what_tells_them_apart() -> None:
     assert "not seen in 2; of these, said not to be distinguishable: 1 of 2" in said
 
 
+def test_seeds_of_a_question_are_compared_and_counted_once() -> None:
+    rows = [
+        answered(0.9, RIGHT, seed=0), answered(0.7, RIGHT, seed=1, verdict="rejected"), answered(0.95, RIGHT, seed=2),
+        answered(0.9, RIGHT, seed=0, question="longer"),
+    ]  # fmt: skip
+    said = trust_table(rows)
+    assert "same verdict in 1 of 3 (33.3 %) of the pairs" in said
+    assert "2 registrations of 1 worlds." in said
+
+
 @pytest.mark.parametrize(("scores", "expected"), [([1.0, 2.0, 3.0, 4.0], 1.0), ([4.0, 1.0, 1.0, 2.0], 0.375)])
 def test_auroc_by_hand(scores: list[float], expected: float) -> None:
     assert auroc(np.array(scores), np.array([False, False, True, True])) == pytest.approx(expected)
