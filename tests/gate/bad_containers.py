@@ -20,7 +20,7 @@ from tests.core.importing.fuzzing.seeds import Seeds
 
 Build = Callable[[Seeds], bytes]
 Files = dict[str, tuple[Build, str]]
-"""Row of docs/bad-inputs.md: how the file is made, and its outcome."""
+"""Row of bad-inputs.md: how the file is made, and its outcome."""
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + bytes(600)
 

@@ -1,4 +1,4 @@
-"""docs/bad-inputs.md says what the tests show: each test it names exists, and a file's row has its outcome."""
+"""bad-inputs.md says what the tests show: each test it names exists, and a file's row has its outcome."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tests.gate.bad_runs import RUNS
 from tests.gate.bad_tensors import TENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
+TABLE = Path(__file__).with_name("bad-inputs.md")
 SECTIONS = ("Transport", "Names", "Container", "Runs", "Pickle", "Tensors", "Boxes", "Requests", "Recordings")
 _WORD = re.compile(r"`([^`]+)`")
 _REASON = re.compile(r"`([A-Z][A-Z0-9_]+)`")
@@ -36,7 +37,7 @@ class Row:
 @cache
 def rows() -> tuple[Row, ...]:
     section, found = "", []
-    for line in (ROOT / "docs" / "bad-inputs.md").read_text(encoding="utf-8").splitlines():
+    for line in TABLE.read_text(encoding="utf-8").splitlines():
         if line.startswith("## "):
             section = line.removeprefix("## ")
         cells = [cell.strip() for cell in line.strip("|").split(" | ")]
@@ -64,7 +65,7 @@ def collect(files: list[str]) -> set[str]:
 
 def test_the_page_has_every_section() -> None:
     assert tuple(dict.fromkeys(row.section for row in rows())) == SECTIONS
-    page = (ROOT / "docs" / "bad-inputs.md").read_text(encoding="utf-8")
+    page = TABLE.read_text(encoding="utf-8")
     assert f"There are {len(rows())} rows." in page
 
 
