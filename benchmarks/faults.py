@@ -2,7 +2,7 @@
 
     python -m benchmarks.faults [arguments of pytest, such as -k sigterm]
 
-Forty minutes. Rewrites the table in docs/faults.md; with arguments, or when a test fails, prints it instead.
+Forty minutes. Rewrites the table in benchmarks/results/faults.md; with arguments, or when a test fails, prints it instead.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tests.faults.promise import MEASURED, WITHIN_S
 
 _ROOT = Path(__file__).resolve().parents[1]
 _TESTS = _ROOT / "tests" / "faults"
-_DOCUMENT = _ROOT / "docs" / "faults.md"
+_DOCUMENT = _ROOT / "benchmarks" / "results" / "faults.md"
 _BEGIN, _END = "<!-- measured: python -m benchmarks.faults -->", "<!-- end -->"
 _TEST_TIMEOUT_S = 600
 

@@ -1,4 +1,4 @@
-"""The code that estimates the normals of a scan, as docs/families.md gives it."""
+"""The code that estimates the normals of a scan, as docs/formats.md gives it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIZE = np.array([0.2, 0.12, 0.08])
 
 
 def code() -> str:
-    parts = (DOCS / "families.md").read_text().split("```python\n")[1:]
+    parts = (DOCS / "formats.md").read_text().split("```python\n")[1:]
     (found,) = [text for part in parts if "scan.ply" in (text := part.partition("```")[0])]
     return found
 
@@ -29,7 +29,7 @@ def box(count: int) -> open3d.geometry.PointCloud:
 def test_they_point_outwards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     open3d.io.write_point_cloud(str(tmp_path / "scan.ply"), box(8_000))
     monkeypatch.chdir(tmp_path)
-    exec(compile(code(), "families.md", "exec"), {})
+    exec(compile(code(), "formats.md", "exec"), {})
     found = open3d.io.read_point_cloud("scan-with-normals.ply")
     points, normals = np.asarray(found.points), np.asarray(found.normals)
     beside = np.stack([points, SIZE - points])  # how far within each pair of faces

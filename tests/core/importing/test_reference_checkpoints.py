@@ -155,7 +155,7 @@ def test_deepsdf_s_network_with_a_code_from_the_description(tmp_path: Path) -> N
 @pytest.mark.parametrize("zipped", [True, False])
 @pytest.mark.parametrize(("codes", "index"), [("codes", 1), ("code", 0)])
 def test_deepsdf_s_network_and_codes_in_one_file(tmp_path: Path, codes: str, index: int, zipped: bool) -> None:
-    """Put together as docs/import-gate.md says."""
+    """Put together as docs/formats.md says."""
     folder, files = deepsdf_run()
     whole = torch.load(files["network"], map_location="cpu", weights_only=True)
     stored = torch.load(files[codes], map_location="cpu", weights_only=True)
