@@ -135,7 +135,7 @@ class Fixed(BaseModel):
 class Settings(Fixed, BaseSettings):
     """Every setting has a default that works on one machine; each is REGNF_<NAME> in the environment.
 
-    What each means is in docs/deployment.md. `quota_*` is of each caller, `max_*` of all together, `job_*` of one
+    What each means is in docs/environment.md. `quota_*` is of each caller, `max_*` of all together, `job_*` of one
     registration, `import_*` of one import. Secrets are given as they are, or as `@` and the path of a file.
     """
 

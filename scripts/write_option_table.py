@@ -30,7 +30,7 @@ def with_table(text: str) -> str:
 
 
 def _row(name: str, option: dict[str, Any]) -> str:
-    meaning = " ".join(option["description"].split())
+    meaning = " ".join(option["description"].split()).replace("|", "\\|")
     return f"| `{name}` | {json.dumps(option['default'])} | {_range(option)} | {meaning} |"
 
 

@@ -5,7 +5,7 @@
     python -m benchmarks.attacks kills --kills 40
 
 Every run starts a service of its own: Redis, API and workers as processes, below a temporary folder. Ends with status 1
-if anything happened that should not have; docs/security.md says what that is and has the last results.
+if anything happened that should not have; docs/security.md says what that is.
 """
 
 from __future__ import annotations

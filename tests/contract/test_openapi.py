@@ -158,7 +158,10 @@ def test_times_and_addresses_have_formats_and_closed_sets_are_enums() -> None:
 def test_the_documents_list_every_reason_and_address() -> None:
     errors = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
     assert [reason for reason in REASONS if f"`{reason}`" not in errors] == []
-    api = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    assert [path for _, path, _ in operations() if f"`{path}`" not in api and f" {path}`" not in api] == []
+    api, uploads, jobs = (
+        (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8") for name in ("api", "uploads", "jobs")
+    )
+    pages = api + uploads + jobs
+    assert [path for _, path, _ in operations() if f"`{path}`" not in pages and f" {path}`" not in pages] == []
     told = re.findall(r"^\| `([A-Z_]+)` \| (?:registered|ambiguous|rejected) \| (.*) \|$", api, flags=re.M)
     assert dict(told) == VERDICT_REASONS

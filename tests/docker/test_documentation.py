@@ -1,4 +1,4 @@
-"""docs/deployment.md says what the settings and the compose file are."""
+"""docs/environment.md says what the settings are, docs/deployment.md what the compose file takes."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from regnf_state.settings import Fixed, Settings
 from tests.docker.files import COMPOSE, ROOT
 
 DEPLOYMENT = (ROOT / "docs" / "deployment.md").read_text()
+ENVIRONMENT = (ROOT / "docs" / "environment.md").read_text()
 ROW = re.compile(r"^\| `(REGNF_\w+|PIP_\w+|GRAFANA_\w+)` \| `?([^|`]*)`? \| (.+) \|$", re.MULTILINE)
 
 
@@ -32,14 +33,13 @@ def test_every_setting_is_in_the_table_with_its_default(monkeypatch: pytest.Monk
         monkeypatch.delenv(f"REGNF_{name.upper()}", raising=False)
     monkeypatch.delenv("XDG_STATE_HOME", raising=False)
     settings = Settings()
-    table = DEPLOYMENT.split("<!-- settings")[1]
-    documented = {name: default for name, default, _ in ROW.findall(table)}
+    documented = {name: default for name, default, _ in ROW.findall(ENVIRONMENT)}
     expected = {f"REGNF_{name.upper()}": written(getattr(settings, name)) for name in names}
     expected["REGNF_STATE_DIR"] = expected["REGNF_STATE_DIR"].replace(str(Path.home()), "~")
     assert documented == expected
 
 
 def test_every_variable_of_the_compose_file_is_explained() -> None:
-    explained = {name: default for name, default, _ in ROW.findall(DEPLOYMENT.split("<!-- settings")[0])}
+    explained = {name: default for name, default, _ in ROW.findall(DEPLOYMENT)}
     used = dict(re.findall(r"\$\{(\w+):-([^}]*)\}", COMPOSE.read_text()))
     assert {name: default or "empty" for name, default in used.items()} == explained
