@@ -14,4 +14,4 @@ __version__ = "0.2.0"
 # ``python -m scripts.engine_revision`` runs the golden registrations again, and raises the revision when their
 # results have changed. A test fails when the engine's code has changed and this was not done.
 
-ENGINE_REVISION = 25
+ENGINE_REVISION = 26
