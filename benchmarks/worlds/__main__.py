@@ -125,7 +125,7 @@ def _train(arguments: argparse.Namespace) -> None:
     arguments.output.write_text(json.dumps(stored | found.models, indent=1) + "\n")
     text = trust.trust_table(found.answers)
     if arguments.table is not None:
-        arguments.table.write_text(f"# The verdict's probability in worlds that were left out\n\n{text}")
+        arguments.table.write_text(f"# Wrong among accepted, in worlds left out of the training\n\n{text}")
     _say(text)
 
 
@@ -135,7 +135,7 @@ def _trust(arguments: argparse.Namespace) -> None:
     if arguments.output is None:
         sys.stdout.write(text)
     else:
-        arguments.output.write_text(f"# Of accepted answers, how many are wrong\n\n{text}")
+        arguments.output.write_text(f"# Wrong among accepted\n\n{text}")
     if arguments.diagrams is not None:
         for kind, picture in trust.reliability_diagrams(rows).items():
             name = re.sub(r"[^a-z]+", "-", kind).strip("-")

@@ -27,7 +27,7 @@ LEAST_SEEN = 0.02
 """Share of both surfaces that differs and was seen, for an object to count as another one."""
 _BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.98, 1.0)
 _SCENES = {"tsdf": "noisy cameras", "rendered": "clean depth"}
-_TOLD = {"images": "", "nothing": ", nothing told of what was seen", "recording": ", the recording as the scene"}
+_TOLD = {"images": "", "nothing": ", without observation", "recording": ", the recording as the scene"}
 
 
 def is_right(row: Row) -> bool:
@@ -55,7 +55,7 @@ def trust_table(rows: Sequence[Row]) -> str:
     told = [row for row in answers if not cannot_be_told(row)]
     parts = [
         f"{len(answers)} registrations of {len({row['world'] for row in answers})} worlds{_revisions(answers)}.",
-        _of_kinds(told, [row for row in told if row["question"] == "right"], "The right object is asked for."),
+        _of_kinds(told, [row for row in told if row["question"] == "right"], "The right object is requested."),
         _of_kinds(told, told, "Right and wrong questions together."),
         _of_questions(answers),
         _of_variants(answers),
@@ -82,8 +82,10 @@ def _groups(rows: Sequence[Row], key: Callable[[Row], str]) -> Iterator[tuple[st
 
 def _of_kinds(everything: Sequence[Row], asked: Sequence[Row], title: str) -> str:
     """asked: what acceptance is counted of · everything: what calibration is."""
-    head = ["kind of data", "asked", "a pose is right"]
-    head += [f"{name}: {what}" for name in LEVELS for what in ("right and accepted", "wrong among accepted", "at most")]
+    head = ["kind of data", "registrations", "correct pose"]
+    head += [
+        f"{name}: {what}" for name in LEVELS for what in ("correct and accepted", "wrong among accepted", "at most")
+    ]
     head += ["calibration error", "AUROC"]
     lines = []
     every = dict(_groups(everything, kind_of))
@@ -101,8 +103,8 @@ def _of_kinds(everything: Sequence[Row], asked: Sequence[Row], title: str) -> st
 
 
 def _of_questions(answers: Sequence[Row]) -> str:
-    head = ["question", "asked", "right", *(f"accepted and wrong, {name}" for name in LEVELS)]
-    head.append("cannot be told: accepted")
+    head = ["question", "registrations", "correct pose", *(f"wrong and accepted, {name}" for name in LEVELS)]
+    head.append("not distinguishable: accepted")
     lines = []
     for question, group in _groups(answers, lambda row: str(row["question"])):
         told = [row for row in group if not cannot_be_told(row)]
@@ -111,7 +113,7 @@ def _of_questions(answers: Sequence[Row]) -> str:
         line = [question, str(len(group)), str(len(told) - len(wrong))]
         line += [f"{sum(_accepted(row, least) for row in wrong)} of {len(wrong)}" for least in LEVELS.values()]
         lines.append([*line, f"{sum(_accepted(row, LEVELS['default']) for row in rest)} of {len(rest)}"])
-    return f"What was asked.\n\n{_cells(head, lines)}"
+    return f"By what is requested.\n\n{_cells(head, lines)}"
 
 
 def _of_variants(answers: Sequence[Row]) -> str:
@@ -124,9 +126,9 @@ def _of_variants(answers: Sequence[Row]) -> str:
     unseen = [row for row in compared if row["seen_difference"] < LEAST_SEEN / 2.0]
     said = sum(not row["difference"]["distinguishable"] for row in unseen)
     return (
-        f"Variants beside the right object as candidates: {len(compared)}. Said to be distinguishable: {len(seen)}; of "
-        f"these, what was seen speaks for the right one in {_percent(first, len(seen))}. What differs was not seen in "
-        f"{len(unseen)}; of these, said not to be distinguishable: {_percent(said, len(unseen))}."
+        f"Variants beside the right object as candidates: {len(compared)}. Reported as distinguishable: {len(seen)}; of "
+        f"these, the evidence favors the right one in {_percent(first, len(seen))}. The difference was not seen in "
+        f"{len(unseen)}; of these, reported as not distinguishable: {_percent(said, len(unseen))}."
     )
 
 
@@ -159,7 +161,7 @@ def _calibration(told: Sequence[Row]) -> str:
         for within, low, high in binned(p)
         if within.any()
     ]
-    return "Probabilities.\n\n" + _cells(["probability told", "answers", "mean told", "right"], lines)
+    return "Calibration.\n\n" + _cells(["probability", "answers", "mean", "correct"], lines)
 
 
 def _accepted(row: Row, least: float) -> bool:
@@ -235,7 +237,7 @@ def reliability_diagram(title: str, answers: Sequence[Row]) -> str:
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {edge} {edge}" role="img">',
-            f"<title>{title}: share of {len(right)} answers that were right, over the probability told</title>",
+            f"<title>{title}: share of {len(right)} answers that are correct, over their probability</title>",
             f"<style>{_STYLE}</style>",
             f'<rect width="{edge}" height="{edge}" fill="#fff"/>',
             f'<text x="{middle}" y="{_MARGIN - 18}" text-anchor="middle">{title.strip("*")}: {len(right)}</text>',
@@ -243,8 +245,8 @@ def reliability_diagram(title: str, answers: Sequence[Row]) -> str:
             f'<line class="ideal" x1="{_x(0)}" y1="{_y(0)}" x2="{_x(1)}" y2="{_y(1)}"/>',
             *(f'<text x="{_x(tick)}" y="{_y(0) + 18}" text-anchor="middle">{tick}</text>' for tick in _TICKS),
             *(f'<text x="{_x(0) - 8}" y="{_y(tick) + 4}" text-anchor="end">{tick}</text>' for tick in _TICKS),
-            f'<text x="{middle}" y="{_y(0) + 38}" text-anchor="middle">probability told, mean</text>',
-            f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">share that was right</text>',
+            f'<text x="{middle}" y="{_y(0) + 38}" text-anchor="middle">mean probability</text>',
+            f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">share that is correct</text>',
             *points,
             "</svg>\n",
         ]

@@ -162,10 +162,9 @@ def test_variants_are_counted_by_what_tells_them_apart() -> None:
     ]  # fmt: skip
     said = trust_table(rows)
     assert (
-        "candidates: 4. Said to be distinguishable: 3; of these, what was seen speaks for the right one in 2 of 3"
-        in said
+        "candidates: 4. Reported as distinguishable: 3; of these, the evidence favors the right one in 2 of 3" in said
     )
-    assert "not seen in 2; of these, said not to be distinguishable: 1 of 2" in said
+    assert "not seen in 2; of these, reported as not distinguishable: 1 of 2" in said
 
 
 def test_seeds_of_a_question_are_compared_and_counted_once() -> None:
