@@ -2,7 +2,7 @@
 
     python -m benchmarks.faults [arguments of pytest, such as -k sigterm]
 
-Forty minutes. Rewrites the table in benchmarks/results/faults.md; with arguments, or when a test fails, prints it instead.
+Forty minutes. Rewrites the table in benchmarks/results/faults.md; with arguments, or when a test fails, it prints it.
 """
 
 from __future__ import annotations

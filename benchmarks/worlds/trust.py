@@ -126,8 +126,8 @@ def _of_variants(answers: Sequence[Row]) -> str:
     unseen = [row for row in compared if row["seen_difference"] < LEAST_SEEN / 2.0]
     said = sum(not row["difference"]["distinguishable"] for row in unseen)
     return (
-        f"Variants beside the right object as candidates: {len(compared)}. Reported as distinguishable: {len(seen)}; of "
-        f"these, the evidence favors the right one in {_percent(first, len(seen))}. The difference was not seen in "
+        f"Variants beside the right object as candidates: {len(compared)}. Reported as distinguishable: {len(seen)}; "
+        f"of these, the evidence favors the right one in {_percent(first, len(seen))}. The difference was not seen in "
         f"{len(unseen)}; of these, reported as not distinguishable: {_percent(said, len(unseen))}."
     )
 
