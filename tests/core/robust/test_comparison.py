@@ -90,7 +90,7 @@ def test_what_nobody_saw_tells_nothing() -> None:
 
 @pytest.mark.parametrize("there", ["plain", "with block"])
 def test_a_search_puts_the_one_first_that_its_difference_speaks_for(there: str) -> None:
-    low_block = ([-0.3, -0.15, 0.05], [-0.1, 0.15, 0.2])  # with a higher one, the other object is searched coarsely alone
+    low_block = ([-0.3, -0.15, 0.05], [-0.1, 0.15, 0.2])  # of a higher one, the other is not refined
     shapes = {"plain": PLAIN, "with block": boxes([BODY, low_block])}
     objects = [LibraryObject(name, lambda field=field: field, model_object(field)) for name, field in shapes.items()]
     found = search_library(shapes[there], BOX, objects, clouds=False)
