@@ -57,6 +57,7 @@ def trust_table(rows: Sequence[Row]) -> str:
         f"{len(answers)} registrations of {len({row['world'] for row in answers})} worlds{_revisions(answers)}.",
         _of_kinds(told, [row for row in told if row["question"] == "right"], "The right object is requested."),
         _of_kinds(told, told, "Right and wrong questions together."),
+        _of_verdicts([row for row in told if row["question"] == "right"]),
         _of_questions(answers),
         _of_variants(answers),
         _of_seeds(every),
@@ -100,6 +101,18 @@ def _of_kinds(everything: Sequence[Row], asked: Sequence[Row], title: str) -> st
         p, hit = _said(every[kind]), np.array([is_right(row) for row in every[kind]])
         lines.append([*line, f"{calibration_error(p, hit):.3f}", f"{auroc(p, hit):.4f}"])
     return f"{title}\n\n{_cells(head, lines)}"
+
+
+def _of_verdicts(asked: Sequence[Row]) -> str:
+    """asked: answers about right objects."""
+    parts = []
+    for verdict, what in (("registered", "are wrong"), ("ambiguous", "list no correct pose")):
+        found = [row for row in asked if row.get("verdict") == verdict]
+        wrong = sum(not is_right(row) for row in found)
+        if found:
+            bound = f"at most {100 * upper_bound(wrong, len(found)):.1f} %"
+            parts.append(f"Of {len(found)} answers `{verdict}`, {wrong} {what} ({bound}).")
+    return " ".join(["The right object is requested, default level.", *parts]) if parts else ""
 
 
 def _of_questions(answers: Sequence[Row]) -> str:

@@ -147,6 +147,7 @@ def test_the_table_counts_answers_by_hand() -> None:
     assert "| noisy cameras, long | 7 | 4 of 7 (57.1 %) | 3 of 7 (42.9 %) | 2 of 5 | 81.1 % |" in table
     assert "| longer | 1 | 0 | 0 of 0 | 0 of 0 | 1 of 1 |" in table
     assert "| other | 1 | 0 | 1 of 1 | 1 of 1 | 0 of 0 |" in table
+    assert "Of 6 answers `registered`, 2 are wrong (at most 72.9 %)." in table
 
 
 def test_variants_are_counted_by_what_tells_them_apart() -> None:
