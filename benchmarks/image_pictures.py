@@ -1,6 +1,6 @@
 """Pictures of hard cases on fields fitted to images: what was measured, what was invented, what was found.
 
-    python -m benchmarks.image_pictures FIELDS [--output docs/images/imperfect-fields.png]
+    python -m benchmarks.image_pictures FIELDS [--output imperfect-fields.png]
 
 FIELDS is the folder of benchmarks.make_image_fields. A row for each case: the field's surface in the detection box,
 what no depth supports in red; the object laid onto what was measured, or where it should have been laid.
@@ -124,7 +124,7 @@ def _caption(sheet: Image.Image, number: int, heading: str, note: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("fields", type=Path)
-    parser.add_argument("--output", type=Path, default=Path("docs/images/imperfect-fields.png"))
+    parser.add_argument("--output", type=Path, default=Path("imperfect-fields.png"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = []
