@@ -23,8 +23,8 @@ from regnf_core.schema.closed import Closed
 Interpolation = Literal["linear", "smoothstep"]
 _ENTRY_ALIGNMENT = 8
 MAX_GROWTH = 8
-"""Of neighboring levels' resolutions, as far as the safe format takes it. A whole number, as other bounds of 8 are: equal
-annotations are one object, and the contract would print 8 or 8.0 by which module was loaded first."""
+"""Of neighboring levels' resolutions, as far as the safe format takes it. A whole number, as other bounds of 8 are:
+equal annotations are one object, and the contract would print 8 or 8.0 by which module was loaded first."""
 _MAX_PATTERNS = 4096
 """Most patterns of rounding that are tried."""
 _ROUNDING_REACH = 1e-3
