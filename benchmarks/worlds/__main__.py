@@ -222,9 +222,7 @@ def _add_commands_on_worlds(commands: argparse._SubParsersAction[argparse.Argume
 def _add_training(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     learning = commands.add_parser("train", help="the verdict's probability models")
     learning.add_argument("--output", type=Path, required=True, help="the models, JSON")
-    learning.add_argument(
-        "--prior", type=Path, help="models of before, which the new ones differ from by what rows tell"
-    )
+    learning.add_argument("--prior", type=Path, help="earlier models; new weights are penalized by what they differ")
     learning.add_argument("--table", type=Path, help="how far they can be trusted in worlds left out, Markdown")
     trusting = commands.add_parser("trust", help="of accepted answers, how many are wrong")
     trusting.add_argument("--output", type=Path, help="Markdown; otherwise it is printed")
