@@ -1,4 +1,4 @@
-"""The examples of regnf_core/importing/families/README.md: a family in two files, and a kind, as a newcomer would write them."""
+"""The examples of regnf_core/importing/families/README.md: a family in two files, and a kind."""
 
 from __future__ import annotations
 
