@@ -28,7 +28,8 @@ def test_local_links_lead_somewhere(document: Path) -> None:
 
 
 def test_the_readme_is_short_and_its_targets_exist() -> None:
-    assert len(README.splitlines()) <= 120
+    assert len(README.splitlines()) <= 100
+    assert max(map(len, README.splitlines())) <= 200
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     named = set(re.findall(r"make (\w+)", README))
     assert "demo" in named
@@ -40,7 +41,7 @@ def test_commands_named_in_the_readme_exist(
 ) -> None:
     shell = "\n".join(re.findall(r"```bash\n(.*?)```", README, flags=re.S))
     named = set(re.findall(r"^(?:\.venv/bin/)?regnf ([\w-]+)", shell, flags=re.M))
-    assert {"serve", "register", "inspect", "fit"} <= named
+    assert {"serve", "register"} <= named
     for name in named:
         monkeypatch.setattr(sys, "argv", ["regnf", name, "--help"])
         assert command() == 0
@@ -53,4 +54,4 @@ def test_python_of_the_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     for code in blocks:
         exec(compile(code, "README.md", "exec"), {})
         assert capsys.readouterr().out.startswith("registered")
-    assert len(blocks) == 2
+    assert len(blocks) == 1

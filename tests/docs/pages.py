@@ -22,7 +22,9 @@ class Block:
 def reader_pages() -> list[Path]:
     """Those in which every block is run. The older pages beside them are about the reader's own files."""
     folders = [DOCS / name for name in ("start", "how-to", "concepts", "reference")]
-    return sorted([DOCS / "index.md", DOCS / "faq.md", *(page for folder in folders for page in folder.glob("*.md"))])
+    return sorted(
+        [DOCS / "index.md", DOCS / "troubleshooting.md", *(page for folder in folders for page in folder.glob("*.md"))]
+    )
 
 
 def blocks(page: Path) -> list[Block]:

@@ -103,10 +103,10 @@ def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
     assert {"tutorial.md", "batch.md", "verdicts.md", "units.md", "page.md"} <= {page.name for page in RUN}
 
 
-def test_the_tutorial_prints_what_is_printed(run: Run, demo: list[object]) -> None:
+@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "start" / "tutorial.md"], ids=lambda page: page.stem)
+def test_the_output_of_the_demo_is_what_is_printed(page: Path, run: Run, demo: list[object]) -> None:
     """The words as they are, the numbers rounded: they differ between machines in the last digits."""
-    page = (DOCS / "start" / "tutorial.md").read_text(encoding="utf-8")
-    (told,) = re.findall(r"```text\n(verdict .*?)```", page, flags=re.S)
+    (told,) = re.findall(r"```text\n(verdict .*?)```", page.read_text(encoding="utf-8"), flags=re.S)
     done = run(*demo, code=0)
     number = re.compile(r"-?\d+\.\d+")
     printed = "\n".join(done.stdout.splitlines()[: len(told.splitlines())])

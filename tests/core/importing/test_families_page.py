@@ -1,4 +1,4 @@
-"""The examples of docs/families.md: a family in two files, and a kind, as a newcomer would write them."""
+"""The examples of regnf_core/importing/families/README.md: a family in two files, and a kind."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.schema.tensor_check import TensorSpec
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "families.md"
+PAGE = Path(__file__).resolve().parents[3] / "regnf_core" / "importing" / "families" / "README.md"
 
 
 def example(path: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
