@@ -14,6 +14,7 @@ import argparse
 import gzip
 import itertools
 import json
+import math
 import re
 import statistics
 from collections.abc import Callable, Iterator, Sequence
@@ -198,7 +199,8 @@ def _answers() -> Iterator[Row]:
     for verdict in ("registered", "ambiguous"):
         runs = [run for run in _asked("right") if run["verdict"] == verdict]
         wrong = [run["listed_mssd"] for run in runs if not is_right(run)]
-        figures = {"wrong": _wrong_of(len(wrong), len(runs)), "farthest off": f"{100 * max(wrong, default=0.0):.0f} %"}
+        off = math.ceil(100 * max(wrong, default=0.0))
+        figures = {"wrong": _wrong_of(len(wrong), len(runs)), "these are off by less than": f"{off} %"}
         yield _row(f"answers/{verdict}", f"`{verdict}`", figures, runs, "worlds", WORLDS)
 
 
@@ -210,7 +212,7 @@ def _wrong() -> Iterator[Row]:
     others = [run for run in read(OTHERS) if run["group"].startswith("wrong")]
     for cushion, what in enumerate(("other furniture, in exact rooms without an observation", _CUSHION)):
         found.append((what, [run for run in others if ("cushion" in run["group"]) == cushion], "exact", OTHERS))
-    for what, runs, step, source in found:
+    for what, runs, step, source in (one for one in found if one[1]):
         figures = {"accepted": _share(runs, _accepted), "accepted at `strict`": _share(runs, _strictly)}
         yield _row(f"wrong/{what}", what, figures, runs, step, source)
 
@@ -232,11 +234,7 @@ def _peers() -> Iterator[Row]:
     for group, what in _PEERS.items():
         runs = [run for run in read(PEERS) if run["group"] == group]
         error = statistics.median(run["mssd_share"] for run in runs if "mssd_share" in run)
-        figures = {
-            "solved": _share(runs, _near("mssd_share")),
-            "median error": f"{100 * error:.2g} %",
-            "median seconds": f"{statistics.median(run['seconds'] for run in runs):.2f}",
-        }
+        figures = {"solved": _share(runs, _near("mssd_share")), "median error of its poses": f"{100 * error:.2g} %"}
         yield _row(f"peers/{group}", what, figures, runs, "peers", PEERS)
 
 

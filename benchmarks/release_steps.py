@@ -1,7 +1,7 @@
-"""The measurements of the release, one after the other: on two idle cores under an hour and a half, all together.
+"""The measurements of the release, one after the other.
 
 A step whose results are of the present engine is left out; what it has made is kept in the folder of --work, so that a
-run which was interrupted goes on. Steps that need data which is not given are named and left out.
+run which was interrupted goes on. Steps whose data is not given are named and left out.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ _GATHERED: tuple[tuple[str, str, Sequence[str]], ...] = (
     ("tsdf", "recording", ("--kinds", "right", "--known-scale", str(KNOWN_SCALE))),
 )
 """Which scenes are asked with which observation, and how many wrong questions about a case."""
+_IDLE = 1.0
+"""The load above which no time is measured."""
 _LISTS = ("others", "moved", "same")
 """Of a row of `evidence`: what only the training needs."""
 
@@ -167,6 +169,9 @@ def _bop(given: argparse.Namespace) -> None:
 
 
 def _time(given: argparse.Namespace) -> None:
+    if os.getloadavg()[0] > _IDLE:
+        print("time: left out, the machine is busy: processor seconds would be up to twice as many")
+        return
     folder = given.work / "timed"
     folder.mkdir(exist_ok=True)
     make_fields(folder)
