@@ -164,7 +164,8 @@ def _right() -> Iterator[Row]:
         runs = [run for run in asked if (run["observed_by"], run["scene"], run["length"]) == key]
         if runs:
             by, scene, length = key
-            known = f", scale known within {100 * runs[0].get('known_scale', KNOWN_SCALE):g} %" * (by == "recording")
+            share = runs[0].get("known_scale", KNOWN_SCALE) if by == "recording" else None
+            known = f", scale known within {100 * share:g} %" if share else ""
             what = f"{_BY[by]}{known}, {_CAMERAS[scene]}, {_LENGTHS[length]}"
             yield _row(f"right/{'/'.join(key)}", what, _right_figures(runs, is_right), runs, "worlds", WORLDS)
     for name, what, runs, taken in (
@@ -309,10 +310,9 @@ def _report(found: Sequence[Row]) -> str:
         some = [row for row in found if row.table == name]
         columns = list(some[0].figures)
         lines = [
-            [row.what, *(row.figures[column] for column in columns), str(row.revision or "unknown"), f"`{row.command}`",
-             f"[{Path(row.source).name}]({row.source})"]
+            [row.what, *row.figures.values(), str(row.revision or "unknown"), f"`{row.command}`", f"`{row.source}`"]
             for row in some
-        ]  # fmt: skip
+        ]
         parts.append(_markdown([head, *columns, "engine revision", "command", "file"], lines))
     return "\n\n".join(parts) + "\n"
 
@@ -328,7 +328,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     release_steps.add_options(
-        commands.add_parser("run", help="measure what this engine has not been measured for, then write")
+        commands.add_parser("run", help="measure what is not measured with this engine, then write")
     )
     commands.add_parser("write", help="the figures of the files in benchmarks/results")
     arguments = parser.parse_args()
