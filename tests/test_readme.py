@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from regnf_cli.main import command
+from tests.docs.test_code_blocks import alike, promised
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -51,7 +52,11 @@ def test_commands_named_in_the_readme_exist(
 def test_python_of_the_readme_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.S)
     monkeypatch.chdir(ROOT)
+    printed = []
     for code in blocks:
         exec(compile(code, "README.md", "exec"), {})
-        assert capsys.readouterr().out.startswith("registered")
+        printed.append(capsys.readouterr().out)
+        assert printed[-1].startswith("registered")
     assert len(blocks) == 1
+    for told in promised("\n".join(blocks)):
+        assert any(alike(told, line) for line in "\n".join(printed).splitlines()), told

@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.bop.dataset import Dataset, Target, Truth, matrix_of
 from benchmarks.bop.errors import MSPD_LIMITS, MSSD_LIMITS, Array, Mesh, matched, mspd, mssd, surfaces_apart
 from benchmarks.bop.writing import rendered
+from regnf_core.version import ENGINE_REVISION
 
 RIGHT = 0.05
 """Diameters: a pose at which no point of the surface is farther off is right."""
@@ -183,9 +184,9 @@ def read_answers(path: Path) -> list[Answer]:
     poses = (
         {**row, "pose": row["pose"] and tuple(row["pose"]), "others": tuple(map(tuple, row["others"]))} for row in rows
     )
-    return [Answer(**row) for row in poses]
+    return [Answer(**{key: value for key, value in row.items() if key != "revision"}) for row in poses]
 
 
 def write_answers(path: Path, answers: Sequence[Answer]) -> None:
-    """One JSON object a line."""
-    path.write_text("".join(json.dumps(asdict(one)) + "\n" for one in answers))
+    """One JSON object a line, with the engine's revision."""
+    path.write_text("".join(json.dumps({"revision": ENGINE_REVISION, **asdict(one)}) + "\n" for one in answers))

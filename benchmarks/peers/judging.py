@@ -9,6 +9,7 @@ from benchmarks.peers.interface import MissingPackageError, Peer, PeerCase, Peer
 from benchmarks.symmetric_errors import errors_against_truth
 from regnf_core import RegnfError
 from regnf_core.geometry.metrics import paper_errors
+from regnf_core.version import ENGINE_REVISION
 
 SUCCESS = 0.05
 """Largest MSSD of a right pose, object diameters."""
@@ -54,7 +55,7 @@ def run_one(name: str, make: Callable[[], Peer], case: PeerCase, seed: int) -> d
 
     seconds and field_evaluations include the shared sampling where the method starts from its points.
     """
-    found: dict[str, Any] = {"group": name, "case": case.name, "seed": seed}
+    found: dict[str, Any] = {"revision": ENGINE_REVISION, "group": name, "case": case.name, "seed": seed}
     try:
         peer = make()
         found |= {"group": peer.name, "given": peer.given}

@@ -12,6 +12,7 @@ from typing import Any
 from benchmarks.robust.cases import Case
 from benchmarks.robust.judging import judge, judge_error
 from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, register
+from regnf_core.version import ENGINE_REVISION
 
 Run = dict[str, Any]
 ROBUST = RegistrationOptions(preset="robust")
@@ -64,7 +65,7 @@ def run_one(job: Job, measure: Callable[[Case, RegistrationResult], dict[str, An
     else:
         found = {"seconds": time.perf_counter() - begun, **judge(result, case.truth, case.symmetries)}
         found |= measure(case, result) if measure is not None else {}
-    return {"group": job.group, "case": case.name, "seed": job.seed, **found}
+    return {"revision": ENGINE_REVISION, "group": job.group, "case": case.name, "seed": job.seed, **found}
 
 
 def summary(run: Run) -> str:

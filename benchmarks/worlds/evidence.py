@@ -68,6 +68,7 @@ def evidence_of_world(home: Path, known: Sequence[Path], gathering: Gathering) -
             options = _options(gathering, cases[number])
             if question is not None:
                 facts = {"revision": ENGINE_REVISION, **cases[number].facts, "question": kind, "seed": gathering.seed}
+                facts["known_scale"] = gathering.known_scale
                 facts["model"] = question.asked.facts["object"]
                 rows += [{**facts, **row} for row in _rows(question, options, gathering, made)]
     return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import socket
 import subprocess
 import sys
@@ -14,14 +15,25 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.cli.conftest import Run, demo, run
+from tests.cli.conftest import Run, run
 from tests.contract.live import eventually
 from tests.docs.pages import DOCS, ROOT, Block, blocks, reader_pages
 
-__all__ = ["demo", "run"]
+__all__ = ["run"]
 ADDRESS = "127.0.0.1:8080"
 SERVE = "regnf serve\n"
 RUN = [page for page in reader_pages() if any(block.language in ("bash", "python") for block in blocks(page))]
+SHOWN = [
+    (page, code.replace("\\\n", " ").strip().splitlines()[-1], told)
+    for page in (ROOT / "README.md", *reader_pages())
+    for code, told in re.findall(
+        r"```bash\n((?:(?!```).)*?)```(?:(?!```).)*?```text\n(verdict .*?)```",
+        page.read_text(encoding="utf-8"),
+        flags=re.S,
+    )
+]
+"""The pages that show what `regnf register` prints: the command, the first lines of its output."""
+NUMBER = re.compile(r"-?\d+\.\d+")
 ELSEWHERE = re.compile(
     r"make |source |pip |python3 -m venv|scripts/|cp DATA|cp -r ros2|rosdep|colcon|ros2 |ns-train|regnf \w+"
 )
@@ -37,6 +49,19 @@ def environment(folder: Path) -> dict[str, str]:
     paths = os.pathsep.join(str(ROOT / part) for part in ("", "service", "worker"))
     own = {"PATH": f"{tools}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": paths}
     return plain | own | {"REGNF_STATE_DIR": str(folder / "state"), "XDG_CACHE_HOME": str(folder / "cache")}
+
+
+def alike(told: str, printed: str) -> bool:
+    """The words are the same, the numbers rounded: they differ between machines in the last digits."""
+    words = [re.sub(r"\s+", " ", NUMBER.sub("#", text)).strip() for text in (told, printed)]
+    numbers = [[float(one) for one in NUMBER.findall(text)] for text in (told, printed)]
+    return words[0] == words[1] and numbers[1] == pytest.approx(numbers[0], rel=0.05, abs=2e-4)
+
+
+def promised(text: str) -> list[str]:
+    """What a page says that its blocks print; the service's own address is another one in the tests."""
+    found = re.findall(r"it prints `((?!regnf serves)[^`]+)`|print\(.*\)  # (<.+>)", text, flags=re.I)
+    return [sentence or comment for sentence, comment in found]
 
 
 def ended(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> tuple[int, str]:
@@ -81,17 +106,21 @@ def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
     variables = environment(tmp_path)
     found = blocks(page)
     with serving(Block("bash", SERVE) in found, tmp_path, variables) as address:
-        program = ""
+        program = printed = ""
         for block in found:
             code = block.code.replace(ADDRESS, address)
             if block.language == "bash" and block.code != SERVE:
                 status, shown = ended(["bash", "-euo", "pipefail"], code, tmp_path, variables)
                 assert status == 0, shown
+                printed += shown
             elif block.language == "python":
                 program += code
         if program:
             status, shown = ended([sys.executable, "-W", "error", "-"], program, tmp_path, variables)
             assert status == 0, shown
+            printed += shown
+        for told in promised(page.read_text(encoding="utf-8")):
+            assert any(alike(told, line) for line in printed.splitlines()), told
 
 
 def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
@@ -103,14 +132,20 @@ def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
     assert {"tutorial.md", "batch.md", "verdicts.md", "units.md", "page.md"} <= {page.name for page in RUN}
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "start" / "tutorial.md"], ids=lambda page: page.stem)
-def test_the_output_of_the_demo_is_what_is_printed(page: Path, run: Run, demo: list[object]) -> None:
-    """The words as they are, the numbers rounded: they differ between machines in the last digits."""
-    (told,) = re.findall(r"```text\n(verdict .*?)```", page.read_text(encoding="utf-8"), flags=re.S)
-    done = run(*demo, code=0)
-    number = re.compile(r"-?\d+\.\d+")
-    printed = "\n".join(done.stdout.splitlines()[: len(told.splitlines())])
-    words_told, words_printed = (re.sub(r"\s+", " ", number.sub("#", text)).strip() for text in (told, printed))
-    assert words_printed == words_told
-    for shown, found in zip(number.findall(told), number.findall(printed), strict=True):
-        assert float(found) == pytest.approx(float(shown), rel=0.05, abs=2e-4)
+@pytest.mark.parametrize(("page", "line", "told"), SHOWN, ids=[page.name for page, _, _ in SHOWN])
+def test_a_page_shows_what_the_command_prints(
+    page: Path, line: str, told: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    done = run(*shlex.split(line)[1:])
+    assert alike(told, "\n".join(done.stdout.splitlines()[: len(told.splitlines())]))
+
+
+def test_outputs_are_found_and_compared() -> None:
+    assert "tutorial.md" in {page.name for page, _, _ in SHOWN}
+    told = "probability  98.5 % that"
+    assert alike(told, "probability 98.6 % that")
+    assert not alike(told, "probability  88.5 % that")
+    assert not alike(told, "chance  98.5 % that")
+    assert promised("It prints `a 1.0`.\n    print(b)  # <b: 2>\n    print(c)  # of c\n") == ["a 1.0", "<b: 2>"]
