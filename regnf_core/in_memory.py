@@ -74,24 +74,26 @@ def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said =
     return _mesh(places, corners, painted, description)
 
 
-def from_points(points: Any, normals: Any, description: Said = None) -> SdfField:
-    """The field of a cloud of points with normals that point to free space: of its screened Poisson surface.
+def from_points(points: Any, normals: Any = None, description: Said = None, sensor: Any = None) -> SdfField:
+    """The field of a cloud of points: the distance to its screened Poisson surface.
 
     points, normals: (N, 3), as ``from_mesh`` takes vertices; rows that are not finite, or of no normal, are left out.
-    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, POINT_CLOUD_TOO_SMALL,
-    POINT_CLOUD_NORMALS_DISAGREE, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
+    Normals point to free space. Without them, or where they contradict each other, they are estimated: they look to the
+    ``sensor`` (3,), where all points were measured from; else to where the points can be seen from.
+    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_TOO_SMALL, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
     """
-    from regnf_core.importing.families.mesh import convert_cloud
+    from regnf_core.importing.families.cloud import convert_cloud
     from regnf_core.importing.meshes.triangle_files import Geometry, require_room
 
     places = _rows("points", points, "MESH_INVALID")
-    if normals is None:
-        raise FieldFormatError("points without normals", reason="POINT_CLOUD_WITHOUT_NORMALS")
-    along = _rows("normals", normals, "MESH_INVALID")
-    if len(along) != len(places):
+    along = None if normals is None else _rows("normals", normals, "MESH_INVALID")
+    place = None if sensor is None else _array("sensor", sensor, "MESH_INVALID").astype(np.float64)
+    if place is not None and (place.shape != (3,) or not np.isfinite(place).all()):
+        raise FieldFormatError(f"sensor has shape {place.shape}, expected three numbers", reason="MESH_INVALID")
+    if along is not None and len(along) != len(places):
         raise FieldFormatError(f"{len(along)} normals for {len(places)} points", reason="MESH_INVALID")
     require_room(len(places), 0)
-    geometry = Geometry(places, np.zeros((0, 3), np.int64), along)
+    geometry = Geometry(places, np.zeros((0, 3), np.int64), along, sensor=place)
     return _field(convert_cloud(geometry, "points in memory", _said(description)), description)
 
 

@@ -107,7 +107,7 @@ def search_library(
         for taken, (_, number, poses) in enumerate(worth):
             one, counted = library[number], CountingField(scene)
             obj, generator = CountingField(one.field()), torch.Generator().manual_seed(seed)
-            problem = make_problem(view, one.model, counted, obj, options.robust)
+            problem = make_problem(view, one.model, counted, obj, options.robust, options.up_axis)
             found = refine_poses(problem, poses, generator, partial(run.optimized, taken / len(worth)))
             evaluation = evaluate_candidates(problem, found, options)
             refined.append((evaluation, number, problem, counted.evaluations + obj.evaluations))
@@ -169,7 +169,7 @@ def _searched_coarsely(
 ) -> tuple[float, int, Sim3]:
     """The best pose's score (0..1, smaller is better), the number, and poses (H,), best first."""
     model, generator = one.model.on(view.foreground.points.device), torch.Generator().manual_seed(seed)
-    bound = pose_bound(view, model, options.robust)
+    bound = pose_bound(view, model, options.robust, options.up_axis)
     seeds = geometric_seeds(view, model, start_rotations(options, LIBRARY.rotations_divisor), bound.scale)
     found = search_poses(view, model, seeds, generator, bound, LIBRARY.stages)
     return float(found.scores[0]), number, found.T

@@ -193,6 +193,9 @@ class SearchConstants:
         replace(_SEARCH_CLOSER, copies=6, spread=(0.15, 0.05, 0.07)),
         *_SEARCH_END,
     )
+    # Cosine between the vertical axes of scene and object, where the option `up_axis` names them: 30 degrees. A map's
+    # own vertical is off by less, a toppled thing by more. [by hand]
+    min_upright_cosine: float = 0.866
     min_share_of_detection: float = 0.25  # of the box's edge: so long is the object along one of them [by hand]
     # Score, 0..1: so much worse is a pose that ends at none of the box's faces. [by hand, on random worlds]
     box_weight: float = 0.2

@@ -70,7 +70,7 @@ def register_robust(
         view = scene_view or view_scene(scene_field, detection, options.robust)
         # 2. Surface points of the object, and its symmetries.
         model = object_model or model_object(obj, options.robust)
-        problem = make_problem(view, model, scene, obj, options.robust)
+        problem = make_problem(view, model, scene, obj, options.robust, options.up_axis)
     evaluation: Evaluation | None = None
     for seeds, given, stages in _starts(problem, options, seed, generator, initial_transform):
         # 3. Seeds: around a given pose; else from the two shapes and the box; else from matched features too.

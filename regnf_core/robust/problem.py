@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RobustOptions
+from regnf_core.options import Axis, RobustOptions
 from regnf_core.robust.model import ObjectModel
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.scene import SceneView
@@ -41,7 +41,12 @@ class RegistrationProblem(Bundle):
 
 
 def make_problem(
-    view: SceneView, model: ObjectModel, scene: SdfField, obj: SdfField, options: RobustOptions
+    view: SceneView,
+    model: ObjectModel,
+    scene: SdfField,
+    obj: SdfField,
+    options: RobustOptions,
+    up_axis: Axis | None = None,
 ) -> RegistrationProblem:
     """Divide the samples of both surfaces into those to fit and those to hold out, on the device of the scene's field.
 
@@ -56,11 +61,11 @@ def make_problem(
     scene_field, object_field = view.field(scene), model.field(obj)
     fit = SurfacePair(scene_field, object_field, A, B, view.ahead)
     held_out = SurfacePair(scene_field, object_field, A_held, B_held, view.ahead)
-    return RegistrationProblem(view, model, fit, held_out, pose_bound(view, model, options))
+    return RegistrationProblem(view, model, fit, held_out, pose_bound(view, model, options, up_axis))
 
 
-def pose_bound(view: SceneView, model: ObjectModel, options: RobustOptions) -> PoseBound:
+def pose_bound(view: SceneView, model: ObjectModel, options: RobustOptions, up_axis: Axis | None = None) -> PoseBound:
     """What the detection and the options say of poses between the working frames."""
     scale = ScaleBound.of(options, view.frame.length, model.frame.length)
     bound = PoseBound.of(view.detection, model.extremal_points, options.box_tolerance, scale)
-    return replace(bound, seen=view.of_thing)
+    return replace(bound, seen=view.of_thing, up_axis=up_axis)

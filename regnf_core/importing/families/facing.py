@@ -149,11 +149,13 @@ def _level(free: float) -> float:
 
 
 def _is_room(vertices: Float64Array, faces: Int64Array, before: _Before, level: float) -> bool:
-    """Whether the free side fills the mesh's box, and faces stand in it: an empty box is an object turned round."""
+    """Whether the free side fills the mesh's box, and things stand in it: an empty box is an object turned round."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     probes = low + (high - low) * np.random.default_rng(1).random((SAMPLES, 3))
     if (winding_number(vertices, faces, probes) < level).mean() < _FILLED:
         return False
+    if _holds_solids(vertices, faces):
+        return True
     try:
         hull = ConvexHull(before.places)
     except QhullError:  # flat
@@ -162,18 +164,36 @@ def _is_room(vertices: Float64Array, faces: Int64Array, before: _Before, level: 
     return bool((depth > _DEPTH * np.linalg.norm(high - low)).mean() >= _WITHIN)
 
 
-def _outer_shell(vertices: Float64Array, faces: Int64Array, before: _Before) -> npt.NDArray[np.bool_] | None:
-    """Which faces (F,) are of the part that encloses others and looks outward; None where none does."""
-    buried = before.values > _BURIED
-    if buried.mean() < _WITHIN:
-        return None
+def _holds_solids(vertices: Float64Array, faces: Int64Array) -> bool:
+    """Whether the part that encloses the others looks inward and most of these look outward: parts of an object that
+    was turned round all look inward."""
+    part, shell = _parts(vertices, faces)
+    corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
+    volume = np.bincount(part, np.linalg.det(corners))
+    area = np.bincount(part, areas(vertices, faces))
+    others = np.arange(len(volume)) != shell
+    return bool(volume[shell] < 0.0 and area[others & (volume > 0.0)].sum() > area[others].sum() / 2.0)
+
+
+def _parts(vertices: Float64Array, faces: Int64Array) -> tuple[Int64Array, int]:
+    """The part (F,) of each face, and the number of the part with the largest box."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_array((np.ones(len(edges), np.int8), edges.T), shape=(len(vertices), len(vertices)))
     parts, part = connected_components(graph, directed=False)
     low, high = np.full((parts, 3), np.inf), np.full((parts, 3), -np.inf)
     np.minimum.at(low, part, vertices)
     np.maximum.at(high, part, vertices)
-    shell: npt.NDArray[np.bool_] = part[faces[:, 0]] == int(np.argmax(np.prod(high - low, axis=1)))
+    extent = np.where(np.isfinite(low), high - low, 0.0)
+    return part[faces[:, 0]].astype(np.int64), int(np.argmax(np.prod(extent, axis=1)))
+
+
+def _outer_shell(vertices: Float64Array, faces: Int64Array, before: _Before) -> npt.NDArray[np.bool_] | None:
+    """Which faces (F,) are of the part that encloses others and looks outward; None where none does."""
+    buried = before.values > _BURIED
+    if buried.mean() < _WITHIN:
+        return None
+    part, outermost = _parts(vertices, faces)
+    shell: npt.NDArray[np.bool_] = part == outermost
     if shell[before.face[buried]].mean() > _WITHIN:
         return None
     return shell

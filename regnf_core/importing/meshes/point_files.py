@@ -86,6 +86,7 @@ class _Header:
     points: int
     data: str
     size: int
+    sensor: Float64Array | None = None
 
     @property
     def row(self) -> np.dtype[np.void]:
@@ -108,7 +109,8 @@ def read_pcd(data: memoryview) -> Geometry:
         rows = np.frombuffer(body, header.row, header.points) if header.points else np.zeros(0, header.row)
         table = {name: rows[name][:, 0].astype(np.float64) for name in header.counts}
     normals = np.stack([table[name] for name in _NORMALS], axis=1) if table.keys() >= set(_NORMALS) else None
-    return Geometry(np.stack([table[name] for name in _PLACES], axis=1), np.zeros((0, 3), np.int64), normals)
+    points = np.stack([table[name] for name in _PLACES], axis=1)
+    return Geometry(points, np.zeros((0, 3), np.int64), normals, sensor=header.sensor)
 
 
 def _header(data: memoryview) -> _Header:
@@ -138,7 +140,19 @@ def _header(data: memoryview) -> _Header:
         raise malformed("the PCD header has a count that makes no sense")
     if any(columns[name] != 1 for name in singles) or " ".join(said["DATA"][:1]) not in _FORMS:
         raise malformed("the PCD header names no known form of its points")
-    return _Header(types, columns, points, said["DATA"][0], at)
+    return _Header(types, columns, points, said["DATA"][0], at, _sensor(said))
+
+
+def _sensor(said: dict[str, list[str]]) -> Float64Array | None:
+    """(3,): where the sensor stood. The zeros that all writers put for "unknown" count where the points are a depth
+    image, row by row: those are in the camera's own frame."""
+    try:
+        place = np.array([float(word) for word in said.get("VIEWPOINT", [])[:3]])
+        rows = int(said.get("HEIGHT", ["1"])[0])
+    except (IndexError, ValueError) as error:
+        raise malformed("the PCD header has a line that makes no sense") from error
+    known = len(place) == 3 and np.isfinite(place).all() and (rows > 1 or place.any())
+    return place if known else None
 
 
 def _row(said: dict[str, list[str]], key: str, count: int) -> list[str]:
@@ -191,13 +205,30 @@ def read_xyz(data: memoryview) -> Geometry:
         raise malformed("the points' lines are not of one length")
     rows = numbers.reshape(-1, columns)
     require_room(len(rows), 0)
+    if _are_poses(rows):
+        raise malformed("these are camera poses (KITTI's or TUM's), not points; give them with --cameras")
     return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows))
+
+
+def _are_poses(rows: Float64Array) -> bool:
+    """Whether rows (N, C) are poses: 3x4 matrices (KITTI), or a time, a place and a unit quaternion (TUM)."""
+    if rows.shape[1] == 8:
+        return _of_length_one(rows[:, 4:])
+    turns = rows.reshape(len(rows), 3, 4)[:, :, :3] if rows.shape[1] == 12 else rows[:0]
+    if not len(turns):
+        return False
+    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return bool((off < _UNIT).mean() >= _SHARE)
+
+
+def _of_length_one(rows: Float64Array) -> bool:
+    return len(rows) > 0 and bool((np.abs(np.linalg.norm(rows, axis=1) - 1.0) < _UNIT).mean() >= _SHARE)
 
 
 def _normals(rows: Float64Array) -> Float64Array | None:
     """The three neighboring columns behind the place whose rows have length one; None where there are none."""
     for start in range(3, rows.shape[1] - 2):
         found = rows[:, start : start + 3]
-        if len(rows) and (np.abs(np.linalg.norm(found, axis=1) - 1.0) < _UNIT).mean() >= _SHARE:
+        if _of_length_one(found):
             return found
     return None

@@ -38,6 +38,8 @@ class Geometry:
     """What the file holds or names that was not read, a few words each: the shape is the same without."""
     not_applied: tuple[str, ...] = ()
     """The same of what changes the shape: it is warned of."""
+    sensor: Float64Array | None = None
+    """(3,) from where all points were measured, where the file says so."""
 
 
 def not_numbers(message: str, text: bytes) -> FieldFormatError:

@@ -12,7 +12,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.bundle import Bundle
 from regnf_core.geometry.exponential_map import matrix_from_quaternion
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RegistrationOptions, RobustOptions
+from regnf_core.options import Axis, RegistrationOptions, RobustOptions
 from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.residuals import geman_mcclure_loss
 from regnf_core.surface.sphere_tracing import axis_vector
@@ -70,7 +70,8 @@ class PoseBound(Bundle):
     points: (E, 3) outermost points of the object · axes: (3, 3) the box's, columns, scene frame · edges: (3,) of the
     box · tolerance: how far the object may reach beyond each of the box's faces, as a share of the edge. The edges of
     flat boxes count as SEARCH.min_face_distance there: a flat thing's field may be much thicker than its box ·
-    scale: what the caller knows of it · seen: the box is of what an image shows of the object: other things may hide
+    scale: what the caller knows of it · up_axis: the vertical axis of both frames; None: any pose may be toppled ·
+    seen: the box is of what an image shows of the object: other things may hide
     the rest, so the object may reach beyond by its own extent too, and nothing is said of where it ends.
     """
 
@@ -80,6 +81,7 @@ class PoseBound(Bundle):
     tolerance: float
     scale: ScaleBound = ANY_SCALE
     seen: bool = False
+    up_axis: Axis | None = None
 
     @classmethod
     def of(
@@ -104,6 +106,9 @@ class PoseBound(Bundle):
         reach = self.edges / 2 + self.tolerance * beyond
         within = (torch.maximum(-low, high) <= reach).all(-1)  # the box's center is 0
         admitted = within & ((size / lengths).amax(-1) >= SEARCH.min_share_of_detection)
+        if self.up_axis is not None:
+            up = axis_vector(self.up_axis).to(T.rotation.device)
+            admitted &= (T.rotation.double() @ up) @ up >= SEARCH.min_upright_cosine
         if self.seen:
             return admitted, torch.zeros_like(T.scale)
         off = torch.cat([low + self.edges / 2, high - self.edges / 2], -1) / lengths.repeat(2)

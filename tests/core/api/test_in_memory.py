@@ -119,7 +119,7 @@ def test_a_function_is_a_field(function: Callable[[Tensor], Any], sign: int) -> 
         (lambda: regnf.from_mesh(None, F), "MESH_INVALID", "nothing"),
         (lambda: regnf.from_mesh(V * np.nan, F), "MESH_INVALID", "finite"),
         (lambda: regnf.from_mesh(V * [1, 0, 0], F), "MESH_INVALID", "no triangle of the mesh has an area"),
-        (lambda: regnf.from_points(V, None), "POINT_CLOUD_WITHOUT_NORMALS", "estimate_normals"),
+        (lambda: regnf.from_points(V, sensor=(0, 0)), "MESH_INVALID", "three numbers"),
         (lambda: regnf.from_points(V, V[1:]), "MESH_INVALID", "161 normals for 162"),
         (lambda: regnf.from_grid(GRID[0], (0, 0, 0), 1), "TENSOR_SHAPE", "(17, 17)"),
         (lambda: regnf.from_grid(GRID * np.nan, (0, 0, 0), 1), "TENSOR_NOT_FINITE", "finite"),
@@ -233,5 +233,5 @@ def test_what_is_refused_is_refused_before_a_large_file_is_imported(
     )
     with pytest.raises(regnf.RegnfError) as caught:
         ask(tmp_path / "room.ply", tmp_path / "cloud.ply", CUBE)
-    assert caught.value.reason in ("POINT_CLOUD_WITHOUT_NORMALS", "NO_FIELD")
+    assert caught.value.reason in ("POINT_CLOUD_TOO_SMALL", "NO_FIELD")
     assert "room.ply" not in imported

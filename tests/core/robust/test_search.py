@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from regnf_core.fields.composite import TransformedField
 from regnf_core.geometry.box import OrientedBox
@@ -86,6 +88,19 @@ def placed(edge: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) ->
         torch.tensor([center], dtype=torch.float64) * EDGE,
     )
     return at.inverse()
+
+
+@pytest.mark.parametrize(
+    ("degrees", "admitted"), [(0.0, True), (29.0, True), (31.0, False), (90.0, False), (180.0, False)]
+)
+def test_a_known_vertical_admits_no_toppled_pose(degrees: float, admitted: bool) -> None:
+    """Tilted about x, the cube's vertical leaves the scene's by the angle; turned about z, it stays."""
+    for axis, stays in (("z", admitted), ("x", True)):
+        tilt = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        turn = Rotation.from_euler("z", 70.0, degrees=True).as_matrix() if axis == "z" else np.eye(3)
+        T = replace(placed(0.5), rotation=torch.from_numpy(tilt @ turn)[None])
+        assert replace(bound(0.5), up_axis=axis).admits(T).tolist() == [stays]
+        assert bound(0.5).admits(T).tolist() == [True]
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,15 @@ def test_what_is_asked_for_decides() -> None:
     assert (distance(converted(empty, **{"as": "scene"}), FREE) > 0).all()
 
 
+def test_one_small_thing_makes_a_shell_a_room_but_no_crate_that_was_turned_round() -> None:
+    cup = ([1.0, 1.0, 0.001], [1.1, 1.1, 0.1])
+    assert words(converted(scanned_room(cup))) == ["SCENE_ASSUMED"]
+    filled = scanned_room()
+    inner = parts(cup)
+    inner.invert()
+    assert words(converted(together(filled, inner))) == ["MESH_INSIDE_OUT"]
+
+
 @pytest.mark.parametrize("said", [{}, {"as": "scene"}, {"as": "object"}], ids=["unsaid", "scene", "object"])
 def test_solids_that_face_outward_are_left_as_they_are(said: dict[str, str]) -> None:
     floor = parts(([0, 0, -0.1], [4, 3, 0.0]), *TABLE, *CABINET)

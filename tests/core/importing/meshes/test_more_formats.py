@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
@@ -101,9 +102,14 @@ def test_clouds_give_the_points_and_normals_they_were_written_from(data: bytes) 
     np.testing.assert_allclose(found.normals, AROUND, atol=1e-6)
 
 
+POSES = [(np.hstack([Rotation.from_rotvec(one).as_matrix(), 9.0 * one[:, None]]), one) for one in AROUND]
+KITTI = "".join(" ".join(f"{number:.6f}" for number in pose.ravel()) + "\n" for pose, _ in POSES).encode()
+TUM = "".join(
+    " ".join(f"{number:.6f}" for number in (0.1 * n, *one, *Rotation.from_rotvec(one).as_quat())) + "\n"
+    for n, (_, one) in enumerate(POSES)
+).encode()
 BINARY, ASCII = pcd(AROUND, AROUND, "binary"), pcd(AROUND, AROUND, "ascii")
 CLOUDS = {
-    "POINT_CLOUD_WITHOUT_NORMALS": [pcd(AROUND, None, "binary"), points_text(normals=False)],
     "MESH_TOO_LARGE": [BINARY.replace(b"POINTS 400", b"POINTS 99999999")],
     "MESH_INVALID": [
         *(BINARY[:-1], ASCII[:-300], pcd(AROUND, AROUND, "binary_compressed")[:-1]),
@@ -112,6 +118,7 @@ CLOUDS = {
         *(BINARY.replace(b"TYPE F", b"TYPE Q"), BINARY.replace(b"SIZE 4", b"SIZE 3")),
         *(BINARY.replace(b"FIELDS x y", b"FIELDS x x"), BINARY.replace(b"DATA binary", b"DATA zipped")),
         *(points_text(normals=True) + row for row in (b"1 2\n", b"1 2 3 4 5 six\n")),
+        *(KITTI, TUM),
     ],
 }
 

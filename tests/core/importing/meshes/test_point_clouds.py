@@ -14,13 +14,16 @@ from scipy.spatial import cKDTree
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.importing.families import mesh
+from regnf_core.importing.families import cloud as clouds
+from regnf_core.importing.families.cloud_normals import oriented
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.meshes.point_files import read_pcd
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import saved
 from tests.core.importing.in_process import convert
+from tests.core.importing.meshes import mesh_files
 
 DIAGONAL = 3**0.5
 
@@ -55,7 +58,7 @@ def test_points_at_one_place_are_compared_once(monkeypatch: pytest.MonkeyPatch) 
         built.append(places)
         return cKDTree(places)
 
-    monkeypatch.setattr(mesh, "cKDTree", tree)
+    monkeypatch.setattr(clouds, "cKDTree", tree)
     around = directions(400)
     again = np.concatenate((around, around[:20].repeat(50, axis=0)))
     assert len(field_of(converted(ply(again, again))).faces) > 1000
@@ -93,9 +96,6 @@ HALF_ZERO = np.where(np.arange(2000)[:, None] % 2 == 0, directions(2000), 0.0)
 @pytest.mark.parametrize(
     ("points", "normals", "reason", "says"),
     [
-        (directions(500), None, "POINT_CLOUD_WITHOUT_NORMALS", "needs normals"),
-        (directions(500), np.zeros((500, 3)), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are zero"),
-        (directions(500), np.full((500, 3), np.inf), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are no"),
         (directions(50), directions(50), "POINT_CLOUD_TOO_SMALL", "50 of 50 points"),
         (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points that are no finite numbers"),
         (np.zeros((500, 3)), directions(500), "POINT_CLOUD_TOO_SMALL", "the 500 points lie at 1 places"),
@@ -113,7 +113,7 @@ def test_clouds_of_no_surface(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Refused before the surface is made, which takes long."""
-    monkeypatch.setattr(mesh, "_poisson", lambda *_: pytest.fail("a surface was made of it"))
+    monkeypatch.setattr(clouds, "_poisson", lambda *_: pytest.fail("a surface was made of it"))
     with pytest.raises(FieldFormatError, match=says) as caught:
         converted(ply(points, normals))
     assert caught.value.reason == reason
@@ -121,7 +121,7 @@ def test_clouds_of_no_surface(
 
 def test_points_without_a_normal_are_left_out_and_counted() -> None:
     found = converted(ply(directions(2000), HALF_ZERO))
-    assert "ignored: 1000 points whose normals are zero" in found.why
+    assert "ignored: 1000 points whose normals are zero or no finite numbers" in found.why
 
 
 def boxes(*sizes: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
@@ -160,14 +160,17 @@ def turned(normals: NDArray[np.float64], which: NDArray[np.bool_]) -> NDArray[np
         (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "looks inward"),
     ],
 )
-def test_clouds_whose_normals_are_turned_in_patches_are_refused(
+def test_normals_that_are_turned_in_patches_are_turned_back(
     points: NDArray[np.float64], normals: NDArray[np.float64], says: str, noise: float
 ) -> None:
     points = points + noise * np.random.default_rng(1).normal(size=points.shape)
-    with pytest.raises(FieldFormatError, match=says) as caught:
-        converted(ply(points, normals))
-    assert caught.value.reason == "POINT_CLOUD_NORMALS_DISAGREE"
-    assert "orient_normals" in (caught.value.hint or "")
+    found = converted(ply(points, normals))
+    (warning,) = [one for one in found.warnings if one.startswith("NORMALS_TURNED")]
+    assert says in warning
+    assert "outside of the cloud" in warning
+    within, beyond = field_of(found).signed_distance(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5]]))
+    assert within < -0.3
+    assert beyond > 0.3
 
 
 @pytest.mark.parametrize("spacings", [0.0, 1.0])
@@ -187,7 +190,7 @@ def test_noisy_clouds_of_thin_boards_and_edges_are_not_taken_for_turned(
     chosen = random.permutation(len(cloud[0]))[:count]
     points, normals = cloud[0][chosen], cloud[1][chosen]
     apart = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
-    assert mesh._turned(points + spacings * apart * random.normal(size=points.shape), normals) == ""
+    assert clouds._turned(points + spacings * apart * random.normal(size=points.shape), normals) == ""
 
 
 def test_who_insists_is_given_the_surface_of_turned_normals() -> None:
@@ -200,3 +203,76 @@ def test_a_refusal_s_own_hint_comes_out_of_the_gate(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError) as caught:
         import_field(saved(tmp_path, ply(1e-30 * BALL, BALL)), tmp_path / "out")
     assert caught.value.hint == "Give it in another unit, or without stray points."
+
+
+# Normals that the file does not have, or that are not of its points.
+
+
+def warned(found: ConvertedField) -> list[str]:
+    return [warning.split(":")[0] for warning in found.warnings]
+
+
+def outward(found: ConvertedField, points: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """Share of places just outside of the true surface where the field is free, and just within where it is not."""
+    step = 0.03 * np.linalg.norm(np.ptp(points, axis=0)) * normals
+    field = mesh_files.field_of(found)
+    before, behind = (field.signed_distance(torch.from_numpy(points + side * step).float()) for side in (1, -1))
+    return float(((before > 0) & (behind < 0)).float().mean())
+
+
+@pytest.mark.parametrize("shape", [(BALL, BALL), boxes((1.0, 0.6, 0.4))[:2], boxes((1.0, 1.0, 0.1))[:2]])
+@pytest.mark.parametrize("known", ["nothing", "zeros", "rows exchanged", "signs exchanged"])
+def test_normals_are_estimated_and_look_outside(
+    shape: tuple[NDArray[np.float64], NDArray[np.float64]], known: str
+) -> None:
+    random = np.random.default_rng(3)
+    chosen = random.permutation(len(shape[0]))[:6000]
+    points, normals = shape[0][chosen] + 0.002 * random.normal(size=(len(chosen), 3)), shape[1][chosen]
+    given = {
+        "nothing": None,
+        "zeros": 0.0 * normals,
+        "rows exchanged": random.permutation(normals),
+        "signs exchanged": normals * random.choice([-1.0, 1.0], (len(normals), 1)),
+    }[known]
+    found = converted(ply(points, given))
+    turned_only = known == "signs exchanged"
+    assert warned(found) == ["NORMALS_TURNED" if turned_only else "NORMALS_ESTIMATED", "SURFACE_RECONSTRUCTED"]
+    assert outward(found, shape[0][chosen], normals) > 0.97
+
+
+def test_the_cloud_of_a_room_is_measured_from_within() -> None:
+    """A box round a smaller one that stands in it: free space is between them."""
+    shell, sides, number = boxes((1.0, 1.0, 0.6), (0.2, 0.2, 0.2))
+    inner = number >= 6
+    points = np.where(inner[:, None], shell - [2.0, 0.0, 0.2], shell)
+    normals = np.where(inner[:, None], sides, -sides)
+    found = convert_mesh("ply", memoryview(ply(points)), UploadDescription(as_="scene"))
+    assert "as a scene" in found.warnings[0]
+    assert outward(found, points, normals) > 0.97
+
+
+def test_a_sensor_s_place_decides() -> None:
+    """Half a hollow ball, measured from its middle: nothing but the sensor tells which side was seen."""
+    half = BALL[BALL[:, 2] < 0.2]
+    for sensor, side in (((0.0, 0.0, 0.5), -1.0), ((0.0, 0.0, -9.0), 1.0)):
+        seen = half if side < 0 else half[half[:, 2] < -0.12]  # from below the rim turns away
+        made = oriented(seen / 2.0, None, np.array(sensor), None)
+        assert ((made.normals * seen).sum(axis=1) * side > 0).mean() > 0.99
+
+
+def test_a_pcd_file_says_where_its_sensor_stood() -> None:
+    def header(viewpoint: str, rows: int) -> bytes:
+        body = "".join(f"{x:.5f} {y:.5f} {z:.5f}\n" for x, y, z in BALL[:400])
+        head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        size = f"WIDTH {400 // rows}\nHEIGHT {rows}\nVIEWPOINT {viewpoint}\nPOINTS 400\nDATA ascii\n"
+        return f"# .PCD v.7\n{head}{size}{body}".encode()
+
+    def sensor(viewpoint: str, rows: int = 1) -> list[float] | None:
+        place = read_pcd(memoryview(header(viewpoint, rows))).sensor
+        return None if place is None else place.tolist()
+
+    assert sensor("1 2 3 1 0 0 0") == [1.0, 2.0, 3.0]
+    assert sensor("0 0 0 1 0 0 0") is None  # what writers put where nothing is known
+    assert sensor("0 0 0 1 0 0 0", rows=20) == [0.0, 0.0, 0.0]  # a depth image, in its camera's frame
+    with pytest.raises(FieldFormatError, match="makes no sense"):
+        sensor("a b c 1 0 0 0")
