@@ -281,97 +281,119 @@ class TransformDocument(Outgoing):
 
 
 class AlternativeDocument(Outgoing):
-    """Another pose that explains the data as well, such as a table's twin."""
+    """Another pose that fits the data equally well, for example of a symmetric table."""
 
     T_scene_object: TransformDocument
     T_object_scene: TransformDocument
-    score: float = Field(description="0..1, smaller is better; the result's own is the metric `score`.")
-    relation: str = Field(description="How it differs from the result, such as `180 degrees about z`: object axes.")
+    score: float = Field(description="Cost, 0..1, lower is better. The result's own cost is the metric `score`.")
+    relation: str = Field(
+        description="How it differs from the result, for example `180 degrees about z`. Axes are those of the object."
+    )
 
 
 class ConsideredDocument(Outgoing):
-    """A pose that was refined and judged by itself. `considered.npz` has what each sample says of it."""
+    """A pose that was refined and has its own verdict. `considered.npz` has the evidence of each sample."""
 
     T_scene_object: TransformDocument
     T_object_scene: TransformDocument
-    reason: str = Field(description="As of a verdict: SURFACES_AGREE, or what speaks against it.")
-    detail: str = Field(default="", description="The same in words.")
-    level: Acceptance | None = Field(default=None, description="That of `metrics.probability`, as the result's.")
+    reason: str = Field(description="Reason of the verdict: SURFACES_AGREE, or the reason against the pose.")
+    detail: str = Field(default="", description="The reason as a sentence.")
+    level: Acceptance | None = Field(
+        default=None, description="The named level of `metrics.probability`, as in the result."
+    )
     metrics: dict[str, float | None] = Field(default={})
 
 
 class UncertaintyDocument(Outgoing):
-    """One standard deviation each, from the covariance. They do not depend on where the scene's origin is."""
+    """Standard deviations from the covariance. They do not depend on the position of the scene's origin."""
 
-    center_scene: _Three = Field(description="Of `center_scene`, along the scene's x, y, z, scene units.")
-    rotation_deg: _Three = Field(description="Degrees about the object frame's x, y, z.")
-    scale_percent: float | None = Field(description="Of the scale.")
+    center_scene: _Three = Field(description="Of `center_scene` along the scene's x, y and z, scene units.")
+    rotation_deg: _Three = Field(description="Of the rotation about the object frame's x, y and z, degrees.")
+    scale_percent: float | None = Field(description="Of the scale, percent.")
 
 
 class SymmetryDocument(Outgoing):
-    """The turns that carry the object onto itself, found by registering it with itself."""
+    """The rotations that map the object onto itself, found by registering it with itself."""
 
-    order: int = Field(ge=1, description="The identity included; with `continuous`, how many ends look alike: 1 or 2.")
-    axis: list[float] | None = Field(description="Unit vector, object frame, that all of them turn about; or null.")
-    continuous: bool = Field(description="Whether every turn about the axis is one.")
+    order: int = Field(
+        ge=1,
+        description="Number of rotations, including the identity. With `continuous`: 1, or 2 if both ends of the "
+        "axis look alike.",
+    )
+    axis: list[float] | None = Field(
+        description="The axis of all rotations, a unit vector in the object frame; or null."
+    )
+    continuous: bool = Field(description="Whether every rotation about the axis is a symmetry.")
 
 
 class DifferenceDocument(Outgoing):
-    """What tells a candidate from the one that comes first: the surface of either that lies off the other."""
+    """Difference between a candidate and the first one: the part of each surface that is not on the other surface."""
 
-    differs: float = Field(description="Its share of both surfaces, 0..1.")
-    seen: float = Field(description="The share of both surfaces that differs and was seen, or seen not to be there.")
-    favor: float = Field(description="-1..1: how much more of what was seen speaks for the first than for this one.")
-    distinguishable: bool = Field(description="Whether enough of it was seen to tell the two apart.")
+    differs: float = Field(description="Share of both surfaces that differs between the two candidates, 0..1.")
+    seen: float = Field(
+        description="Share of both surfaces that differs and was observed, as surface or as free space."
+    )
+    favor: float = Field(
+        description="-1..1: how much more observed surface supports the first candidate than this one."
+    )
+    distinguishable: bool = Field(description="Whether enough of the difference was observed to distinguish the two.")
 
 
 class CandidateDocument(Outgoing):
-    """What a search found out about one object of a library."""
+    """The result of a search for one object of the library."""
 
     object: str = Field(description="SHA-256 of its field.")
     stage: Literal["refined", "coarse", "signature", "unusable"] = Field(
-        description="How far it came: refined on its field and judged, searched coarsely, compared by signature alone; "
-        "or unusable as an object."
+        description="The last stage that the candidate reached: refined on its field with a verdict, coarse "
+        "search, comparison of signatures only; or unusable as an object."
     )
-    score: float | None = Field(description="0..1, smaller is better; to be compared within one stage.")
-    verdict: Verdict | None = Field(default=None, description="Of refined ones.")
-    verdict_reason: str | None = Field(default=None, description="Of refined and unusable ones.")
-    probability: float | None = Field(default=None, description="Of refined ones, as the result's.")
-    level: Acceptance | None = Field(default=None, description="Of refined ones, as the result's.")
+    score: float | None = Field(description="Cost, 0..1, lower is better. Compare it only within one stage.")
+    verdict: Verdict | None = Field(default=None, description="Only for refined candidates.")
+    verdict_reason: str | None = Field(default=None, description="Only for refined and unusable candidates.")
+    probability: float | None = Field(
+        default=None, description="Only for refined candidates. Same meaning as in the result."
+    )
+    level: Acceptance | None = Field(
+        default=None, description="Only for refined candidates. Same meaning as in the result."
+    )
     difference: DifferenceDocument | None = Field(
-        default=None, description="Of refined ones but the first: what tells it from that."
+        default=None, description="Only for refined candidates after the first: the difference from the first."
     )
-    T_scene_object: TransformDocument | None = Field(default=None, description="Of refined ones.")
+    T_scene_object: TransformDocument | None = Field(default=None, description="Only for refined candidates.")
     T_object_scene: TransformDocument | None = Field(default=None, description="Its inverse.")
 
 
 class SettingsUsedDocument(Outgoing):
-    """Which of a trainer's settings an import has used."""
+    """The trainer's settings that an import has used."""
 
     trainer: str | None = None
     files: list[str] = Field(default=[], description="Their names.")
-    used: dict[str, Any] = Field(
-        default={}, description="Entries of a description, such as `hash.levels`, with values."
-    )
+    used: dict[str, Any] = Field(default={}, description="Import options, such as `hash.levels`, with their values.")
 
 
 class FieldNotesDocument(Outgoing):
-    """What the import of a field said that a result repeats."""
+    """Notes of a field's import that are copied into a result."""
 
     family: str | None = Field(default=None, description="The format that was recognized.")
-    settings: SettingsUsedDocument | None = Field(default=None, description="The trainer's settings that counted.")
-    warnings: list[str] = Field(default=[], description="Each begins with a stable word: docs/import-gate.md.")
+    settings: SettingsUsedDocument | None = Field(
+        default=None, description="The trainer's settings that the import used."
+    )
+    warnings: list[str] = Field(
+        default=[], description="Warnings of the import. Each begins with a stable word (docs/import-gate.md)."
+    )
 
 
 class ArtifactEntry(Outgoing):
-    """One file that the job wrote, or is about to write."""
+    """One file that the job has written or is writing."""
 
     name: str
     state: Literal["ready", "pending"] = Field(
-        default="ready", description="`pending`: it is still being made; a request for it is held until it is there."
+        default="ready",
+        description="`pending`: the file is still being made. A request for it waits until it is finished.",
     )
     bytes: int | None = Field(
-        description="Null while it is pending, as the digest, and for a picture that is drawn when it is asked for."
+        description="Size of the file. `bytes` and `sha256` are null while the file is pending, and for a picture "
+        "before its first request."
     )
     sha256: Sha256 | None
     url: Address
@@ -381,67 +403,82 @@ class CameraDocument(Outgoing):
     """The object in the frame of the camera whose image the detection was made in: x right, y down, z forward."""
 
     frame: str = Field(description="The image's name.")
-    T_camera_object: TransformDocument = Field(description="Object to camera coordinates, in meters if the scene is.")
+    T_camera_object: TransformDocument = Field(
+        description="Object to camera coordinates. In meters if the scene is in meters."
+    )
     T_scene_camera: TransformDocument = Field(description="Camera to scene coordinates; the scene is the recording.")
-    center_camera: list[float] = Field(description="Where `center_object` is, camera frame, meters.")
-    object_unit_m: float | None = Field(default=None, description="Meters of the object's unit, where it is known.")
+    center_camera: list[float] = Field(description="`center_object` in the camera frame, meters.")
+    object_unit_m: float | None = Field(default=None, description="The object's unit in meters, if it is known.")
 
 
 class ResultDocument(Outgoing):
-    """What a registration found. Transforms carry their direction in their name."""
+    """The result of a registration. The name of a transform gives its direction."""
 
     verdict: Verdict
     verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
-    verdict_detail: str = Field(default="", description="The reason in words, with the numbers behind it.")
-    verdict_hint: str = Field(default="", description="What to do next, for people; empty for a registered result.")
+    verdict_detail: str = Field(default="", description="The reason as a sentence, with numbers.")
+    verdict_hint: str = Field(default="", description="What the user can do next. Empty for a registered result.")
     probability: float | None = Field(
         default=None,
-        description="0..1: that the pose or one of the alternatives is right, within 5 % of the object's diameter. It "
-        "decides the verdict: see `options.robust.acceptance`. Null from the preset `paper`.",
+        description="Probability, 0..1, that the pose or one of the alternatives is within 5 % of the object's "
+        "diameter of the true pose. It decides the verdict: see `options.robust.acceptance`. Null "
+        "with the preset `paper`.",
     )
     level: Acceptance | None = Field(
         default=None,
-        description="The strictest named level of `options.robust.acceptance` that the probability reaches, whichever "
-        "was asked for; null: none.",
+        description="The strictest named level of `options.robust.acceptance` that the probability reaches. It "
+        "does not depend on the level in the request. Null: none.",
     )
     T_scene_object: TransformDocument = Field(
         description="The object's pose in the scene: object to scene coordinates."
     )
     T_object_scene: TransformDocument = Field(description="Its inverse: scene coordinates to object coordinates.")
-    center_scene: list[float] = Field(default=[], description="T_scene_object of `center_object`, scene frame.")
+    center_scene: list[float] = Field(default=[], description="`center_object` in the scene frame.")
     center_object: list[float] = Field(default=[], description="The centroid of the object's surface, object frame.")
-    T_object_scene_initial: TransformDocument | None = Field(default=None, description="Where the refinement began.")
+    T_object_scene_initial: TransformDocument | None = Field(
+        default=None, description="The pose at the start of the refinement."
+    )
     alternatives: list[AlternativeDocument] = Field(
-        default=[], description="Every other pose that explains the data as well; empty unless `ambiguous`."
+        default=[],
+        description="All other poses that fit the data equally well. Empty unless the verdict is `ambiguous`.",
     )
     considered: list[ConsideredDocument] | None = Field(
-        default=None, description="Up to six poses that were judged, the likeliest first; null from the preset `paper`."
+        default=None,
+        description="Up to six candidate poses, each with its own verdict, the most probable first. Null with the "
+        "preset `paper`.",
     )
     covariance: Annotated[list[_Seven], Field(min_length=7, max_length=7)] | None = Field(
         default=None,
-        description="7x7 in the order of `covariance_ordering`, in radians and object units. T_object_scene, "
-        "x -> s R x + t, becomes s exp(log_s), exp([omega]) R, t + dt, so turn and growth are about t, where the "
-        "scene's origin lies; it is not exp(xi) T_object_scene. The object's point c lies in the scene at "
-        "p = R^T (c - t) / s and moves by J (omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s: its "
-        "covariance is J C J^T. docs/api.md has an example in numbers. Null from the preset `paper`.",
+        description="7x7 in the order of `covariance_ordering`, in radians and object units. A perturbation "
+        "changes T_object_scene, x -> s R x + t, to s exp(log_s), exp([omega]) R, t + dt. Rotation "
+        "and scaling are therefore about t, the image of the scene's origin; this is not exp(xi) "
+        "T_object_scene. The object's point c is in the scene at p = R^T (c - t) / s. It moves by J "
+        "(omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s, so its covariance is J C J^T. "
+        "docs/api.md has an example with numbers. Null with the preset `paper`.",
     )
     covariance_ordering: list[str] | None = Field(default=None, description="omega (3), t (3), log_s.")
     uncertainty: UncertaintyDocument | None = None
-    camera: CameraDocument | None = Field(default=None, description="Of a scene that is a recording.")
+    camera: CameraDocument | None = Field(
+        default=None, description="The object in the camera frame, if the scene is a recording."
+    )
     symmetry: SymmetryDocument | None = Field(
-        default=None, description="The object's own; null from the preset `paper`."
+        default=None, description="The object's symmetry. Null with the preset `paper`."
     )
     metrics: dict[str, float | None] = Field(default={})
-    object: str | None = Field(default=None, description="SHA-256 of the object's field; of a search, the likeliest's.")
-    candidates: list[CandidateDocument] | None = Field(default=None, description="Of a search, the likeliest first.")
+    object: str | None = Field(
+        default=None, description="SHA-256 of the object's field. For a search, that of the most probable object."
+    )
+    candidates: list[CandidateDocument] | None = Field(
+        default=None, description="The candidates of a search, the most probable first."
+    )
     fields: dict[Literal["scene", "object"], FieldNotesDocument] | None = Field(
-        default=None, description="Their imports."
+        default=None, description="Notes of the imports of scene and object."
     )
     seed: int = 0
-    options: dict[str, Any] = Field(default={}, description="Every option that was used, defaults included.")
+    options: dict[str, Any] = Field(default={}, description="All options that were used, including defaults.")
     engine: dict[str, Any] = Field(default={}, description="Name, version, device.")
     artifacts: list[ArtifactEntry] = Field(default=[])
-    missing_artifacts: list[str] = Field(default=[], description="Names of those that could not be made afterwards.")
+    missing_artifacts: list[str] = Field(default=[], description="Names of artifacts that could not be made.")
 
 
 COVARIANCE_ORDERING = ("omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s")

@@ -87,7 +87,7 @@ class Batches:
         return Batch(batch_id, owner, _summary(batch_id, head).created, pairs)
 
     def delete(self, owner: str, batch_id: str) -> None:
-        """Forget a batch; its jobs stay."""
+        """Delete a batch; its jobs stay."""
         self._blobs.delete(_key(owner, batch_id))
 
     def kept(self, owner: str) -> list[BlobEntry]:

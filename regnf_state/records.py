@@ -118,7 +118,7 @@ class JobRecord(Closed):
 
     @property
     def webhooks(self) -> list[str]:
-        """Every address that is told of the job's end, in the order of asking."""
+        """All addresses that get the message about the job's end, in the order of the requests."""
         own = [self.request["webhook"]["url"]] if "webhook" in self.request else []
         return own + self.more_webhooks
 

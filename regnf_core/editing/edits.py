@@ -103,7 +103,7 @@ class Substitution(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Replacement(_Checked):
-    """Another object in place of one that was registered.
+    """Replaces a registered object by another object.
 
     obj, T_object_scene, residual: as in a substitution, of what stands there now · replacement: what will
     stand there · T_replacement_object: the known pose of both, from the object's coordinates to the replacement's;
@@ -152,7 +152,7 @@ class Removal(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Insertion(_Checked):
-    """An object where nothing of the scene is removed. T_object_scene: any similarity, scene to object coordinates."""
+    """Adds an object. Nothing of the scene is removed. T_object_scene: any similarity, scene to object coordinates."""
 
     obj: SdfField
     T_object_scene: Sim3

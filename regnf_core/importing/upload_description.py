@@ -48,7 +48,8 @@ _Box = Annotated[list[_Corner], Len(2, 2), AfterValidator(_sound_box)]
 
 @dataclass(frozen=True)
 class GridDescription(_Said):
-    """What the table's size alone may leave open about a hash grid. Anything left out is searched for."""
+    """Import options for a hash grid, if its layout does not follow from the size of its table. The importer searches
+    for options that are left out."""
 
     levels: Annotated[int, Ge(1), Le(32)] | None = None
     features_per_level: Annotated[int, Ge(1), Le(32)] | None = None
@@ -64,7 +65,7 @@ class GridDescription(_Said):
 
 @dataclass(frozen=True)
 class EncodingDescription(_Said):
-    """What the widths alone may leave open about the sines and cosines of the position."""
+    """Import options for the positional encoding, if its layout does not follow from the widths of the layers."""
 
     degree: Annotated[int, Ge(0), Le(24)] | None = None
     """Number of frequencies."""
@@ -85,7 +86,8 @@ Inputs = Literal["all", "no_direction", "no_gradient", "features"]
 
 @dataclass(frozen=True)
 class ColorOverrides(_Said):
-    """What the widths alone may leave open about a network of colors. It changes nothing about the geometry."""
+    """Import options for a color network, if its layout does not follow from the widths of its layers. They do not
+    change the geometry."""
 
     keep: bool | None = None
     """False: leave the color out."""
@@ -108,7 +110,7 @@ class ColorOverrides(_Said):
 
 @dataclass(frozen=True)
 class CamerasDescription(_Said):
-    """What the file of cameras does not say of them."""
+    """Import options for cameras: what is not in the camera file."""
 
     intrinsics: Annotated[list[Annotated[float, Gt(0), Le(1e6)]], Len(4, 4)] | None = None
     """fx, fy, cx, cy of all images, in pixels."""
@@ -120,7 +122,7 @@ class CamerasDescription(_Said):
 
 @dataclass(frozen=True)
 class UploadDescription(_Said):
-    """Overrides of what the gate would conclude by itself. None means: conclude it."""
+    """Import options. They replace what the importer derives from the file. null: derive it."""
 
     family: Annotated[str, MaxLen(64)] | None = None
     contraction: Literal["none", "linf", "linf_grid"] | None = None

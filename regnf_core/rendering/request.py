@@ -25,7 +25,7 @@ MOST_PIXELS_IN_ALL = 1 << 30
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Of all frames of one rendering."""
+    """Options of a rendering. They apply to all frames."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "use_attribute_docstrings": True}
 
@@ -33,23 +33,25 @@ class RenderOptions:
     """surface: where rays first meet the zero level. volume: NeuS's opacity along the ray; it shows how sharp a field
     is, and takes three to four times as long."""
     coloring: Literal["auto", "field", "shaded"] = "auto"
-    """auto: the field's colors where it has some, else shading. field: an error where it has none. shaded: never."""
+    """auto: the field's colors if it has colors, else shading. field: the field's colors, or an error if it has none.
+    shaded: always shading."""
     tints: bool = True
-    """Whether what was edited has its tint."""
+    """Whether edited objects are tinted."""
     antialias: Annotated[int, Ge(1), Le(4)] = 1
-    """Rays along each side of a pixel, for colors, normals and opacity; depths are of the pixels' middles or beside."""
+    """Rays along each side of a pixel, for colors, normals and opacity. Depths are those at the center of the pixel, or
+    next to it."""
     background: Rgb = (1.0, 1.0, 1.0)
-    """Where a ray meets nothing."""
+    """Color of a pixel whose ray hits no surface."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
-    """Where more light comes from, for shading; the scene's frame."""
+    """Direction of the light for shading, scene frame."""
     cut_away: bool = False
-    """Whether a camera may stand in matter, as one of an orbit always may: its rays then begin where they leave it.
-    Matter at the bounds is always cut away before a camera outside of them."""
+    """Whether a camera may be inside solid matter: its rays then start where they leave it. Cameras of an orbit always
+    may. For cameras outside of the bounds, matter at the bounds is always cut away."""
     inverse_deviation: Annotated[FiniteFloat, Gt(0), Le(1e9)] | None = None
-    """NeuS's s, per scene unit, for mode volume. None: the field's own where it was learned, else 2000 over its
-    bounds' diagonal."""
+    """NeuS's parameter s, per scene unit, for the mode volume. null: the learned value of the field, else 2000 divided
+    by the diagonal of its bounds."""
     memory_mb: Annotated[int, Ge(16), Le(65536)] = 256
-    """What a tile's rays may take, about. It bounds the size of tiles and changes nothing else."""
+    """Approximate memory for the rays of one tile, MB. It limits the size of tiles and does not change the picture."""
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RenderOptions:
@@ -113,7 +115,7 @@ class OrbitRequest(Closed):
 
 @dataclass(frozen=True)
 class StationRequest(Closed):
-    """One place to look from. position, target: scene frame."""
+    """One camera. `position` and `target` are in the scene frame."""
 
     position: _Point
     target: _Point
@@ -127,7 +129,7 @@ class StationRequest(Closed):
 
 @dataclass(frozen=True)
 class PoseRequest(Closed):
-    """A camera whose pose and lens are known. T_scene_camera: rotation and place, OpenCV's axes (x right, y down, z
+    """A camera with known pose and intrinsics. T_scene_camera: rotation and position, OpenCV's axes (x right, y down, z
     forward) · intrinsics: fx, fy, cx, cy in pixels of an image of ``size`` (width, height)."""
 
     T_scene_camera: Rows

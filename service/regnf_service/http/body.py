@@ -46,9 +46,11 @@ async def caller_of_request(request: Request) -> str:
 ServicesDep = Annotated[Services, Depends(services_of)]
 CallerDep = Annotated[str, Depends(caller_of_request)]
 PrefixDep = Annotated[str, Depends(prefix_of)]
-WaitQuery = Annotated[int, Query(ge=0, le=30, description="Seconds to hold the answer back for news.")]
-LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return at most.")]
-PageTokenQuery = Annotated[str | None, Query(max_length=200, description="`next_page_token` of the page before.")]
+WaitQuery = Annotated[
+    int, Query(ge=0, le=30, description="Longest time to wait for a change before the response is sent, seconds.")
+]
+LimitQuery = Annotated[int, Query(ge=1, le=200, description="Largest number of entries in the response.")]
+PageTokenQuery = Annotated[str | None, Query(max_length=200, description="The `next_page_token` of the previous page.")]
 
 
 def declared_length(request: Request, besides: int = 0) -> int | None:

@@ -85,7 +85,7 @@ _ONE_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
 RangeHeader = Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")]
-IfRangeHeader = Annotated[str | None, Header(description="The ETag that the range belongs to.")]
+IfRangeHeader = Annotated[str | None, Header(description="The ETag of the file that the range is from.")]
 
 
 def parse_range(header: str | None, size: int) -> range | None:

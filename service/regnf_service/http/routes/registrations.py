@@ -60,24 +60,28 @@ from regnf_state.registration_request import JobRequest, RegistrationRequest
 
 _PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
 _MAX_WAIT_S = 30
-DryRunQuery = Annotated[bool, Query(description="Check everything, start nothing.")]
-PreferHeader = Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")]
+DryRunQuery = Annotated[bool, Query(description="Only check the request; start no job.")]
+PreferHeader = Annotated[
+    str | None, Header(description="`wait=N`: send the response when the job has finished, or after N seconds.")
+]
 IdempotencyKeyHeader = Annotated[
     str | None,
     Header(
-        description="Up to 255 printable ASCII characters, kept for 24 hours: refused with another request.",
+        description="Up to 255 printable ASCII characters, kept for 24 hours. The same key with a different "
+        "request is refused.",
         json_schema_extra={"pattern": "^[!-~]([ -~]{0,253}[!-~])?$"},
     ),
 ]
 JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The job has finished (`Prefer: wait`, or an identical one had), or the dry run passed.",
+        "description": "The job has finished (with `Prefer: wait`, or the same request was posted earlier), or the "
+        "dry run passed.",
         "content": {JSON: {"schema": {"anyOf": [reference(JobDocument), reference(DryRunDocument)]}}},
         "links": JOB_LINKS,
     },
     202: {
         "description": "Accepted.",
-        "headers": {"Location": header("The job."), "Retry-After": header("Seconds until a look is worth it.")},
+        "headers": {"Location": header("The job."), "Retry-After": header("Seconds to wait before the next request.")},
         "links": JOB_LINKS,
     },
 }
@@ -150,7 +154,7 @@ _ONE_SHOT = {
 
 @router.post(
     "/register",
-    summary="Find the transform that lays the scene's copy of the object onto the library's",
+    summary="Register an object: find its pose in the scene",
     response_model=JobDocument,
     status_code=202,
     responses={
@@ -184,9 +188,10 @@ async def register(
     prefer: PreferHeader = None,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JSONResponse:
-    """The same request twice is one job: its id follows from what is asked. A job that failed is started anew.
+    """The same request twice is one job: the job id is a hash of the request. A job that failed is started again.
 
-    Requests that differ in the label, the score or the webhook alone are the same. Every webhook is told of the end.
+    Requests that differ only in the label, the score or the webhook are the same. Every webhook gets the message about
+    the end of the job.
     """
     check_idempotency_key(idempotency_key)
     asked = await _read(request, services, caller, keep=not dry_run)

@@ -41,7 +41,7 @@ router = APIRouter(tags=["renderings"])
 
 @router.post(
     "/render",
-    summary="Render a scene in which objects are substituted, replaced, removed or inserted",
+    summary="Render a scene with edits: objects substituted, replaced, removed or inserted",
     response_model=JobDocument,
     status_code=202,
     responses={
@@ -70,7 +70,8 @@ async def render(
     prefer: PreferHeader = None,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JSONResponse:
-    """A job like a registration: the same request twice is one job. Edits that name a registration must be finished."""
+    """The rendering is a job, like a registration: the same request twice is one job. If an edit names a registration,
+    that registration must be finished."""
     check_idempotency_key(idempotency_key)
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.")

@@ -1,4 +1,4 @@
-// The job's own part of the HTTP API. Every address is below the job's, taken from the page's own address.
+// The job's own part of the HTTP API. Every address is below that of the job, which is taken from the address of the page.
 
 import { patientFetch } from './patience.js';
 
