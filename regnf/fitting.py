@@ -51,7 +51,9 @@ def fit(
     given = Path(source)
     if given.is_dir() or is_recording(given):
         if extent is not None:
-            raise InvalidOptionsError("extent is for meshes: a dataset has its own frame", hint="Leave extent out.")
+            raise InvalidOptionsError(
+                "extent is only for meshes: a dataset has its own frame", hint="Leave extent out."
+            )
         files = FitFiles(path, path.with_suffix(".checkpoint"))
         chosen = _options(ReconstructionOptions, options)
         images, named = images_of(given).images, {"dataset": given.resolve().name}

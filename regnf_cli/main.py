@@ -148,7 +148,7 @@ def _run() -> int:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
         hint = error.hint
         if hint == HINTS["INVALID_OPTIONS"] and "options." not in str(error):  # options of the command line
-            hint = f"`regnf {asked[0]} --help` shows what it takes."
+            hint = f"`regnf {asked[0]} --help` lists the arguments and options."
         fail(error.reason, str(error), code, hint)
         show_candidates(error)
         return code
@@ -158,8 +158,8 @@ def _run() -> int:
 
 def _what_to_do(number: int | None) -> str | None:
     if number in _CLOSED:
-        return "Check who may write there, or name another place."
-    return "Make room on the disk, or name another place." if number in (*_FULL, None) else None
+        return "Check the permissions, or give another path."
+    return "Free space on the disk, or give another path." if number in (*_FULL, None) else None
 
 
 if __name__ == "__main__":

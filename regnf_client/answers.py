@@ -82,14 +82,14 @@ def checked_token(token: str) -> str:
     """A token that a header can hold. Raises InvalidInputError (INVALID_TOKEN)."""
     if token.isascii() and token.isprintable() and " " not in token and token:
         return token
-    hint = "Give the token alone, as the operator wrote it: without `Bearer`, quotes and line breaks."
-    raise InvalidInputError("the token has characters that no token has", reason="INVALID_TOKEN", hint=hint)
+    hint = "Give only the token, exactly as the operator gave it: without `Bearer`, quotes and line breaks."
+    raise InvalidInputError("the token has invalid characters", reason="INVALID_TOKEN", hint=hint)
 
 
 def unreachable(error: httpx.RequestError) -> UnreachableError:
     """The error for a service that does not answer."""
     url = error.request.url
-    hint = "Is it running? `regnf serve` starts one and prints its address; without a service the work is done here."
+    hint = "Check that the service is running. `regnf serve` starts one and prints its address."
     return UnreachableError(f"{url.scheme}://{url.netloc.decode()} does not answer: {error}", hint=hint)
 
 
@@ -104,11 +104,11 @@ _HINTS = {  # in place of the service's own, which are of HTTP
     "UNAUTHENTICATED": "Give the service's token: token=..., --token, or the environment variable REGNF_API_TOKEN.",
     "RATE_LIMITED": "Wait a moment, and try again.",
     "QUEUE_FULL": "Try again later.",
-    "JOB_NOT_FOUND": "Look at the id: `client.jobs()` lists your jobs. Another caller's jobs are not shown.",
+    "JOB_NOT_FOUND": "Check the id: `client.jobs()` lists your jobs. Jobs of other callers are not shown.",
     "JOB_NOT_READY": "Wait for the job first: `client.wait(job)`.",
     "JOB_EXPIRED": "Register again: the service keeps results for a limited time.",
-    "FIELD_NOT_FOUND": "Upload it first: `client.upload(path)`. Another caller's fields are not shown.",
-    "ARTIFACT_NOT_FOUND": "The result's `artifacts` has the names of all files.",
+    "FIELD_NOT_FOUND": "Upload it first: `client.upload(path)`. Fields of other callers are not shown.",
+    "ARTIFACT_NOT_FOUND": "`artifacts` of the result has the names of all files.",
 }
 
 
@@ -127,8 +127,10 @@ def parsed(model: type[_Model], values: Mapping[str, Any]) -> _Model:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        hint = "Client and service are of releases that differ too much, or the address is another service's."
-        raise ServiceError(f"the answer is no {model.__name__}: {where}: {first['msg']}", hint=hint) from error
+        hint = "The releases of client and service differ too much, or this is the address of another service."
+        raise ServiceError(
+            f"the response is not a valid {model.__name__}: {where}: {first['msg']}", hint=hint
+        ) from error
 
 
 def refusal(answer: httpx.Response) -> ServiceError:
@@ -137,8 +139,8 @@ def refusal(answer: httpx.Response) -> ServiceError:
     if document is None or not (document.keys() & {"reason", "detail", "title"}):
         url = answer.request.url
         place = f"{url.scheme}://{url.netloc.decode()}{url.path}"
-        hint = "Check address and port: `regnf serve` prints them. A proxy in front must pass every path on."
-        error = ServiceError(f"HTTP status {answer.status_code} from {place}: no regnf service", hint=hint)
+        hint = "Check address and port: `regnf serve` prints them. A proxy must forward all paths."
+        error = ServiceError(f"HTTP status {answer.status_code} from {place}: this is no regnf service", hint=hint)
     else:
         error = service_error(document)
     error.status = answer.status_code

@@ -50,7 +50,7 @@ class Pair:
             return given
         hint = 'Write {"scene": ..., "object": ..., "detection": ...}.'
         if not isinstance(given, Mapping):
-            raise InvalidInputError("a pair is no object", reason="INVALID_REQUEST", hint=hint)
+            raise InvalidInputError("a pair is no JSON object", reason="INVALID_REQUEST", hint=hint)
         objects = given.get("object", given.get("candidates"))
         if "scene" not in given or objects is None or "detection" not in given:
             raise InvalidInputError(

@@ -82,7 +82,7 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[Result]:
-        """Find where an object stands in a scene. initial_transform: a T_object_scene (4, 4) to look at first."""
+        """Find the pose of an object in a scene. initial_transform: an initial guess, a T_object_scene (4, 4)."""
         body = request_body(detection, options, seed, initial_transform)
         return _registered(self._connection.asking(progress, timeout_s), scene, obj, body)
 
@@ -210,7 +210,7 @@ class Calls:
         return answer.content
 
     def download(self, job: JobLike, name: str, target: str | Path) -> Flow[Path]:
-        """Write one file of a result to ``target``, which is there only once it is whole."""
+        """Write one file of a result to ``target``. The target appears only when it is complete."""
         return _download(self._connection.asking(), _artifact_address(job, name), Path(target))
 
     def save(self, found: Result | Rendering, folder: str | Path, progress: Report | None = None) -> Flow[list[Path]]:
@@ -303,7 +303,8 @@ class LibraryCalls:
         symmetry: dict[str, Any] | None = None,
         progress: Report | None = None,
     ) -> Flow[Entry]:
-        """Make a field an entry; a file is uploaded. symmetry: order, axis, continuous; None: the detected one.
+        """Add a field to the library. A file is uploaded first. symmetry: order, axis, continuous; None: the detected
+        one.
 
         Raises ServiceError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY), InvalidInputError (LIBRARY_ENTRY_INVALID).
         """
@@ -322,15 +323,15 @@ class LibraryCalls:
         return self._connection.asking().document(Entry, "GET", _entry_address(name))
 
     def change(self, name: str, /, **changes: Any) -> Flow[Entry]:
-        """Change name, tags, unit, note or symmetry; None takes one back. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
+        """Change name, tags, unit, note or symmetry; None removes a value. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
         return self._connection.asking().document(Entry, "PATCH", _entry_address(name), json=changes)
 
     def remove(self, name: str) -> Flow[None]:
-        """Take an entry out; its field stays. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        """Remove an entry; its field is kept. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
         return _done(self._connection.asking(), "DELETE", _entry_address(name))
 
     def download(self, name: str, target: str | Path) -> Flow[Path]:
-        """Write an entry's field, in the safe format. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        """Write an entry's field as a regnf field file. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
         return _download(self._connection.asking(), f"{_entry_address(name)}/file", Path(target))
 
 
@@ -341,8 +342,8 @@ def id_of(job: JobLike) -> str:
     name = job if isinstance(job, str) else getattr(job, "job", None)
     if isinstance(name, str) and name and all(part.isalnum() or part in "-_" for part in name):
         return name
-    hint = "Give what `submit` returned, or its `id`."
-    raise InvalidInputError(f"{job!r} names no job", reason="INVALID_JOB", hint=hint)
+    hint = "Give the return value of `submit`, or its `id`."
+    raise InvalidInputError(f"{job!r} is no job", reason="INVALID_JOB", hint=hint)
 
 
 def _registered(
@@ -438,7 +439,7 @@ def _download(asking: Asking, address: str, target: Path, sha256: str | None = N
     if sha256 is not None and (yield from work(partial(digest_of, part))) != sha256:
         part.unlink()
         hint = "Download it again; if that does not help, register again."
-        message = f"{target.name}: the bytes that came are not the result's"
+        message = f"{target.name}: the received bytes differ from the result's file"
         raise ServiceError(message, reason="DIGEST_MISMATCH", hint=hint)
     part.replace(target)
     return target
@@ -459,7 +460,7 @@ def _several(objects: Sequence[FieldLike]) -> list[FieldLike]:
         hint = "Write a list: [object]."
         raise InvalidInputError("objects must be a list of fields", reason="INVALID_INPUT", hint=hint)
     if not objects:
-        hint = "Give the objects to choose among."
+        hint = "Give the candidates."
         raise InvalidInputError("the list of objects is empty", reason="LIBRARY_EMPTY", hint=hint)
     return list(objects)
 

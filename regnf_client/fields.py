@@ -230,6 +230,6 @@ def _require_same(held: Field, source: FieldSource) -> None:
     wanted = {name: value for name, value in said.items() if name != "label"}
     found = {name: value for name, value in held.description.items() if name in wanted or name != "as"}
     if (wanted, digest) != (found, (held.settings or {}).get("sha256")):
-        message = "the service holds the same bytes with another description or other settings"
-        hint = f"Delete the field there first (DELETE /fields/{held.sha256}), or leave them out."
+        message = "the service has the same file with another `description` or `config`"
+        hint = f"Delete the field on the service first (DELETE /fields/{held.sha256}), or leave both out."
         raise ServiceError(message, reason="FIELD_DESCRIPTION_DIFFERS", hint=hint)

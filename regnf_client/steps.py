@@ -169,8 +169,8 @@ class WorkerWatch:
         if now - self._missing_since >= self._limit_s:
             raise NoWorkerError(
                 f"the service has had no live worker for {self._limit_s:g} s",
-                hint="Start one: `regnf worker`, or `regnf serve` with --workers 1. The job stays in the queue; the "
-                "same command finds it again.",
+                hint="Start one: `regnf worker`, or `regnf serve` with --workers 1. The job stays in the "
+                "queue. Run the same command to follow it again.",
             )
         self._next_look = min(self._next_look, self._missing_since + self._limit_s)
 
@@ -190,7 +190,7 @@ class Deadline:
     def check(self, what: str) -> None:
         """Raises WaitTimeoutError once the time is over. what: is waited for."""
         if time.monotonic() >= self._end:
-            hint = "It goes on: the same call finds it again. Give a larger timeout_s, or None."
+            hint = "It continues. The same call follows it again. Give a larger timeout_s, or None."
             raise WaitTimeoutError(f"{what} has not ended within {self._timeout_s:g} s", hint=hint)
 
 

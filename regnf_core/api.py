@@ -62,8 +62,8 @@ if TYPE_CHECKING:
 # A field as a user names it.
 
 FieldLike = SdfField | str | os.PathLike[str] | HasVertices | HasPoints | HasGeometry
-"""An open field; the path of a file, a training run's folder or an archive of one; or a mesh or a cloud in memory, see
-:func:`regnf_core.in_memory.field_of`."""
+"""An open field; the path of a file, of the folder of a training run or of an archive of such a folder; or a mesh or a
+point cloud in memory, see :func:`regnf_core.in_memory.field_of`."""
 
 
 @dataclass(frozen=True)
@@ -180,8 +180,8 @@ class Registered(RegistrationResult):
         """
         pose = self.T_camera_object
         if pose is None:
-            hint = "Register in a depth image: regnf.Frame, or the path of a recording."
-            raise InvalidInputError("the result is of a field, not of an image", reason="NO_CAMERA", hint=hint)
+            hint = "Register in a depth image (regnf.Frame, or the path of a recording)."
+            raise InvalidInputError("the scene of this result is a field, not an image", reason="NO_CAMERA", hint=hint)
         R, t = pose.rotation.flatten().tolist(), (1000.0 * pose.translation).tolist()
         score = self.probability if self.probability is not None else float(self.verdict == "registered")
         numbers = " ".join(f"{value:.8f}" for value in R), " ".join(f"{value:.6f}" for value in t)
@@ -192,7 +192,7 @@ class Registered(RegistrationResult):
         self._require_clouds()
         target = Path(folder)
         if target.exists() and not target.is_dir():
-            hint = "Name a folder; it is made if need be."
+            hint = "Give a folder. It is created if it does not exist."
             raise InvalidInputError(f"{target}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
         with filled_folder(target) as folder:
             names = write_artifacts(self, folder, object_name=self.object_name, fields=self.notes)
@@ -227,7 +227,7 @@ class Registered(RegistrationResult):
 
     def _require_clouds(self) -> None:
         if not self.residuals:
-            hint = "Register without clouds=False."
+            hint = "Register with clouds=True (the default)."
             raise InvalidInputError("the result has no point clouds to show", reason="NO_CLOUDS", hint=hint)
 
     def __repr__(self) -> str:
@@ -309,7 +309,7 @@ def register_batch(
     Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN, NO_FIELD).
     """
     if isinstance(detections, OrientedBox | str | os.PathLike) or not isinstance(detections, Sequence):
-        raise InvalidDetectionError("the detections are one box, expected a list", hint="Write a list: [box].")
+        raise InvalidDetectionError("detections is a single box, expected a list", hint="Write a list: [box].")
     chosen, boxes, seed = options_of(options), [box_of(one) for one in detections], seed_of(seed)
     pairs_of(pairs, len(boxes), len(objects))  # before any field is opened
     place = opened(scene, "scene")
@@ -383,7 +383,7 @@ def search(
         except NoSurfaceError as error:
             unusable[name] = error.reason
     if not library:
-        raise NoSurfaceError("none of the objects has a surface", reason="NO_SURFACE_IN_OBJECT")
+        raise NoSurfaceError("no object has a surface", reason="NO_SURFACE_IN_OBJECT")
     found = search_library(place.field, box, library, chosen, seed, progress, clouds)
     first = found.ranking[0].name
     notes = None if place.notes is None else {"scene": place.notes}

@@ -89,8 +89,8 @@ class Considered:
 
     scene_points (N, 3), object_points (M, 3): the samples, each in its field's frame · scene_signs (K, N) uint8: 0 the
     object explains the scene's surface there, 1 it does not although it is near, 2 it is not near · object_signs (K, M)
-    uint8: 0 the scene confirms the object's surface there, 1 the scene is free there, 2 nothing was seen there, 3 the
-    surfaces differ by a little.
+    uint8: 0 the scene confirms the object's surface there, 1 the scene has free space there, 2 nothing was observed
+    there, 3 the surfaces differ by a little.
     """
 
     poses: list[ConsideredPose]
@@ -125,8 +125,8 @@ class CameraView:
 
 
 SHOWN, ABSENT, UNKNOWN = range(3)
-"""What the scene says of a place of a candidate's surface: it is there, the scene is free there, or neither is clear:
-mostly since it was not seen."""
+"""Evidence of the scene for a place of a candidate's surface: the surface is there, the place is free space, or it is
+unclear, mostly because it was not observed."""
 
 
 @dataclass(frozen=True, eq=False)

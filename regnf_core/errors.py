@@ -86,8 +86,8 @@ def verdict_hint(reason: str, options: Mapping[str, Any]) -> str:
     """What to do next about a verdict, under these options of the registration; "" where nothing needs to be done."""
     if reason == "SEVERAL_POSES_AGREE" and options.get("up_axis") is not None:
         return (
-            "Choose a pose among the alternatives: all of them stand upright. A box that shows what tells the sides "
-            "apart, or more views of it, may decide."
+            "Choose one of the alternatives. All of them are upright. A box that includes the parts that distinguish "
+            "the sides, or more views of the object, may decide."
         )
     return HINTS.get(reason, "")
 
@@ -226,7 +226,7 @@ class MissingExtraError(RegnfError):
 # Files that appear complete or not at all, and the names that they may have.
 
 RECORDING_SUFFIX = ".rrd"
-"""Of recordings for the viewer of rerun."""
+"""Suffix of recordings for the rerun viewer."""
 
 
 @contextmanager
@@ -285,7 +285,7 @@ def new_file(path: str | os.PathLike[str], suffix: str) -> Path:
     """
     target = Path(path)
     if target.is_dir():
-        hint = f"Name a file in it: {target / 'result'}{suffix}"
+        hint = f"Give a file in it: {target / 'result'}{suffix}"
         raise InvalidInputError(f"{target}: a folder, expected a file to write", reason="FILE_IS_FOLDER", hint=hint)
     if target.suffix != suffix:
         raise InvalidOptionsError(f"{target}: expected a name that ends in {suffix}")

@@ -26,7 +26,7 @@ A file of the dataset (meta_data.json, dataparser_transforms.json ...) joins tho
 """
 _WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, *RUN_ARCHIVES, "safetensors"})
 """Formats that no trainer's settings say anything about, and archives, which have their own."""
-_FOUND_BESIDE = "They were found beside the checkpoint: --no-config (in Python config=False) leaves them unread."
+_FOUND_BESIDE = "They were found next to the checkpoint. --no-config (in Python config=False) ignores them."
 _WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "sqlite", "onnx"})
 """Formats whose files say which side of the surface is free; of the others the use decides."""
 

@@ -199,7 +199,7 @@ def register(
     """
     options = options or RegistrationOptions()
     if initial_transform is not None:
-        options.require_robust("starts from a given transform", reason="PRESET_UNSUITABLE")
+        options.require_robust("can use an initial transform", reason="PRESET_UNSUITABLE")
     if object_model is not None:
         options.require_robust("uses an object model")
     run = Run(progress)

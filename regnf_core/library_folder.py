@@ -54,7 +54,7 @@ class FolderEntry:
         notes = EntryNotes.from_dict(values)
         field = values.get("field")
         if not (isinstance(field, str) and len(field) == _DIGITS and set(field) <= set("0123456789abcdef")):
-            raise InvalidInputError("a field is named by its SHA-256", reason="LIBRARY_ENTRY_INVALID")
+            raise InvalidInputError("a field must be identified by its SHA-256", reason="LIBRARY_ENTRY_INVALID")
         return cls(notes, field, checked_symmetry(values.get("detected_symmetry")))
 
 
@@ -71,10 +71,10 @@ def index_of(text: bytes, named: str) -> list[FolderEntry]:
             raise ValueError(f"expected an index of format {FORMAT}")
         entries = [FolderEntry.from_dict(values) for values in document["entries"]]
     except (ValueError, KeyError, TypeError, RecursionError, InvalidInputError) as error:
-        raise _invalid(f"{named}: no index of a library: {error}") from error
+        raise _invalid(f"{named}: not an index of a library: {error}") from error
     for what in ({one.notes.name for one in entries}, {one.field for one in entries}):
         if len(what) < len(entries):
-            raise _invalid(f"{named}: two entries share a name or a field")
+            raise _invalid(f"{named}: two entries have the same name or the same field")
     return entries
 
 
@@ -109,7 +109,7 @@ class LibraryFolder:
         for one in self.entries():
             if one.notes.name == name:
                 return one
-        hint = "`regnf library list` shows all names."
+        hint = "`regnf library list` lists all names."
         raise InvalidInputError(f"{self.folder}: no entry {name!r}", reason="LIBRARY_ENTRY_NOT_FOUND", hint=hint)
 
     def file(self, entry: FolderEntry) -> Path:
@@ -175,11 +175,11 @@ class LibraryFolder:
     def _require_free(self, held: list[FolderEntry], entry: FolderEntry) -> None:
         for one in held:
             if one.notes.name == entry.notes.name:
-                message = f"{self.folder}: there is an entry {one.notes.name!r}"
+                message = f"{self.folder}: the entry {one.notes.name!r} exists already"
                 hint = "Choose another name, or remove that entry first."
                 raise InvalidInputError(message, reason="LIBRARY_NAME_TAKEN", hint=hint)
             if one.field == entry.field:
-                message = f"the field is the entry {one.notes.name!r}"
+                message = f"the field is already the entry {one.notes.name!r}"
                 hint = "Change that entry: `regnf library edit`."
                 raise InvalidInputError(message, reason="FIELD_IN_LIBRARY", hint=hint)
 
@@ -247,7 +247,7 @@ class Archive:
                 digest.update(block)
                 file.write(block)
         if digest.hexdigest() != entry.field:
-            raise _refused(f"the field of {entry.notes.name!r} is not the one that the index names", "HASH_MISMATCH")
+            raise _refused(f"the field of {entry.notes.name!r} differs from the one in the index", "HASH_MISMATCH")
 
 
 @contextmanager  # what is mapped ends with its last reader
@@ -268,7 +268,7 @@ def _checked(data: memoryview, path: Path) -> Archive:
     index = members.get(INDEX)
     if index is None or index.size > _INDEX_BYTES:
         hint = "Give a file that `regnf library export` wrote."
-        raise InvalidInputError(f"{path}: no library: it has no {INDEX}", reason="LIBRARY_INDEX_INVALID", hint=hint)
+        raise InvalidInputError(f"{path}: not a library: it has no {INDEX}", reason="LIBRARY_INDEX_INVALID", hint=hint)
     entries = index_of(bytes(data[index.offset : index.offset + index.size]), f"{path}: {INDEX}")
     expected = {INDEX, *map(_name, entries)}
     if members.keys() != expected:

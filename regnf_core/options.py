@@ -259,7 +259,7 @@ def seed_of(seed: Any) -> int:
     except TypeError:
         found = -1
     if not 0 <= found < 2**32:
-        raise InvalidOptionsError(f"the seed is {seed!r:.40}, expected a whole number of 0 to {2**32 - 1}")
+        raise InvalidOptionsError(f"the seed is {seed!r:.40}, expected a whole number from 0 to {2**32 - 1}")
     return found
 
 

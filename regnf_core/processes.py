@@ -125,7 +125,7 @@ class _Copy:
         try:
             done, value = self.connection.recv()
         except (EOFError, OSError) as error:
-            raise ProcessLostError("a process was ended from outside", hint="Is there enough memory?") from error
+            raise ProcessLostError("a process was killed from outside", hint="Is there enough memory?") from error
         if not done:
             raise value
         return value

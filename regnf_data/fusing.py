@@ -83,7 +83,7 @@ def fuse_blocks(
             color = image_of(core.Tensor((colors[number] / np.float32(255.0)).astype(np.float32)))
             blocks.integrate(near, image, color, K, K, camera, *reach)
     if fused == 0:
-        raise DatasetError("no depth image shows surface within reach", reason="DATASET_NOTHING_IN_BOUNDS")
+        raise DatasetError("no depth image shows a surface within the depth limit", reason="DATASET_NOTHING_IN_BOUNDS")
     source = path.with_suffix(".npz")
     try:
         blocks.save(str(source))

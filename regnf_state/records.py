@@ -329,9 +329,9 @@ def check_json_format(name: str, document: object) -> dict[str, Any]:
 def _check_format(name: str, value: object) -> None:
     text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise UnreadableRecordError(name, "its format is no number")
+        raise UnreadableRecordError(name, "its format is not a number")
     if int(text) != FORMAT:
-        message = f"it has format {text}, this release reads {FORMAT}"
+        message = f"it has format {text}; this release reads {FORMAT}"
         raise UnreadableRecordError(name, message, newer=int(text) > FORMAT)
 
 
@@ -343,7 +343,7 @@ def _refuse(constant: str) -> None:
 def _check(record: JobRecord | FieldRecord, name: str) -> None:
     """What the types do not say and every reader relies on."""
     if (record.id if isinstance(record, JobRecord) else record.sha256) != name:
-        raise UnreadableRecordError(name, "it is the record of something else")
+        raise UnreadableRecordError(name, "it is the record of another object")
     times = [getattr(record, time, None) for time in _TIMES]
     if not all(time is None or (math.isfinite(time) and 0 <= time < LAST_TIME) for time in times):
         raise UnreadableRecordError(name, "a time is out of range")
@@ -372,7 +372,7 @@ def _check_request(request: dict[str, Any], name: str) -> None:
         listed = request.get(several) or []
         named += listed if isinstance(listed, list) else [0]
     if not all(isinstance(one, str) for one in named):
-        raise UnreadableRecordError(name, "request: a field is named by something else than a text")
+        raise UnreadableRecordError(name, "request: the name of a field is not a text")
     webhook = request.get("webhook", {"url": ""})
     if not (isinstance(webhook, dict) and isinstance(webhook.get("url"), str)):
         raise UnreadableRecordError(name, "request.webhook: no address")

@@ -226,7 +226,7 @@ class Room:
             counters.count(self._redis, "jobs_evicted")
             gone += 1
         if gone:
-            logger.info("%d finished jobs of %s are evicted to make room", gone, owner)
+            logger.info("%d finished jobs of %s are deleted to free space", gone, owner)
         return gone
 
     def _drop_rejected(self, owner: str) -> None:

@@ -52,7 +52,9 @@ class ImageDetection:
 
     def __post_init__(self) -> None:
         if sum(value is not None for value in (self.mask, self.box_2d, self.point_2d)) != 1:
-            raise InvalidDetectionError("a detection in an image has one of mask, box_2d and point_2d", hint=HINT)
+            raise InvalidDetectionError(
+                "a detection in an image needs exactly one of mask, box_2d and point_2d", hint=HINT
+            )
 
     def values(self) -> dict[str, Any]:
         """Plain (JSON) values; what was not given is left out."""
@@ -122,7 +124,7 @@ def place_of_frame(names: Sequence[str], wanted: str) -> int | None:
 def image_detection_in_field(scene: object = "the scene") -> InvalidDetectionError:
     """The error for a mask, a box in pixels or a point where the scene has no images."""
     return InvalidDetectionError(
-        f"the detection is about an image, and {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
+        f"the detection is in an image, but {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
     )
 
 
@@ -143,7 +145,7 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
     if entries and all(isinstance(entry, ImageDetection) for entry in entries):
         return tuple(entries)
     if not entries or len(entries) > _MOST_DETECTIONS or not all(isinstance(entry, Mapping) for entry in entries):
-        raise InvalidDetectionError("no detection is listed", hint=HINT)
+        raise InvalidDetectionError("the list of detections is empty", hint=HINT)
     ours = all(any(key in entry for key in ("mask", "box_2d", "point_2d")) for entry in entries)
     if index is not None:
         if not 0 <= index < len(entries):
@@ -152,7 +154,7 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
     elif not ours and len(entries) > 1:
         known = ", ".join(f"{n}: {_name(entry)}" for n, entry in enumerate(entries[:8]))
         raise InvalidDetectionError(
-            f"{len(entries)} detections are listed: say which ({known})", hint="Give --detection-index."
+            f"there are {len(entries)} detections; choose one ({known})", hint="Give --detection-index."
         )
     images, categories = (_listed(values, name) for name in ("images", "categories"))
     return tuple(_read(entry, images, categories) for entry in entries)
@@ -206,10 +208,10 @@ def _read(
         left, top, width, height = _numbers(entry["bbox"], 4, "bbox")
         corners = [left, top, left + width, top + height]
     else:
-        raise InvalidDetectionError("a detection in an image has a mask, a box_2d or a point_2d", hint=HINT)
+        raise InvalidDetectionError("a detection in an image needs a mask, a box_2d or a point_2d", hint=HINT)
     if not (corners[0] < corners[2] and corners[1] < corners[3]):
         raise InvalidDetectionError(
-            f"the box {corners} has no area: it is left, top, right, bottom in pixels", hint=HINT
+            f"the box {corners} has no area; the order is left, top, right, bottom, in pixels", hint=HINT
         )
     return ImageDetection(box_2d=(corners[0], corners[1], corners[2], corners[3]), **common)
 

@@ -112,7 +112,7 @@ def _require_apart(edits: Sequence[_Planned]) -> None:
             most = _MOST_COMMON if isinstance(a, PlacedObject) and isinstance(b, PlacedObject) else _MOST_OF_BOX
             if _common(a, b) > most:
                 message = f"edits {first} and {second} change the same place"
-                hint = "Leave one of them out, or make one after the other: an edited scene can be edited again."
+                hint = "Leave one of them out, or apply one after the other: an edited scene can be edited again."
                 raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)
 
 
@@ -169,7 +169,7 @@ def standing_alike(
 def _upright(up: str) -> Tensor:
     """(3, 3), columns: two level axes and the vertical, right-handed."""
     if up.removeprefix("-") not in ("x", "y", "z"):
-        raise invalid_edit(f"the vertical is x, y or z, also with -, not {up[:20]!r}")
+        raise invalid_edit(f"the up axis must be x, y, z, -x, -y or -z, not {up[:20]!r}")
     sign = -1.0 if up.startswith("-") else 1.0
     first = axis_vector("xyz"[("xyz".index(up[-1]) + 1) % 3])
     vertical = sign * axis_vector(up[-1])
@@ -260,6 +260,6 @@ def _require_in_scene(scene: SdfField, plan: _Planned, number: int) -> None:
             continue
         corners = _box_of(thing).corners()
         if bool((corners.amin(0) > high).any()) or bool((corners.amax(0) < low).any()):
-            message = f"edit {number}: what it changes lies outside of the scene's bounds"
-            hint = "T_object_scene takes scene coordinates to object coordinates. Check its direction and the units."
+            message = f"edit {number}: it changes a place outside of the scene's bounds"
+            hint = "T_object_scene maps scene coordinates to object coordinates. Check its direction and the units."
             raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)

@@ -79,11 +79,11 @@ class _Checked:
             if transform is None:
                 continue
             if transform.scale.shape != ():
-                raise InvalidInputError("an edit has one transform, not a batch", reason="INVALID_TRANSFORM")
+                raise InvalidInputError("an edit has one transform, not several", reason="INVALID_TRANSFORM")
             Sim3.from_matrix(transform.matrix())
         residual = getattr(self, "residual", None)
         if residual is not None and not 0.0 <= residual < math.inf:
-            raise invalid_edit("a residual is a length in object units, 0 or more")
+            raise invalid_edit("residual must be a length in object units, 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ class Replacement(_Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.match not in ("height", "diagonal"):
-            raise invalid_edit(f"a replacement matches height or diagonal, not {str(self.match)[:20]!r}")
+            raise invalid_edit(f"`match` must be height or diagonal, not {str(self.match)[:20]!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class Removal(_Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.obj is None) != (self.T_object_scene is None):
-            raise invalid_edit("a removal has an object and its transform, or neither")
+            raise invalid_edit("a removal needs both an object and its transform, or neither")
         if self.detection is None and self.obj is None:
             raise invalid_edit("a removal needs a detection, or an object and its transform")
 

@@ -57,5 +57,5 @@ def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
     except FieldFormatError as error:
         raise error.told(f"{named.name}: {error}") from error
     if len(geometry.faces) == 0:
-        raise malformed(f"{named.name} holds no triangles")
+        raise malformed(f"{named.name} has no triangles")
     return geometry

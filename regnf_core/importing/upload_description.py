@@ -26,7 +26,7 @@ class _Said:
 
 def _sound_box(box: list[list[float]]) -> list[list[float]]:
     if not all(low < high for low, high in zip(*box, strict=True)):
-        raise ValueError("the lowest corner is not below the highest along every axis")
+        raise ValueError("the lowest corner must be below the highest corner along every axis")
     return box
 
 

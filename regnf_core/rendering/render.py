@@ -216,7 +216,7 @@ def render_frames(
 
     def check() -> None:
         if cancelled is not None and cancelled():
-            raise CancelledError("the rendering was cancelled")
+            raise CancelledError("the rendering was canceled")
 
     def watched() -> Iterator[list[Part]]:
         done = in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
@@ -261,8 +261,12 @@ class Renderer:
             return
         if float(finite_distance(self.field, camera.position[None].float().to(self.field.device))[0]) <= 0.0:
             place = ", ".join(f"{value:.4g}" for value in position.tolist())
-            hint = "Move it into free space, or let what is before it be cut away: option cut_away."
-            raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_INVALID", hint=hint)
+            hint = (
+                "Move the camera into free space, or set the option cut_away, which removes the matter in front of it."
+            )
+            raise InvalidInputError(
+                f"the camera at ({place}) is inside solid matter", reason="CAMERA_INVALID", hint=hint
+            )
 
     def tiles(self, camera: Camera, processes: int) -> list[Tensor]:
         """The pixels of the frame in rectangles that fit the memory, and are enough for the processes."""

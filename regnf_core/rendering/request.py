@@ -80,8 +80,8 @@ def check_extent(frames: int, pixels: int) -> None:
         (frames * pixels, MOST_PIXELS_IN_ALL, "pixels in all frames"),
     ):
         if count > most:
-            message = f"{count} {of}, at most {most} are rendered at once"
-            raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Ask for fewer or smaller frames.")
+            message = f"{count} {of}; one rendering can have at most {most}"
+            raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Request fewer or smaller frames.")
 
 
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -138,9 +138,9 @@ class PoseRequest(Closed):
 
     def __post_init__(self) -> None:
         if min(self.intrinsics[:2]) <= 0:
-            raise ValueError("focal lengths are above 0")
+            raise ValueError("focal lengths must be above 0")
         if abs(math.hypot(*(row[0] for row in self.T_scene_camera[:3])) - 1.0) > _UNIT:
-            raise ValueError("T_scene_camera has a scale, and a camera has none")
+            raise ValueError("T_scene_camera must not have a scale")
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class RenderRequest(Closed):
         """From plain values, all checked. Raises InvalidInputError naming the member: INVALID_OPTIONS, CAMERA_INVALID,
         EDIT_INVALID, INVALID_TRANSFORM, INVALID_DETECTION, RENDER_TOO_LARGE."""
         if not isinstance(values, dict):
-            raise InvalidOptionsError("a rendering is described by an object")
+            raise InvalidOptionsError("a rendering request must be an object")
         read_edits(values.get("edits", []))  # its own reasons
         try:
             request: RenderRequest = _ADAPTER.validate_python(values)
@@ -204,7 +204,7 @@ class RenderRequest(Closed):
     def check(self) -> None:
         """Raises InvalidInputError: CAMERA_INVALID, RENDER_TOO_LARGE."""
         if sum(one is not None for one in (self.orbit, self.look_at, self.poses)) > 1:
-            raise InvalidInputError("cameras: say one of orbit, look_at and poses", reason="CAMERA_INVALID")
+            raise InvalidInputError("cameras: give one of orbit, look_at and poses", reason="CAMERA_INVALID")
         edit = self.orbit.edit if self.orbit is not None else None
         if edit is not None and edit >= len(self.edits):
             raise InvalidInputError(f"orbit.edit: there is no edit {edit}", reason="CAMERA_INVALID")

@@ -152,7 +152,7 @@ class Painter:
         """Raises InvalidInputError (COLORS_MISSING): colors are asked for, and no part has any."""
         parts = field.parts if isinstance(field, PartedField) else (Part(field, None),)
         if options.coloring == "field" and not any(has_color(part.field) for part in parts):
-            hint = "Let it be shaded: coloring auto or shaded."
+            hint = "Use coloring auto or shaded."
             raise InvalidInputError("the field has no colors", reason="COLORS_MISSING", hint=hint)
         return cls(field, parts, up_vector(options.up).float(), options)
 

@@ -270,7 +270,7 @@ class WorkingObservation:
 
 def not_finite() -> InvalidInputError:
     """For what a field said."""
-    return InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+    return InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
 
 
 # Samples of both surfaces, evenly spread over the surface in the region, with normals and exact field values.

@@ -199,11 +199,11 @@ def _checked_sight(
     odds, sees = _odds(best, len(images)) / _odds(own, len(images)), 2 * seeing >= len(images)
     if sees and odds < _DOUBTFUL:
         return None
-    more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field, and {100 * best:.2g} % with {told}"
+    more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field; {100 * best:.2g} % with {told}"
     if sees:
         return f"CAMERAS_DOUBTFUL: {more}"
-    message = f"{len(images) - seeing} of {len(images)} cameras stand within matter or see no surface of the field"
-    message += f"; {more}" if told else ": are they of the same scene, in the same frame?"
+    message = f"{len(images) - seeing} of {len(images)} cameras are inside solid matter, or see no surface of the field"
+    message += f"; {more}" if told else ". Check that cameras and field are of the same scene, in the same frame"
     raise FieldFormatError(message, reason="CAMERAS_OF_ANOTHER_FRAME")
 
 

@@ -164,7 +164,7 @@ def _own_triangles(field: SdfField) -> Triangles | None:
 
 def _extracted(field: SdfField, budget_s: float) -> DisplayMeshes:
     if budget_s <= 0.0:
-        raise TooSlowError("the field is too slow to be drawn")
+        raise TooSlowError("the field is too slow to draw")
     began = time.process_time()
     clock = _Clock(began + 2.0 * budget_s)  # an estimate may be wrong: what is nearly done is not thrown away
     coarse = _surface(field, _COARSE_CELLS, clock)
@@ -191,7 +191,7 @@ class _Clock:
     def __call__(self, evaluations: int) -> None:
         del evaluations
         if time.process_time() > self.end:
-            raise TooSlowError("the field is too slow to be drawn")
+            raise TooSlowError("the field is too slow to draw")
 
 
 def _surface(field: SdfField, cells: int, clock: _Clock) -> Triangles:

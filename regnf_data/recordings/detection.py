@@ -47,8 +47,8 @@ def mask_of(value: Any, size: Size | None = None) -> Mask:
                     return _of_picture(image)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             known = ", ".join(_MASK_FORMATS)
-            raise InvalidDetectionError(f"the mask is no image of the kinds {known}, as base64") from error
-    said = f"the mask is no file, no image as base64 and no run lengths of COCO: {str(value)[:80]!r}"
+            raise InvalidDetectionError(f"the mask is not a base64 image of these types: {known}") from error
+    said = f"the mask is not a file, not a base64 image and not a run-length encoding of COCO: {str(value)[:80]!r}"
     raise InvalidDetectionError(said, hint=HINT)
 
 
@@ -70,7 +70,7 @@ def _run_lengths(value: Mapping[str, Any]) -> Mask:
         counts = value["counts"]
         lengths = _text_lengths(counts) if isinstance(counts, str) else [int(count) for count in counts]
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InvalidDetectionError(f"the mask's run lengths cannot be read: {error}") from error
+        raise InvalidDetectionError(f"the mask's run-length encoding cannot be read: {error}") from error
     within = height > 0 and width > 0 and height * width <= MOST_PIXELS
     if not within or min(lengths, default=0) < 0 or sum(lengths) != height * width:
         raise InvalidDetectionError(f"the mask's runs have {sum(lengths)} pixels, its size {width} x {height}")
@@ -109,9 +109,9 @@ def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
             flat = [[number * size[1 - at % 2] for at, number in enumerate(polygon)] for polygon in flat]
         height, width = (int(side) for side in size) if size else (int(reach) + 2, int(reach) + 2)
     except (TypeError, ValueError) as error:
-        raise InvalidDetectionError("the mask's polygons are not lists of x, y, x, y ...", hint=HINT) from error
+        raise InvalidDetectionError("the polygons of the mask are not lists x, y, x, y ...", hint=HINT) from error
     if any(len(polygon) < 6 or len(polygon) % 2 for polygon in flat) or not 0 < height * width <= MOST_PIXELS:
-        raise InvalidDetectionError("a mask's polygon has three corners at least", hint=HINT)
+        raise InvalidDetectionError("a polygon of a mask needs at least three corners", hint=HINT)
     image = Image.new("1", (width, height))
     for polygon in flat:
         ImageDraw.Draw(image).polygon(polygon, fill=1)
@@ -203,7 +203,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         pixels[pixels] = near
         camera_points = camera_points[near]
     if len(camera_points) < _FEWEST:
-        raise _without_depth(frame, f"{len(camera_points)} of the thing's pixels")
+        raise _without_depth(frame, f"{len(camera_points)} of the object's pixels")
     low, high = (np.quantile(camera_points, share, axis=0) for share in (_TRIMMED, 1.0 - _TRIMMED))
     behind = max(float((high - low)[:2].max()), diameter or 0.0)
     high[2] = max(high[2], low[2] + behind)
@@ -215,7 +215,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
 
 
 def _without_depth(frame: Frame, said: str) -> InvalidDetectionError:
-    said = f"frame {frame.name}: depth was measured in {said}; {_FEWEST} are needed"
+    said = f"frame {frame.name}: depth was measured in {said}; at least {_FEWEST} are required"
     return InvalidDetectionError(said, reason="DETECTION_WITHOUT_DEPTH")
 
 
@@ -236,7 +236,9 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the mask is empty")
         if not mask.all() and mask[[0, -1]].all() and mask[:, [0, -1]].all():
-            raise InvalidDetectionError(f"frame {frame.name}: the mask is true all along the border: is it inverted?")
+            raise InvalidDetectionError(
+                f"frame {frame.name}: the mask is true along the whole border. Check whether it is inverted."
+            )
         return frame.registered(mask), None
     mask = np.zeros(given, dtype=np.bool_)
     if detection.box_2d is not None:

@@ -302,7 +302,7 @@ def _train(
         if done % _REPORT_EVERY == 0 or done == total or done % interval == 0:
             recent = trainer.mean_loss()
             if not math.isfinite(recent) or not trainer.is_finite():
-                raise FitDivergedError(f"the fit diverged about iteration {done}")
+                raise FitDivergedError(f"the fit diverged at about iteration {done}")
             if files.checkpoint is not None and done % interval == 0 and done < total:
                 write_checkpoint(files.checkpoint, trainer.state(), key)
             if progress is not None:

@@ -353,6 +353,7 @@ def _check_frame(field: SdfField, seen: Observation, noise: float) -> None:
     near = max(_NEAR * seen.voxel, noise)
     if len(cells) == 0 or not float((distance <= near).float().mean()) >= _AGREEING:
         raise DatasetError(
-            "the field has no surface where the images saw one: are they of the same scene, in the same frame?",
+            "the field has no surface where the images show one. Check that both are of the same scene, in the same "
+            "frame.",
             reason="DATASET_OF_ANOTHER_FRAME",
         )

@@ -77,7 +77,7 @@ def recorded_scene(
         box = first[0].box if len(first) == 1 else _common(first, diameter)
         own = [one.frame for one in first]
         left = ", ".join(one.frame.name for one in shown if one not in first)
-        told = (f"the detections of other frames show another thing than {left}: left out",) if left else ()
+        told = (f"the detections of other frames show another object than {left}: they are not used",) if left else ()
     region = _around(box)
     names = [frame.name for frame in own]
     others: list[Frame] = []
@@ -98,9 +98,11 @@ def recorded_scene(
     known = replace(options, robust=replace(options.robust, object_unit=unit))
     notes = (*recording.notes, *told, *([disagreement] if disagreement else ()), *aligned.notes)
     if not recording.is_metric:
-        notes += ("the recording's world is not in meters: the scale is free, and lengths are in its unit",)
+        notes += ("the recording is not in meters: the scale is free, and lengths are in the recording's unit",)
     if unit in METERS and options.robust.object_unit == "auto":
-        notes += (f"the object's unit is taken to be {unit}, by its size: say --object-unit, or --scale free",)
+        notes += (
+            f"the object's unit is assumed to be {unit}, from its size; if not, give --object-unit, or --scale free",
+        )
     return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), notes)
 
 
@@ -152,8 +154,8 @@ def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
         names = ", ".join(one.frame.name for one in shown)
         nearest = float(apart[apart > 0.0].min(initial=np.inf))
         raise InvalidDetectionError(
-            f"the detections of the frames {names} show no common thing: they lie {nearest:.2g} apart or more in space,"
-            f" and it is {reach:.2g} long. Check the frames' poses, or give the detections of one frame"
+            f"the detections of the frames {names} show no common object: they are at least {nearest:.2g} apart in "
+            f"space, and the object's size is {reach:.2g}. Check the frames' poses, or give the detections of one frame"
         )
     return [one for one, found in zip(shown, meets[best], strict=True) if found]
 

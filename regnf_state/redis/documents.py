@@ -235,7 +235,7 @@ class RedisDocuments:
         except UnreadableRecordError:
             return None
         except OSError as error:
-            logger.warning("%s %s is left out: %s", kind.name, name, type(error).__name__)
+            logger.warning("%s %s is skipped: %s", kind.name, name, type(error).__name__)
             return None
 
     def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
@@ -319,7 +319,7 @@ def is_wrong_type(answer: object) -> bool:
 
 def _decoded(kind: Kind[_Record], name: str, stored: Stored) -> _Record:
     if stored.document is None or stored.version is None:
-        raise UnreadableRecordError(name, "it is no record")
+        raise UnreadableRecordError(name, "it is not a record")
     record = decoded(kind.record, name, stored.document, stored.format)
     if text(stored.version) != str(record.version):
         raise UnreadableRecordError(name, "its versions differ")  # no change could ever be written

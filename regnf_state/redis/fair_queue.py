@@ -211,7 +211,7 @@ class FairQueue:
         except ResponseError as error:
             if not _tells_of_damage(error):
                 raise
-            logger.error("the fair queue is damaged and begins anew: %s", error)
+            logger.error("the fair queue is damaged and starts empty: %s", error)
         damaged = [key for key in LISTS if self._redis.type(key) != b"list"]
         held: list[Any] = [*self._redis.scan_iter(f"{_PREFIX}*", count=1000), *damaged]
         if held:

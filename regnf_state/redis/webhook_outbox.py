@@ -162,7 +162,7 @@ class RedisOutbox:
             except ValueError:
                 self._redis.zrem(due_key(line), name)
                 count(self._redis, "records_unreadable", "webhook")
-                logger.error("a message about a job has a name that cannot be read: it is dropped")
+                logger.error("a message about a job has an unreadable name: it is dropped")
 
     def settle(self, message: Message, delivery: Delivery, outcome: str = "dropped") -> None:
         """Write down how a send went: put the message off until ``next_at``, or be done with it."""

@@ -108,7 +108,7 @@ def _check_storage(services: Services) -> None:
     try:
         claim_storage(services.redis, services.records.journal.storage_id(), services.settings.adopt_storage or None)
     except (RedisError, OSError) as error:
-        logger.warning("whose records Redis holds is looked up later: %s", type(error).__name__)
+        logger.warning("the owner of Redis's records is checked later: %s", type(error).__name__)
     except StorageMismatchError as error:
         logger.critical("%s: %s", error.reason, error)
         raise
@@ -126,9 +126,9 @@ async def _reap(services: Services) -> None:
             logger.critical("%s: %s", error.reason, error)
             signal.raise_signal(signal.SIGTERM)  # it would mix the jobs of two services
         except (RedisError, OSError) as error:
-            logger.warning("the reaper: a store does not answer: %s", type(error).__name__)
+            logger.warning("the reaper: a store does not respond: %s", type(error).__name__)
         except Exception:
-            logger.exception("an internal error ended this round of the reaper; the next round follows")
+            logger.exception("an internal error ended this round of the reaper; the next round will run")
         await pause(_REAP_EVERY_S, services.stopping)
 
 

@@ -51,7 +51,9 @@ def test_what_is_read_is_not_overwritten(run: Run, tmp_path: Path) -> None:
     before = mesh.read_bytes()
     for given, output in ((mesh, mesh), (mesh, link), (link, mesh)):
         outcome = run("convert", given, output, code=2)
-        assert outcome.stderr.startswith(f"INVALID_OPTIONS {output}: it is read, and would be overwritten")
+        assert outcome.stderr.startswith(
+            f"INVALID_OPTIONS {output}: this is an input file, and it would be overwritten"
+        )
     assert mesh.read_bytes() == before
 
 

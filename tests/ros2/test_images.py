@@ -401,7 +401,7 @@ def test_images_that_are_of_no_use_are_said(robot: Robot, given: dict[str, Any],
 
 def test_depth_of_another_frame_than_the_color_is_said(robot: Robot) -> None:
     robot.see(boxes(12.5, BOX), color=image(12.5, np.zeros((H, W), np.uint8), "mono8", frame="color"))
-    assert "depth is of 'camera', color of 'color': is the depth aligned?" in robot.said
+    assert "depth is of 'camera', color of 'color'. Check that the depth is aligned to the color image." in robot.said
 
 
 def test_equal_warnings_are_said_once(robot: Robot) -> None:
@@ -472,7 +472,7 @@ def test_detections_that_match_nothing_are_dropped_and_said(monkeypatch: pytest.
     stream = Stream()
     stream.depth(1.0, 3.0)
     assert stream.boxes(2.0) == []
-    assert "no depth image lies within 0.1 s" in stream.said[-1]
+    assert "no depth image is within 0.1 s" in stream.said[-1]
     assert stream.boxes(0.5) == []
     assert "too late: the oldest depth image kept is 0.5 s newer" in stream.said[-1]
     assert stream.boxes(0.0) == []

@@ -165,10 +165,15 @@ def test_the_picture_is_made_once_somebody_asks(visit: Visit) -> None:
 
 def test_a_rendering_that_fails_says_why(visit: Visit) -> None:
     page = visit.open("ambiguous")
-    failed = {"id": "x", "kind": "render", "status": "failed", "error": {"detail": "the camera at (1, 2) is in matter"}}
+    failed = {
+        "id": "x",
+        "kind": "render",
+        "status": "failed",
+        "error": {"detail": "the camera at (1, 2) is inside solid matter"},
+    }
     page.route("**/render", lambda route: route.fulfill(status=200, json=failed))
     page.locator("#render-in-scene").click()
-    expect(page.locator("#in-scene-note")).to_have_text("the camera at (1, 2) is in matter.")
+    expect(page.locator("#in-scene-note")).to_have_text("the camera at (1, 2) is inside solid matter.")
 
 
 def test_the_page_of_a_rendering_shows_its_strip(visit: Visit) -> None:

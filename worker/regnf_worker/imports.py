@@ -187,4 +187,4 @@ def _require_current(context: Context, field: FieldRecord) -> None:
     """Somebody may have deleted the field, and uploaded it anew: what lies there now is no longer ours to touch."""
     now = context.records.get_field(field.sha256)
     if now is None or now.attempt != field.attempt or now.state != "validating":
-        raise StaleAttemptError("the field was deleted or is imported anew")
+        raise StaleAttemptError("the field was deleted, or is imported again")

@@ -88,7 +88,7 @@ def draw_field(context: Context, reference: str, draw: Callable[[Path], FieldVie
     if field is None or field.state != "ready" or field.views != "pending":
         return
     if field.drawings >= _MOST_DRAWINGS:
-        logger.warning("field %s is not drawn: it was begun %d times", reference, field.drawings)
+        logger.warning("field %s is not drawn: drawing was started %d times", reference, field.drawings)
         _note(context, field, views="none")
         return
     if not _note(context, field, drawings=field.drawings + 1):

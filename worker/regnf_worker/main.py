@@ -74,7 +74,7 @@ def preload() -> None:
     RegistrationOptions.from_dict({"preset": "robust"})  # makes the validator that every job needs
     tasks = Path("/proc/self/task")
     if tasks.exists() and len(list(tasks.iterdir())) > 1:
-        raise PreloadError("a library that was loaded has started threads; unset REGNF_PRELOAD")
+        raise PreloadError("a preloaded library has started threads; unset REGNF_PRELOAD")
     gc.enable()
     gc.freeze()  # a collection in a child would otherwise copy the pages of everything that was loaded
 
@@ -155,7 +155,9 @@ def _preload(environment: MutableMapping[str, str]) -> None:
     except PreloadError as error:
         if _ASKED in environment:
             raise
-        logger.warning("%s: %s. The worker starts without it: every job loads the engine itself", error.reason, error)
+        logger.warning(
+            "%s: %s. The worker starts without preloading: every job loads the engine itself", error.reason, error
+        )
         os.execve(sys.executable, sys.orig_argv, {**environment, _ASKED: "false"})  # noqa: S606 -- this program again
 
 

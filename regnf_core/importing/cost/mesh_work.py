@@ -172,7 +172,10 @@ _LIBRARIES = 3 << 29
 def require_within(seconds: float, work_s: float) -> None:
     """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more seconds are estimated than allowed."""
     if seconds > work_s:
-        message = f"the field's checks would take an estimated {seconds:.0f} s of a core; {work_s:g} s are allowed"
+        message = (
+            f"the checks of the field would take an estimated {seconds:.0f} s of processor time; {work_s:g} s are "
+            f"allowed"
+        )
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
 
 
@@ -184,7 +187,9 @@ def free_room(memory_bytes: int) -> int:
 def require_room(needed: int, room: int) -> None:
     """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more bytes are estimated than there are."""
     if needed > room:
-        message = f"the field's values would take an estimated {needed >> 20} MiB at once; {room >> 20} MiB are free"
+        message = (
+            f"the values of the field would need an estimated {needed >> 20} MiB of memory; {room >> 20} MiB are free"
+        )
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
 
 

@@ -116,7 +116,7 @@ def untold_error(converted: ConvertedField, variants: Sequence[Variant], what: s
     """The refusal of a field that is one of ``variants``, because of ``what``."""
     asked = [OpenCandidate(one.name, one.say, partial(one.of, converted.reading)) for one in variants]
     lines = " or ".join(json.dumps(one.say) for one in asked[:MOST_CANDIDATES])
-    return AmbiguousError(f"{what}; add to the description {lines}", asked)
+    return AmbiguousError(f"{what}; add to the import options {lines}", asked)
 
 
 def converted_of(

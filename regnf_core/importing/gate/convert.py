@@ -43,8 +43,8 @@ _SEEN = (OBSERVATION, WEIGHTS)
 """Tensors that say how much was seen; they are no parameters of the function."""
 _ALL_ROUND = 0.95
 _SIGN_UNCERTAIN = (
-    "all round the bounds the values are negative: a room seen from within, or an object trained with its sign turned"
-    " round; for the latter say sign -1"
+    "the values are negative everywhere at the bounds: it is a room seen from inside, or an object with inverted "
+    "sign; for the latter give the import option sign: -1"
 )
 _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
@@ -112,7 +112,7 @@ def _stored(
 
         converted = settled(converted, affordable_share(converted, limits))
     if converted.untold:
-        what = "neither the tensors nor how they behave tell which function this is"
+        what = "neither the tensors nor the values of the field determine which function this is"
         raise untold_error(converted, converted.untold, what)
     converted = placed(with_affordable_color(converted, limits), read.description)
     converted = observed(converted, read, limits, required=cameras)
@@ -179,11 +179,13 @@ def _require_text(description: dict[str, Any]) -> None:
     from regnf_core.library_entries import LABEL_PATTERN
 
     if not re.fullmatch(LABEL_PATTERN, description.get("label") or ""):
-        raise FieldFormatError("the field's label has control characters", reason="SAFE_FORMAT_INVALID")
+        raise FieldFormatError("the label of the field has control characters", reason="SAFE_FORMAT_INVALID")
     try:
         json.dumps(description, ensure_ascii=False).encode("utf-8")
     except UnicodeEncodeError as error:
-        raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
+        raise FieldFormatError(
+            "the description of the field is not Unicode text", reason="SAFE_FORMAT_INVALID"
+        ) from error
 
 
 def draw_asked(asked: Sequence[OpenCandidate], out_dir: Path, seconds: float) -> None:
@@ -200,7 +202,7 @@ def draw_asked(asked: Sequence[OpenCandidate], out_dir: Path, seconds: float) ->
 
     def look(_: int) -> None:
         if time.process_time() > deadline:
-            raise RegnfError("no time is left for the picture")
+            raise RegnfError("there is no time left for the picture")
 
     for number, candidate in enumerate(asked, 1):
         with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():

@@ -47,7 +47,9 @@ def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, 
     found = observed_by_weights(converted.description, converted.tensors)
     if found is not None:
         if required:
-            converted = with_unused_cameras(converted, "the map's weights say what was observed, and they tell more")
+            converted = with_unused_cameras(
+                converted, "the observation is from the map's weights, which have more information"
+            )
         return observed_field(converted, *found, "by the weights of the map")
     if read.cameras is None:
         return converted
@@ -96,7 +98,7 @@ def _points(description: Mapping[str, Any], tensors: Mapping[str, StoredArray], 
     asked = seconds_of(plain, tensors, Calls((_ASKED,), ()))
     points = int(min(_MOST_POINTS, _SHARE * limits.work_s * _ASKED / max(asked, 1e-9)))
     if points < _LEAST_POINTS and math.isfinite(limits.refused_beyond_s):
-        message = f"lines of sight take {_LEAST_POINTS} evaluations at least; there is time for an estimated {points}"
+        message = f"lines of sight need at least {_LEAST_POINTS} evaluations; there is time for an estimated {points}"
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
     return max(points, _LEAST_POINTS)
 

@@ -77,7 +77,7 @@ def pack_settings(run: Run, into: Path) -> Path:
     target = into / "settings.tar"
     top = Path(os.path.commonpath([path.parent for path in run.settings] or [run.checkpoint.parent]))
     if sum(path.stat().st_size for path in run.settings) > MAX_SETTINGS_BYTES:
-        message = f"the settings beside {run.checkpoint.name} have more than {MAX_SETTINGS_BYTES} bytes"
+        message = f"the config files next to {run.checkpoint.name} have more than {MAX_SETTINGS_BYTES} bytes"
         raise FieldFormatError(message, reason="SETTINGS_TOO_LARGE")
     with tarfile.open(target, "w", format=tarfile.GNU_FORMAT, dereference=True) as archive:
         for path in run.settings[:MAX_FILES]:
@@ -101,7 +101,7 @@ def _names_below(root: Path) -> Iterator[str]:
             for entry in entries:
                 count += 1
                 if count > _MAX_FILES:
-                    message = f"{root.name} holds more than {_MAX_FILES} files; give the checkpoint by itself"
+                    message = f"{root.name} holds more than {_MAX_FILES} files; give only the checkpoint"
                     raise FieldFormatError(message, reason="RUN_TOO_LARGE")
                 if entry.is_dir(follow_symlinks=False):
                     if depth < _MAX_DEPTH and entry.name not in _SKIPPED:

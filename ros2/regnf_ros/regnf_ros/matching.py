@@ -106,7 +106,9 @@ class Matcher:
         self._waiting.append(message)
         if len(self._waiting) > MOST_WAITING:
             lacking = "camera_info" if self._info is None else "later depth image"
-            self._say(f"no {lacking} has come for the oldest of {MOST_WAITING} arrays of detections: it is dropped")
+            self._say(
+                f"no {lacking} has arrived for the oldest of {MOST_WAITING} waiting detection arrays: it is dropped"
+            )
             self._waiting.popleft()
         return self._complete()
 
@@ -122,8 +124,8 @@ class Matcher:
                 shots.append(Shot(depth, self._info, self._colors.near(stamp), message, self._color_size))
             elif stamp < self._depths.first():
                 late = 1e-9 * (self._depths.first() - stamp)
-                self._say(f"detections came too late: the oldest depth image kept is {late:.1f} s newer")
+                self._say(f"detections arrived too late: the oldest stored depth image is {late:.1f} s newer")
             else:
-                self._say(f"no depth image lies within {1e-9 * NEAREST_NS:g} s of the detections")
+                self._say(f"no depth image is within {1e-9 * NEAREST_NS:g} s of the detections")
         self._waiting = waiting
         return shots

@@ -27,7 +27,7 @@ _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _PROBES = frozenset({"/healthz", "/readyz", "/static"})
 access_log = logging.getLogger(ACCESS_LOGGER)
 _CHALLENGE = {"WWW-Authenticate": 'Bearer realm="regnf"'}
-_NO_TOKENS = "Beyond loopback this service answers with tokens only, and none is configured."
+_NO_TOKENS = "This service has no access tokens, so it accepts only requests from this machine."
 
 
 class RequestContext:
@@ -251,7 +251,7 @@ class RequestGate:
             nonlocal refused
             if message["type"] == "http.response.start" and self._unread[who] > _MOST_UNREAD:
                 refused = True
-                detail = "Too much of what was answered waits to be read. Read it, then repeat."
+                detail = "Too many response bytes are waiting to be read. Read them, then repeat the request."
                 problem = Problem("TOO_MANY_REQUESTS_AT_ONCE", detail, headers=RETRY_LATER)
                 await problem_response(problem, scope)(scope, receive, send)
             if refused:

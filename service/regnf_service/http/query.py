@@ -23,7 +23,7 @@ _MOST_PARAMETERS = 32
 async def refuse_unknown_parameters(request: Request) -> None:
     """Raises Problem INVALID_QUERY for parameters that the route does not take, or takes once and was given twice."""
     if request.scope["query_string"].count(b"&") >= _MOST_PARAMETERS:
-        raise Problem("INVALID_QUERY", f"At most {_MOST_PARAMETERS} parameters are taken.")
+        raise Problem("INVALID_QUERY", f"At most {_MOST_PARAMETERS} parameters are allowed.")
     route = request.scope["route"]
     if not request.query_params or not isinstance(route, APIRoute):
         return

@@ -173,13 +173,13 @@ def content_range(header: str | None, limit: int) -> PieceRange | None:
     first, last, total = (None if text is None else int(text) for text in match.groups())
     assert total is not None
     if total > limit:
-        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.")
+        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are allowed.")
     if total == 0:
-        raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.")
+        raise Problem("UPLOAD_INCOMPLETE", "The upload is empty.")
     if first is None or last is None:
         return PieceRange(None, None, total)
     if not first <= last < total:
-        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.")
+        raise Problem("INVALID_HEADER", "Content-Range has bytes after the end of the file, or no bytes.")
     return PieceRange(first, last + 1, total)
 
 
@@ -216,5 +216,5 @@ def _decoded(text: str) -> str:
     except binascii.Error:
         value = b""
     if len(value) != 32:
-        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.")
+        raise Problem("INVALID_DIGEST", "Content-Digest has no SHA-256.")
     return value.hex()

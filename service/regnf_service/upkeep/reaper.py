@@ -207,7 +207,7 @@ def _note(done: Done, name: str, look: Callable[[_Record, float], str | None], r
     except (RedisError, OSError, LeaseLostError):
         raise
     except Exception:
-        logger.exception("%s is left out of this round: an internal error", name)
+        logger.exception("%s is skipped in this round: an internal error", name)
         return
     if action is not None:
         done[action].append(name)

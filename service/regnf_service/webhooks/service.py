@@ -324,5 +324,5 @@ async def _guarded(work: Awaitable[_Result]) -> _Result | None:
     except RedisError as error:
         logger.warning("webhooks wait for Redis: %s", type(error).__name__)
     except Exception:
-        logger.exception("an internal error: a message of the outbox is tried again")
+        logger.exception("an internal error: a message of the outbox is sent again")
     return None

@@ -1,4 +1,5 @@
-"""A color never makes an import fail: what is not understood is left out, with a warning, and the geometry is kept."""
+"""A color never makes an import fail: what is not understood is left out, with a warning, and only the geometry is
+imported."""
 
 from __future__ import annotations
 

@@ -203,7 +203,7 @@ def test_the_convention_that_the_field_agrees_with_is_named(name: str) -> None:
 
 def test_quaternions_in_another_order_are_tried() -> None:
     right, read = walk(9), trajectory(walk(9), "opencv", as_w_first)
-    mended = dict(others(read))["quaternions written w first: write quaternions as x y z w"]
+    mended = dict(others(read))["quaternions with w first: write quaternions as x y z w"]
     torch.testing.assert_close(mended.axes, right.axes, atol=1e-9, rtol=0.0)
 
 

@@ -79,7 +79,7 @@ def _fault(check: Callable[[], object]) -> str | None:
 def _records_write(services: Services) -> None:
     services.records.probe()
     if services.room.is_full:
-        raise RecordsFullError("Redis has less than its reserve of memory left")
+        raise RecordsFullError("Redis has less free memory than its reserve")
 
 
 @get_and_head(router, "/version", summary="Version of the service", response_model=VersionDocument)

@@ -172,7 +172,7 @@ async def _taken(
             return await store_upload(services, caller, upload, await upload.finish(), as_)
         wanted = ["camera", "depth"] + (["name"] if adds else [])
         if sorted(parts.keys() - {"color"}) != wanted:
-            raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and color if there is one.")
+            raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and optionally color.")
         texts = {"camera.json": camera_of(parts)}
         if adds:
             name = parts["name"].decode("utf-8", "replace")

@@ -264,14 +264,16 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
 def _check_parts(parts: Mapping[str, bytes]) -> None:
     """Raises Problem MALFORMED_MULTIPART."""
     if "request" not in parts:
-        raise Problem("MALFORMED_MULTIPART", "The part `request` is missing. It names the object, or `object` is sent.")
+        raise Problem(
+            "MALFORMED_MULTIPART", "The part `request` is missing. It is needed unless the part `object` is sent."
+        )
     if ("scene" in parts) == ("depth" in parts):
-        raise Problem("MALFORMED_MULTIPART", "Send the part `scene`, or `depth` and `camera` of a frame.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `scene`, or the parts `depth` and `camera` of a frame.")
     needed = {"camera": "depth", "depth": "camera", "color": "depth", "mask": "depth"}
     needed |= {f"{name}_{what}": name for name in _ROLES for what in ("settings", "description")}
     for part, other in needed.items():
         if part in parts and other not in parts:
-            raise Problem("MALFORMED_MULTIPART", f"The part `{part}` goes with `{other}`, which is missing.")
+            raise Problem("MALFORMED_MULTIPART", f"The part `{part}` needs the part `{other}`, which is missing.")
 
 
 async def _asked(
@@ -279,7 +281,7 @@ async def _asked(
 ) -> tuple[RegistrationRequest, dict[str, str]]:
     """The job's request and the fields that must be held, as ``asked_by_reference``. came: the SHA-256s of files."""
     if ("object" in came) == (spec.object is not None or spec.candidates is not None):
-        raise Problem("MALFORMED_MULTIPART", "Send the part `object`, or name `object` or `candidates` in the request.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `object`, or give `object` or `candidates` in the request.")
     if ("mask" in parts) == (spec.detection is not None) or not parts.get("mask", _PNG).startswith(_PNG):
         raise Problem("INVALID_DETECTION", "Give `detection` in the request, or a PNG as the part `mask` of a frame.")
     mask = (ImageDetection(mask=base64.b64encode(parts["mask"]).decode()),) if "mask" in parts else spec.detection

@@ -98,8 +98,8 @@ def _poses(said: RenderBody) -> list[dict[str, Any]] | None:
     T = None if file.T_scene_file is None else rows_of(file.T_scene_file)
     poses = poses_of_transforms(file.document, T, said.size, file.every)
     if len(poses) > MOST_CAMERAS:
-        message = f"{len(poses)} cameras, at most {MOST_CAMERAS} are taken of a file"
-        raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Take one of so many: `transforms.every`.")
+        message = f"{len(poses)} cameras; at most {MOST_CAMERAS} of a file can be used"
+        raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Use every N-th camera: `transforms.every`.")
     return poses
 
 

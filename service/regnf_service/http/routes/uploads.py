@@ -126,7 +126,7 @@ async def put_field(
     if not is_sha256(sha256):
         raise Problem("INVALID_DIGEST")
     if body.media_type(request).startswith("multipart/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.")
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT needs only the bytes of the file as the body.")
     digest = announced_digest(content_digest)
     span = content_range(content_range_, services.settings.max_upload_bytes)
     declared = body.declared_length(request)
@@ -234,7 +234,7 @@ async def _receive_piece(
                 raise Problem("DIGEST_MISMATCH")
             if known is None:
                 if received.bytes != span.length:
-                    raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.")
+                    raise Problem("UPLOAD_INCOMPLETE", "The length of the body differs from Content-Range.")
                 await in_thread(services.pieces.make_room, caller, sha256, span.first + received.bytes)
                 await upload.commit(services.pieces.key(caller, sha256, span.first, span.total))
     return known
@@ -268,7 +268,7 @@ async def _receive_parts(
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts)
     if ("file" in parts) == ("upload" in parts):
-        raise Problem("MALFORMED_MULTIPART", "Send the part `file`, or `upload` in its place.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `file` or the part `upload`.")
     description = read_description(parts.get("description"))
     settings, cameras = [await beside[part].received() for part in _BESIDE]
     if "file" in parts:
@@ -281,7 +281,7 @@ def named_upload(text: bytes) -> str:
     try:
         named = decode_text(text).strip()
     except TextError as error:
-        raise Problem("INVALID_DIGEST", f"The part upload is {error}.") from error
+        raise Problem("INVALID_DIGEST", f"The part `upload` is {error}.") from error
     if not is_sha256(named):
         raise Problem("INVALID_DIGEST")
     return named

@@ -153,15 +153,15 @@ _PNG = "iVBORw0KGgo"
 def read_images(value: Any) -> tuple[ImageDetection, ...]:
     """A thing in images, as requests have it. Raises InvalidDetectionError."""
     if isinstance(value, list) and len(value) > MOST_IMAGES:
-        hint = "Give the images that show most of it."
+        hint = "Give the images that show most of the object."
         raise InvalidDetectionError(f"has {len(value)} entries, expected {MOST_IMAGES} at most", hint=hint)
     found = read_image_detections(value)
     for one in found:
         if max(len(str(one.frame)), len(one.label or "")) > _MOST_NAME:
-            raise InvalidDetectionError(f"the frame's name and the label have at most {_MOST_NAME} characters")
+            raise InvalidDetectionError(f"the frame's name and the label can have at most {_MOST_NAME} characters")
         if isinstance(one.mask, str) and not (one.mask.partition("base64,")[2] or one.mask).startswith(_PNG):
-            hint = "Write the bytes of a PNG of the image's size as base64, or COCO's run lengths."
-            raise InvalidDetectionError("the mask is no PNG as base64", hint=hint, place=("mask",))
+            hint = "Write the bytes of a PNG of the image's size as base64, or COCO's run-length encoding."
+            raise InvalidDetectionError("the mask is not a PNG as base64", hint=hint, place=("mask",))
     return found
 
 

@@ -151,7 +151,7 @@ class LibrarySelection(Incoming):
     library: LibraryFilter
 
 
-BY_DIGEST, BY_LIBRARY = "named by digest", "named in the library"
+BY_DIGEST, BY_LIBRARY = "by digest", "named in the library"
 
 
 def by_library(value: Any) -> str:

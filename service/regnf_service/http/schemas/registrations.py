@@ -75,7 +75,7 @@ class TransformObject(Incoming):
         if self.rotation_quaternion_xyzw is not None:
             agrees = agrees and any(self.rotation_quaternion_xyzw) and self._is_turned(scale)
         if not agrees:
-            raise ValueError("scale, rotation_quaternion_xyzw or translation contradict the matrix")
+            raise ValueError("scale, rotation_quaternion_xyzw or translation do not match the matrix")
         return self
 
     def _is_turned(self, scale: float) -> bool:
@@ -135,7 +135,7 @@ class ObjectPose(Incoming):
         """The 4x4 T_object_scene."""
         if self.T_object_scene is not None:
             return rows_of(self.T_object_scene)
-        assert self.T_scene_object is not None, "one of both is given"
+        assert self.T_scene_object is not None, "give exactly one of them"
         return inverse_rows(rows_of(self.T_scene_object))
 
 
@@ -172,13 +172,13 @@ Reference = Annotated[Sha256, BeforeValidator(_bare_reference, json_schema_input
 
 def _given(value: Any) -> Any:
     if value is None:
-        raise ValueError("leave it out, or name something")
+        raise ValueError("leave it out, or give at least one")
     return value
 
 
 def _distinct(names: list[str]) -> list[str]:
     if len(set(names)) < len(names):
-        raise ValueError("a field is named twice")
+        raise ValueError("a field is given twice")
     return names
 
 
@@ -229,7 +229,7 @@ class RegistrationSpec(Incoming):
     def _is_of_use(cls, start: Any, info: ValidationInfo) -> Any:
         options = info.data.get("options")  # absent when they were refused themselves
         if start is not None and options is not None and options.preset != "robust":
-            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` starts from a given transform")
+            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` can use an initial transform")
         return start
 
     def to_request(
@@ -293,7 +293,7 @@ class RegisterRequest(RegistrationSpec):
         if options is not None and options.preset != "robust":
             raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` searches a library")
         if info.data.get("initial_transform") is not None:
-            raise PydanticCustomError(PRESET_FAULT, "a search of a library starts from no given transform")
+            raise PydanticCustomError(PRESET_FAULT, "a search of a library cannot use an initial transform")
         if info.data.get("ground_truth") is not None:
             raise ValueError("a ground truth applies to one object, not to several candidates")
         return names

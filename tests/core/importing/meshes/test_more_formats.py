@@ -173,7 +173,7 @@ def test_unusual_beginnings_are_recognized(text: str, kind: str) -> None:
         ("v 0 0 1\n", "v 0 0 1\nv nan nan nan\n", ""),
         ("v 0 0 1\n", "v 0 0 1\nv 1 nan 2\nf 1 2 5\n", "1 triangles with such a corner"),
         ("f 1 3 2\n", "f 1 3 2\nf 1 1 2\n", "1 triangles without an area"),
-        ("f 1 3 2\n", "f 1 3 2\nf 3 2 1\n", "1 triangles that are there twice"),
+        ("f 1 3 2\n", "f 1 3 2\nf 3 2 1\n", "1 duplicate triangles"),
         ("f 1 3 2\n", "f 1 3 2\nl 1 2\np 1\n", "lines"),
     ],
 )

@@ -97,7 +97,7 @@ HALF_ZERO = np.where(np.arange(2000)[:, None] % 2 == 0, directions(2000), 0.0)
         (directions(500), np.zeros((500, 3)), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are zero"),
         (directions(500), np.full((500, 3), np.inf), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are no"),
         (directions(50), directions(50), "POINT_CLOUD_TOO_SMALL", "50 of 50 points"),
-        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points that are no finite numbers"),
+        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points with NaN or infinity"),
         (np.zeros((500, 3)), directions(500), "POINT_CLOUD_TOO_SMALL", "the 500 points lie at 1 places"),
         (np.tile(directions(9), (100, 1)), np.tile(directions(9), (100, 1)), "POINT_CLOUD_TOO_SMALL", "at 9 places"),
         (LINE, directions(500), "POINT_CLOUD_TOO_SMALL", "on one line"),
@@ -199,4 +199,4 @@ def test_who_insists_is_given_the_surface_of_turned_normals() -> None:
 def test_a_refusal_s_own_hint_comes_out_of_the_gate(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError) as caught:
         import_field(saved(tmp_path, ply(1e-30 * BALL, BALL)), tmp_path / "out")
-    assert caught.value.hint == "Give it in another unit, or without stray points."
+    assert caught.value.hint == "Give the mesh in another unit, or remove stray points."
