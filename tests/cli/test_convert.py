@@ -87,7 +87,7 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
     said = ("--intrinsics", "25,25,16,12,32,24")
     safe = tmp_path / "ball.safetensors"
     run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said, code=0)
-    assert "records which parts were observed" in run("inspect", safe).stdout
+    assert "it has an observation" in run("inspect", safe).stdout
     observation = observation_of(open_field(safe))
     assert observation is not None
     assert observation.at(torch.tensor([[0.0, 0.0, 0.49], [0.0, 0.0, -0.49], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]

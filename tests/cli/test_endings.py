@@ -211,6 +211,6 @@ def test_a_full_disk_leaves_nothing(command: list[str], tmp_path: Path) -> None:
         "from regnf_cli.main import main; main()"
     )
     done = run(["-c", limited, *command], tmp_path)
-    told = [words in done.stderr for words in ("FILE_UNUSABLE", "Make room", "Traceback")]
+    told = [words in done.stderr for words in ("FILE_UNUSABLE", "Free space on the disk", "Traceback")]
     assert (done.returncode, told, left(tmp_path)) == (2, [True, True, False], ["made"]), done.stderr
     assert list((tmp_path / "made").iterdir()) == []

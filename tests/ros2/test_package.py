@@ -310,7 +310,7 @@ def test_axes_and_shares_arrive_whatever_yaml_makes_of_them(passed: Callable[[st
         assert share_of("scale_tolerance", passed(said)) == share
     said = ("1", "-0.1", "3%", "true", "y", "no", "nan", ".nan", ".inf", "inf", "0,03")
     for value in ([0.1], *map(passed, said)):
-        with pytest.raises(ValueError, match=r"scale_tolerance: .* is no number"):
+        with pytest.raises(ValueError, match=r"scale_tolerance: .* is not a number"):
             share_of("scale_tolerance", value)
 
 

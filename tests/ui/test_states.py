@@ -26,7 +26,7 @@ def test_running_shows_phase_and_progress_and_cancel_ends_the_job(visit: Visit) 
     page.locator("#cancel").click()
     page.wait_for_selector("text=The job was dismissed")
     expect(page.locator("#status")).to_have_text("Dismissed")
-    expect(page.locator("#message-text")).to_contain_text("Run again starts it anew.")
+    expect(page.locator("#message-text")).to_contain_text("Run again starts it again.")
     expect(page.locator("#run-again")).to_be_visible()
     assert visit.complaints == []
 
@@ -98,13 +98,13 @@ def test_failure_tells_reason_and_detail_as_text_under_the_versioned_address_too
 
 def test_unknown_job_says_so(visit: Visit) -> None:
     page = visit.open("unheard_of")
-    expect(page.locator("#message-title")).to_have_text("There is no such job")
+    expect(page.locator("#message-title")).to_have_text("This job does not exist")
     expect(page.locator("#message-facts")).to_contain_text("JOB_NOT_FOUND")
 
 
 def test_a_result_without_pictures_says_so_and_has_its_numbers(visit: Visit) -> None:
     page = visit.open("numbers")
-    expect(page.locator("#message")).to_contain_text("without pictures")
+    expect(page.locator("#message")).to_contain_text("has no pictures")
     expect(page.locator("#tools")).to_be_hidden()
     expect(page.locator("#matrix")).to_be_visible()
     assert not [one for one in visit.requests if one.endswith(".ply")]

@@ -244,7 +244,7 @@ def rows(**changes: Any) -> list[list[Any]]:
         (rows(m00=NAN), "finite"),
         (rows(m03=INF), "finite"),
         (rows(m03=10**400), "finite"),
-        (rows(m22=-2), "mirrors"),
+        (rows(m22=-2), "is a reflection"),
         (rows(m22=2.01), "stretched"),
         (rows(m02=0.01), "sheared"),
         (rows(m33=2), "last row"),

@@ -177,12 +177,12 @@ def as_w_first(poses: Array) -> Array:
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 FORWARD_X = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 MISREAD: dict[str, tuple[Axes, Callable[[Array], Array], str]] = {
-    "OpenGL": ("opencv", lambda T: T @ HALF_TURN, "against z.*say --camera-axes opengl"),
-    "OpenCV": ("opengl", lambda T: T, "along z.*say --camera-axes opencv"),
+    "OpenGL": ("opencv", lambda T: T @ HALF_TURN, "against z.*give --camera-axes opengl"),
+    "OpenCV": ("opengl", lambda T: T, "along z.*give --camera-axes opencv"),
     "inverted": ("opencv", np.linalg.inv, "world to the camera: invert the matrices"),
     "inverted, OpenGL": ("opengl", lambda T: np.linalg.inv(T @ HALF_TURN), "world to the camera: invert the matrices"),
     "inverted, OpenGL read as OpenCV": ("opencv", lambda T: np.linalg.inv(T @ HALF_TURN), "invert.*and say --camera"),
-    "a body": ("opencv", lambda T: T @ FORWARD_X, "along x .*turn the cameras' axes"),
+    "a body": ("opencv", lambda T: T @ FORWARD_X, "along x .*rotate the axes of the cameras"),
 }
 
 

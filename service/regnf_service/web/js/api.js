@@ -7,7 +7,7 @@ export const TOKEN_KEY = 'regnf.token';
 /** What the service answers instead of a result: RFC 9457 problem details. */
 export class ApiProblem extends Error {
   constructor(status, problem = {}) {
-    super(problem.detail || problem.title || `The service answered ${status}`);
+    super(problem.detail || problem.title || `The service responded with ${status}`);
     this.status = status;
     this.problem = problem;
     this.reason = problem.reason ?? '';

@@ -190,7 +190,7 @@ def test_a_double_sided_mesh_has_one_side() -> None:
     found = converted(bytes(both.export(file_type="stl")))
     assert len(found.tensors["faces"]) == len(BALL.faces)
     assert found.why[1] == "watertight"
-    assert f"ignored: the other side of {len(BALL.faces)} triangles: the mesh is double-sided" in found.why
+    assert f"ignored: {len(BALL.faces)} triangles of the other side: the mesh is double-sided" in found.why
 
 
 def test_what_changes_the_shape_and_is_not_read_is_warned_of() -> None:
@@ -253,5 +253,5 @@ def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
 )
 def test_decimal_commas_are_named(format_: str, text: str) -> None:
     assert sniff_format(text.encode()) == format_
-    with pytest.raises(FieldFormatError, match="decimals have points, not commas"):
+    with pytest.raises(FieldFormatError, match="write decimal points, not commas"):
         read_mesh(format_, memoryview(text.encode()))

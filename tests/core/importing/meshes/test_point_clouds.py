@@ -153,11 +153,11 @@ def turned(normals: NDArray[np.float64], which: NDArray[np.bool_]) -> NDArray[np
 @pytest.mark.parametrize(
     ("points", "normals", "says"),
     [
-        (BALL, turned(BALL, BALL[:, 2] > 0), "one patch meets another"),
-        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "one patch meets another"),
-        (BALL, turned(BALL, BALL[:, 0] > 0.8), "one patch meets another"),
+        (BALL, turned(BALL, BALL[:, 2] > 0), "at the border of two patches"),
+        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "at the border of two patches"),
+        (BALL, turned(BALL, BALL[:, 0] > 0.8), "at the border of two patches"),
         (BALL, turned(BALL, np.random.default_rng(0).random(len(BALL)) < 0.5), "mixed at one place"),
-        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "looks inward"),
+        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "points inward"),
     ],
 )
 def test_clouds_whose_normals_are_turned_in_patches_are_refused(
