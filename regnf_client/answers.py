@@ -22,7 +22,7 @@ _HOST = re.compile(r"[A-Za-z0-9.-]+(:\d+)?(/.*)?")
 
 
 class ServiceError(RegnfError):
-    """The service refused, or could not do, what was asked; ``reason`` is the one it gave."""
+    """The service refused the request, or could not do it; ``reason`` is the service's."""
 
     reason = "SERVICE_ERROR"
     status: int | None = None
@@ -37,7 +37,7 @@ class ServiceError(RegnfError):
     """How many bytes of an upload have arrived."""
 
     def told(self, message: str) -> ServiceError:
-        """The same error in other words."""
+        """The same error with another message."""
         error = ServiceError(message, reason=self.reason, hint=self.hint)
         error.status, error.unavailable = self.status, self.unavailable
         error.candidates, error.said, error.offset = self.candidates, self.said, self.offset
@@ -45,21 +45,21 @@ class ServiceError(RegnfError):
 
 
 class UnreachableError(RegnfError):
-    """Nothing answers at the service's address."""
+    """There is no response from the service's address."""
 
     reason = "SERVICE_UNAVAILABLE"
     unavailable = True
 
 
 class NoWorkerError(RegnfError):
-    """The service had no live worker for as long as the caller was ready to wait."""
+    """The service had no live worker within the caller's time limit."""
 
     reason = "NO_WORKER"
     unavailable = True
 
 
 class WaitTimeoutError(RegnfError):
-    """The job, or the import of a field, has not finished within the time that the caller gave."""
+    """The job or the import of a field did not finish within the caller's time limit."""
 
     reason = "WAIT_TIMEOUT"
     unavailable = True

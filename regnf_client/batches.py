@@ -32,8 +32,8 @@ _HEADERS = {"Content-Type": "application/x-ndjson"}
 
 @dataclass(frozen=True)
 class Pair:
-    """One registration of many. object: or a list of candidates, among which the likeliest is searched · key: your name
-    of it · more: further members of ``POST /register``, such as ``initial_transform``."""
+    """One registration of many. object: the object, or a list of candidates to search · key: your own name of the pair
+    · more: further members of ``POST /register``, such as ``initial_transform``."""
 
     scene: FieldLike
     object: FieldLike | list[FieldLike]
@@ -69,8 +69,8 @@ def _error(value: Any) -> RegnfError | None:
 
 
 class PairResult(Document):
-    """What became of one pair. index: its place among the requests, from 0 on · job: its id; ``client.result(it)`` has
-    the whole result. error: what went wrong, unless ``status`` is ``successful``."""
+    """The outcome of one pair. index: its position among the requests, from 0 · job: the id of its job;
+    ``client.result(job)`` returns the full result · error: the failure; None if ``status`` is ``successful``."""
 
     index: int
     key: str | None = None
@@ -108,7 +108,7 @@ def request_body(
     initial_transform: Any = None,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What a registration asks for beside its fields, as it is sent. initial_transform: a T_object_scene, or
+    """The request of a registration without its fields, as it is sent. initial_transform: a T_object_scene, or
     ``{"T_scene_object": ...}``. Raises InvalidDetectionError and InvalidOptionsError."""
     body = {
         "detection": detection_body(detection),

@@ -50,14 +50,14 @@ class Calls:
         timeout_s: float | None = None,
         wait: bool = True,
     ) -> Flow[Field]:
-        """The field at the service, once its import has ended, or while it may still run (``wait``). ``description``
-        says what no file says, ``settings`` names the trainer's settings (None: those beside the file, False: none), as
-        in ``regnf.open_field``."""
+        """Upload a field and wait for its import (unless ``wait`` is False). ``description`` has import options that
+        are in no file. ``settings`` is the trainer's config file (None: those next to the file, False: none), as in
+        ``regnf.open_field``."""
         source = source_of(field, description, settings, role)
         return fields.upload(self._connection.asking(progress, timeout_s), source, wait=wait)
 
     def field(self, field: FieldLike) -> Flow[Field]:
-        """A field as it is now. Raises ServiceError (FIELD_NOT_FOUND)."""
+        """The current state of a field. Raises ServiceError (FIELD_NOT_FOUND)."""
         return fields.find(self._connection.asking(), field)
 
     def fields(self, label: str | None = None) -> Flow[list[Field]]:
@@ -66,7 +66,7 @@ class Calls:
         return [parsed(Field, one) for one in found]
 
     def delete_field(self, field: FieldLike) -> Flow[None]:
-        """Forget a field. Raises ServiceError (FIELD_IN_USE)."""
+        """Delete a field. Raises ServiceError (FIELD_IN_USE)."""
         asking = self._connection.asking()
         known = yield from fields.find(asking, field)
         yield from _done(asking, "DELETE", f"/fields/{known.sha256}")
@@ -97,8 +97,8 @@ class Calls:
         more: Mapping[str, Any] | None = None,
         progress: Report | None = None,
     ) -> Flow[Job]:
-        """The same without waiting; a search where ``obj`` is a list. more: members of the request that have no
-        parameter here, such as ``webhook``."""
+        """As ``register``, without waiting. If ``obj`` is a list, it is a search. more: members of the request that
+        have no parameter here, such as ``webhook``."""
         body = request_body(detection, options, seed, initial_transform, more or {})
         return _submit(self._connection.asking(progress), scene, obj, body)
 
@@ -112,7 +112,7 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[Result]:
-        """Which of the objects it is, and where; the result's ``candidates`` rank them all."""
+        """Find which of the objects is in the box, and its pose. ``candidates`` of the result ranks all objects."""
         body = request_body(detection, options, seed)
         return _registered(self._connection.asking(progress, timeout_s), scene, _several(objects), body)
 
@@ -127,7 +127,7 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[list[BatchOutcome]]:
-        """Several registrations in one scene; pairs: numbers of detection and object, None: each with each.
+        """Several registrations in one scene. pairs: indices of detection and object; None: all combinations.
 
         A pair that fails does not stop the others.
         """
@@ -157,9 +157,9 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[Rendering]:
-        """Pictures, a mesh and a field of a scene with its edits. request: members of ``POST /render``.
+        """Render a scene with edits: pictures, a mesh, a field. request: members of ``POST /render``.
 
-        Objects of edits may be paths, jobs may be results.
+        An object of an edit may be a path. A job of an edit may be a result.
         """
         asking = self._connection.asking(progress, timeout_s)
         place = yield from fields.upload(asking, scene, "scene")
@@ -177,7 +177,7 @@ class Calls:
         return (yield from self.rendering(job))
 
     def job(self, job: JobLike) -> Flow[Job]:
-        """A job as it is now. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
+        """The current state of a job. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
         return self._connection.asking().document(Job, "GET", f"/jobs/{id_of(job)}")
 
     def jobs(self, status: str | None = None) -> Flow[list[Job]]:
@@ -186,19 +186,19 @@ class Calls:
         return [parsed(Job, one) for one in found]
 
     def wait(self, job: JobLike, progress: Report | None = None, timeout_s: float | None = None) -> Flow[Job]:
-        """The job once it has finished. Raises WaitTimeoutError, NoWorkerError."""
+        """Wait until a job has finished. Raises WaitTimeoutError, NoWorkerError."""
         return _wait(self._connection.asking(progress, timeout_s), job)
 
     def cancel(self, job: JobLike) -> Flow[Job]:
-        """Stop a job; no error if it was stopped before. Raises ServiceError (JOB_FINISHED)."""
+        """Cancel a job. It is no error if the job was canceled already. Raises ServiceError (JOB_FINISHED)."""
         return self._connection.asking().document(Job, "POST", f"/jobs/{id_of(job)}/cancel")
 
     def result(self, job: JobLike) -> Flow[Result]:
-        """What a registration found. Raises ServiceError: JOB_NOT_READY, or the job's own reason where it failed."""
+        """The result of a registration. Raises ServiceError: JOB_NOT_READY, or the job's own reason if it failed."""
         return _result(self._connection.asking(), job)
 
     def rendering(self, job: JobLike) -> Flow[Rendering]:
-        """What a rendering made. Raises ServiceError as ``result`` does."""
+        """The result of a rendering. Raises ServiceError like ``result``."""
         document = yield from _document(self._connection.asking(), job)
         return parsed(Rendering, {**document, "job": id_of(job)})
 
@@ -226,7 +226,7 @@ class Calls:
 
 
 class RecordingCalls:
-    """Recordings: depth images with their camera. One may be given as the scene wherever a field may; the detection may
+    """Recordings: depth images with their camera. A recording can be the scene of a registration. The detection can
     then be in its images: ``{"frame": ..., "mask" | "box_2d" | "point_2d": ...}``, or a list of these."""
 
     def __init__(self, connection: Connection) -> None:
@@ -241,9 +241,9 @@ class RecordingCalls:
         wait: bool = True,
         description: Mapping[str, Any] | None = None,
     ) -> Flow[Field]:
-        """A folder, an archive of one, a bag or a stored recording; once its import has ended, unless ``wait`` is
-        False. description: what no file says: ``depth_unit``, ``layout``, ``camera_axes``, ``intrinsics``. Raises
-        ServiceError with the import's reason."""
+        """Upload a folder, an archive of a folder, a bag or a stored recording, and wait for its import (unless
+        ``wait`` is False). description: import options that are in no file: ``depth_unit``, ``layout``,
+        ``camera_axes``, ``intrinsics``. Raises ServiceError with the import's reason."""
         asking = self._connection.asking(progress, timeout_s)
         return recordings.upload(asking, Path(path), label, description, wait)
 
@@ -259,8 +259,8 @@ class RecordingCalls:
         wait: bool = True,
     ) -> Flow[Field]:
         """One frame: paths, bytes or arrays (depth: (H, W), meters, or whole numbers of ``depth_unit`` meters; color:
-        (H, W, 3) uint8). camera: a document of intrinsics, its path, or K. after: the recording whose frames come
-        before, to which this one is added as ``name``."""
+        (H, W, 3) uint8). camera: a document of intrinsics, its path, or K. after: a recording to which this frame is
+        added, with the name ``name``."""
         more = {"depth_unit": depth_unit, "T_world_camera": T_world_camera}
         form = recordings.frame_form(depth, camera, color, more)
         asking, address = self._connection.asking(), "/recordings"
@@ -283,12 +283,12 @@ class RecordingCalls:
         return answer.content
 
     def delete(self, recording: Field | str) -> Flow[None]:
-        """Forget a recording. Raises ServiceError (FIELD_IN_USE)."""
+        """Delete a recording. Raises ServiceError (FIELD_IN_USE)."""
         return _done(self._connection.asking(), "DELETE", f"/recordings/{known_sha256(recording)}")
 
 
 class LibraryCalls:
-    """Objects by name. An ``Entry`` may be given wherever a field may."""
+    """Objects by name. An ``Entry`` can be used in place of a field."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -314,7 +314,7 @@ class LibraryCalls:
         return (yield from asking.document(Entry, "POST", "/library", json=notes.to_dict() | {"field": sent.sha256}))
 
     def entries(self, tag: str | None = None, name: str | None = None) -> Flow[list[Entry]]:
-        """Those with the tag, and with ``name`` in their names; the one added last first."""
+        """The entries with this tag, and with ``name`` in their names; newest first."""
         found = yield from _pages(self._connection.asking(), "library", {"tag": tag, "name": name})
         return [parsed(Entry, one) for one in found]
 

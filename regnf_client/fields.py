@@ -42,7 +42,7 @@ def source_of(
     settings: SettingsChoice = None,
     role: Role | None = None,
 ) -> FieldSource:
-    """What a path stands for, or a mesh or a cloud in memory, of which a file is made for as long as it is needed.
+    """The source of a path, or of a mesh or point cloud in memory, for which a temporary file is written.
 
     Raises what ``find_source`` does, InvalidInputError and FieldFormatError.
     """
@@ -89,10 +89,10 @@ def smallest_first(given: Mapping[Role, FieldLike]) -> list[tuple[Role, str | Fi
 
 
 def upload(asking: Asking, field: FieldLike, role: Role | None = None, wait: bool = True) -> Flow[Field]:
-    """The field at the service, once its import has ended; its bytes are sent only if the service lacks them.
+    """Upload a field and wait for its import. Its bytes are sent only if the service does not have them.
 
-    wait: False leaves the import running. Raises ServiceError: of a refused field the gate's reason,
-    FIELD_DESCRIPTION_DIFFERS for bytes that are held as another function; both name the file.
+    wait: False leaves the import running. Raises ServiceError: the importer's reason for a refused field, or
+    FIELD_DESCRIPTION_DIFFERS if the file is stored with other import options. Both have the name of the file.
     """
     (found,) = yield from upload_all(asking, [field], role, wait)
     return found
@@ -156,7 +156,8 @@ def find(asking: Asking, field: FieldLike) -> Flow[Field]:
 
 
 def ready(asking: Asking, field: Field) -> Flow[Field]:
-    """The field once its import has ended. Raises ServiceError with the gate's reason when it was rejected."""
+    """Wait until the import of a field has ended. Raises ServiceError with the importer's reason if the field was
+    rejected."""
     deadline = asking.deadline()
     while field.state == "validating":
         asking.tell("importing", 0.0)

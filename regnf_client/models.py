@@ -51,7 +51,7 @@ class Document(BaseModel):
 
 
 class Field(Document):
-    """A field that the service holds. Only a ``ready`` one can be registered; it may be given in place of a path."""
+    """A field on the service. Only a ``ready`` field can be registered. It can be used in place of a path."""
 
     sha256: str
     state: Literal["validating", "ready", "rejected"]
@@ -68,7 +68,7 @@ class Field(Document):
 
 
 class Entry(Document):
-    """An object of the library. It may be given in place of a path. field: the SHA-256 of its field."""
+    """An object of the library. It can be used in place of a path. field: the SHA-256 of its field."""
 
     name: str
     field: str
@@ -87,7 +87,7 @@ class Entry(Document):
 
 
 class Job(Document):
-    """A job as it was when the service was asked."""
+    """The state of a job at the time of the request."""
 
     id: str
     kind: Literal["registration", "render"]
@@ -107,7 +107,7 @@ class Job(Document):
 
     @property
     def finished(self) -> bool:
-        """Whether nothing will change any more."""
+        """Whether the job has ended."""
         return self.status in FINISHED
 
     def __repr__(self) -> str:
@@ -124,18 +124,18 @@ class Event(Document):
 
 
 class Artifact(Document, ArtifactEntry):
-    """A file of a result. One that is ``pending`` has no bytes yet: downloading it waits for them."""
+    """A file of a result. A ``pending`` file is still being made: its download waits until it is finished."""
 
 
 class Alternative(Document, AlternativeDocument):
-    """Another pose that agrees with the data as well."""
+    """Another pose that matches the data equally well."""
 
     T_scene_object: Matrix  # type: ignore[assignment]
     T_object_scene: Matrix  # type: ignore[assignment]
 
 
 class Candidate(Document, CandidateDocument):
-    """What a search found out about one object. source: as the caller named it."""
+    """The result of a search for one object. source: the object as the caller gave it."""
 
     T_scene_object: Matrix | None = None  # type: ignore[assignment]
     T_object_scene: Matrix | None = None  # type: ignore[assignment]
@@ -143,10 +143,10 @@ class Candidate(Document, CandidateDocument):
 
 
 class Result(Document, ResultDocument):
-    """What a registration or a search found: the members of ``regnf_core.document.ResultDocument``, and those below.
+    """The result of a registration or a search: the members of ``regnf_core.document.ResultDocument``, and those below.
 
     Transforms are (4, 4) arrays, x -> s R x + t · center_scene: (3,) · covariance: (7, 7) · job: its id · source: the
-    object as the caller named it.
+    object as the caller gave it.
     """
 
     job: str
@@ -179,7 +179,8 @@ class Result(Document, ResultDocument):
 
 
 class Rendering(Document):
-    """What a rendering has made. job: its id · field: SHA-256 of the edited scene's field, if it was asked for."""
+    """The result of a rendering. job: its id · field: SHA-256 of the edited scene's field, if the output `field` was
+    requested."""
 
     job: str
     frames: int
@@ -195,7 +196,7 @@ class Rendering(Document):
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
+    """The outcome of one pair of a batch: a result or an error. detection, object: their indices in the lists."""
 
     detection: int
     object: int

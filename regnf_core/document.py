@@ -1,4 +1,4 @@
-"""What a registration returns, and the document of it that the engine writes, the service answers and clients read.
+"""The result of a registration, and its document, which the engine writes, the service returns and clients read.
 
 A new member of the result is written here: in ``RegistrationResult``, in ``ResultDocument`` and in ``result_document``.
 Torch-free.
@@ -45,7 +45,7 @@ class _Posed:
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """One iteration of the optimizer: everything that trace.json shows.
+    """One iteration of the optimizer: the content of trace.json.
 
     residual_scene: mean |r| over the scene's samples, object units · residual_object: over the object's samples, scene
     units, as the paper has it.
@@ -74,7 +74,8 @@ class Alternative(_Posed):
 
 @dataclass(frozen=True)
 class ConsideredPose(_Posed):
-    """One pose that was refined and judged by itself, whatever rivals it has. reason, limit, level: as of a verdict."""
+    """One pose that was refined, with its own verdict, without regard to other poses. reason, limit, level: as of a
+    verdict."""
 
     T_object_scene: Sim3
     reason: str
@@ -85,12 +86,12 @@ class ConsideredPose(_Posed):
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """Poses that were judged, the likeliest first, and what the samples held out for that say of each of the K.
+    """Candidate poses, the most probable first, and the evidence of the verification samples for each of the K poses.
 
     scene_points (N, 3), object_points (M, 3): the samples, each in its field's frame · scene_signs (K, N) uint8: 0 the
-    object explains the scene's surface there, 1 it does not although it is near, 2 it is not near · object_signs (K, M)
-    uint8: 0 the scene confirms the object's surface there, 1 the scene has free space there, 2 nothing was observed
-    there, 3 the surfaces differ by a little.
+    object matches the scene's surface there, 1 it does not match although it is near, 2 it is not near · object_signs
+    (K, M) uint8: 0 the scene confirms the object's surface there, 1 the scene has free space there, 2 nothing was
+    observed there, 3 the surfaces differ by a little.
     """
 
     poses: list[ConsideredPose]
@@ -116,8 +117,8 @@ class ObjectSymmetry:
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The camera of the image that a detection was made in. frame: its name · T_world_camera: its pose in the scene's
-    frame, OpenCV's axes, scale 1 · object_unit: meters of the object's unit, where it is known."""
+    """The camera of the image in which the detection was made. frame: its name · T_world_camera: its pose in the
+    scene's frame, OpenCV's axes, scale 1 · object_unit: the object's unit in meters, if it is known."""
 
     frame: str
     T_world_camera: Sim3
@@ -131,7 +132,8 @@ unclear, mostly because it was not observed."""
 
 @dataclass(frozen=True, eq=False)
 class DecidingSurface:
-    """The surface of a search's first two candidates that lies off the other one of them, where they stand.
+    """The surface of each of the first two candidates of a search that is not on the surface of the other one, at their
+    poses.
 
     samples: (N,), scene frame · of_other (N,) bool: whose: False of the first, True of the other candidate · states
     (N,) uint8: SHOWN, ABSENT or UNKNOWN · distinguishable: as of the two's :class:`Difference`.
@@ -145,18 +147,18 @@ class DecidingSurface:
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult(_Posed):
-    """The outcome of one registration. The object's pose in the scene is ``T_scene_object``.
+    """The result of one registration. The object's pose in the scene is ``T_scene_object``.
 
     verdict_reason: one stable UPPER_SNAKE word, e.g. SURFACES_AGREE, LOW_OVERLAP · metrics: of the manual's list, and
     seconds by phase as seconds_<phase> · residuals: per point of both clouds: scene_points, scene_residuals,
     object_points, object_residuals; object units · center_object: (3,) float64, object frame: the centroid of the
-    object's surface · verdict_limit: the limit that a rejected pose does not keep, in words, with both numbers; "" if
-    there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
-    symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
-    viewers · surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection
-    was made in, where the scene is a recording · deciding: what tells the first two candidates of a search apart,
-    where the first one is accepted and both were refined · level: the strictest named level of the option
-    ``acceptance`` that the probability reaches; None: none.
+    object's surface · verdict_limit: the limit that a rejected pose violates, as text, with both numbers; "" if there
+    is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
+    symmetry: the object's own, found by registering it with itself · considered: the candidate poses, for viewers ·
+    surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection was made
+    in, where the scene is a recording · deciding: what tells the first two candidates of a search apart, where the
+    first one is accepted and both were refined · level: the strictest named level of the option ``acceptance`` that the
+    probability reaches; None: none.
     covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
     becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
     place of the scene's origin: the farther that is from the object, the larger are the entries of t, however well the
@@ -198,19 +200,20 @@ class RegistrationResult(_Posed):
 
     @property
     def probability(self) -> float | None:
-        """That the answer is right, 0..1: that the pose or one of the alternatives is within 5 % of the object's
-        diameter, or equal to that by the object's symmetry. It decides the verdict: see the option ``acceptance``. None
-        from the preset `paper`."""
+        """Probability, 0..1, that the pose or one of the alternatives is within 5 % of the object's diameter of the
+        true pose or of a symmetry equivalent of it. It decides the verdict: see the option ``acceptance``. None with
+        the preset `paper`."""
         return self.metrics.get("probability")
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What tells the candidate that comes first and another one apart: the surface of either that lies off the other.
+    """Difference between the first candidate and another one: the part of each surface that is not on the other
+    surface.
 
-    differs: its share 0..1 of both surfaces · seen: share of both surfaces that does and was seen, or seen not to be
-    there · favor: -1..1, the share of what was seen that speaks for the first candidate less that which speaks for the
-    other · distinguishable: whether enough was seen of it.
+    differs: share of both surfaces that differs, 0..1 · seen: share of both surfaces that differs and was observed, as
+    surface or as free space · favor: -1..1, the observed share that supports the first candidate minus the share that
+    supports the other · distinguishable: whether enough of the difference was observed.
     """
 
     differs: float
@@ -221,9 +224,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Candidate:
-    """What a search tells about one object.
+    """The result of a search for one object.
 
-    stage: the last stage that it reached · score: 0..1, smaller is better, comparable only within a stage. Verdict,
+    stage: the last stage that it reached · score: cost, 0..1, lower is better, comparable only within a stage. Verdict,
     reason, transform, probability and level are those of a registration, for ``refined`` objects; None for the others.
     difference: from the candidate that comes first, for other ``refined`` ones.
     """
@@ -494,11 +497,11 @@ def result_document(
     candidates: list[dict[str, Any]] | None = None,
     fields: Mapping[str, FieldNotes] | None = None,
 ) -> dict[str, Any]:
-    """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
+    """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics have the errors relative to it.
 
     ``device``: of the computation.
     ``object_name``: the object that was registered. ``candidates``: of :func:`ranking_document`, after a search.
-    ``fields``: what is known of the imports of scene and object, by these names.
+    ``fields``: notes of the imports of scene and object, by these names.
     """
     import torch
 

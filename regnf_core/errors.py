@@ -1,7 +1,7 @@
-"""Every error regnf raises on purpose, each with a stable ``reason`` that programs may switch on.
+"""All errors of regnf, each with a stable ``reason`` for programs.
 
     RegnfError
-    ├── InvalidInputError            the caller can mend it
+    ├── InvalidInputError            the caller can correct it
     │   ├── InvalidOptionsError      INVALID_OPTIONS, PRESET_UNSUITABLE
     │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
     │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
@@ -175,7 +175,7 @@ class FieldFormatError(InvalidInputError):
         self.candidates = tuple(candidates)
 
     def told(self, message: str, hint: str | None = None) -> FieldFormatError:
-        """The same error in other words."""
+        """The same error with another message."""
         error = FieldFormatError(message, reason=self.reason, hint=hint or self.hint, candidates=self.candidates)
         error.said = self.said
         return error

@@ -186,7 +186,7 @@ def register(
     object_model: ObjectModel | None = None,
     clouds: bool = True,
 ) -> RegistrationResult:
-    """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
+    """Find the pose of a known object in a scanned scene: rotation, position, scale and a verdict.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimizing; it may
     raise CancelledError. For the preset `robust` alone: ``initial_transform``, a T_object_scene to try first, and

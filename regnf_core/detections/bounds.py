@@ -1,4 +1,4 @@
-"""Whether a box meets the scene at all, how far away it is, and what may be wrong with its units."""
+"""Whether a box overlaps the scene, its distance from the scene, and possible errors of its units."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _MIN_AXIS_SQUARED = 1e-12
 
 
 def require_in_scene(box: Detection, scene: Bounds, obj: Bounds | None = None) -> None:
-    """Raises InvalidDetectionError for a box that does not meet the scene's bounds (DETECTION_OUTSIDE_SCENE).
+    """Raises InvalidDetectionError for a box that does not overlap the scene's bounds (DETECTION_OUTSIDE_SCENE).
 
     A box many times larger than the whole scene is INVALID_DETECTION. ``obj``, the object's bounds, tells whether
     scene and object may be swapped.

@@ -35,10 +35,10 @@ _MOST_DETECTIONS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class ImageDetection:
-    """A thing in one image. One of mask, box_2d and point_2d is given; in pixels of the color image, of the depth image
-    where a frame has no color.
+    """An object in one image. Exactly one of mask, box_2d and point_2d is given, in pixels of the color image, or of
+    the depth image if a frame has no color.
 
-    frame: its name or number · mask: as it was written, or an array (H, W), true on the thing · size: height and width
+    frame: its name or number · mask: as it was written, or an array (H, W), true on the object · size: height and width
     of the image, for polygons · box_2d: left, top, right, bottom · point_2d: u, v.
     """
 
@@ -57,7 +57,7 @@ class ImageDetection:
             )
 
     def values(self) -> dict[str, Any]:
-        """Plain (JSON) values; what was not given is left out."""
+        """Plain (JSON) values, without members that were not given."""
         found: dict[str, Any] = {"frame": self.frame}
         for name in ("mask", "box_2d", "point_2d", "size", "label", "score"):
             value = getattr(self, name)
@@ -95,7 +95,7 @@ AnyDetection = Detection | tuple[ImageDetection, ...]
 
 
 def read_detection(values: Any, index: int | None = None, folder: Path | None = None) -> AnyDetection:
-    """A detection of either kind. index: which one, of a list · folder: of masks that are named as files, which are
+    """A detection of either kind. index: its position in a list · folder: the folder of mask files; their content is
     put into the detection.
 
     Raises InvalidDetectionError.

@@ -7,8 +7,8 @@
     {"center": .., "extent": .., "R": ..}                    Open3D's OrientedBoundingBox
     {"min_bound": .., "max_bound": ..}                       Open3D's AxisAlignedBoundingBox
 
-Points and sizes may be objects {"x":, "y":, "z":}, as ROS has them. What does not say enough is refused: a bare list of
-four numbers as `rotation` may have either order. Other names are refused with what to write.
+Points and sizes may be objects {"x":, "y":, "z":}, as ROS has them. Ambiguous forms are refused: a list of four numbers
+as `rotation` may have either order. Other names are refused with a hint.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ Named = dict[str, tuple[str, Any]]
 
 
 def parse_detection(values: Any, index: int | None = None) -> Detection:
-    """The detection that plain (JSON) values say. ``index`` chooses one where a document holds several.
+    """The detection from plain (JSON) values. ``index`` selects one if a document has several.
 
     Raises InvalidDetectionError; its ``place`` tells where in ``values`` the fault is, its ``hint`` what to write.
     """

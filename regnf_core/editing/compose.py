@@ -179,10 +179,11 @@ def _upright(up: str) -> Tensor:
 def compose(
     scene: SdfField, edits: Sequence[Edit], seed: int = 0, progress: Callable[[float], None] | None = None
 ) -> EditedScene:
-    """The scene with all edits done, a field as any other: it can be registered against, rendered and edited again.
+    """Apply all edits to a scene. The result is a field: it can be the scene of a registration, be rendered and be
+    edited again.
 
-    Distances are in scene units. Deterministic for a seed. ``progress`` is called with the share done, 0..1, before
-    each edit; it may raise CancelledError to stop the work.
+    Distances are in scene units. Deterministic for a seed. ``progress`` is called with the progress, 0..1, before each
+    edit. It may raise CancelledError to stop the work.
     Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID (also for two edits of one place, and beyond the scene),
     FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """

@@ -88,10 +88,11 @@ class _Checked:
 
 @dataclass(frozen=True, eq=False)
 class Substitution(_Checked):
-    """The object's own field where the scene shows the object: as a registration has found it.
+    """Substitutes the object's own field for the object in the scene, at the pose of a registration.
 
     T_object_scene: scene to object coordinates · residual: of the registration, in object units (``residual_rms`` times
-    the diameter); None: unknown. The larger it is, the farther from the object's surface the scene's copy is removed.
+    the diameter); None: unknown. The larger it is, the farther from the object's surface the scene's surface is
+    removed.
     """
 
     obj: SdfField
@@ -105,10 +106,9 @@ class Substitution(_Checked):
 class Replacement(_Checked):
     """Replaces a registered object by another object.
 
-    obj, T_object_scene, residual: as in a substitution, of what stands there now · replacement: what will
-    stand there · T_replacement_object: the known pose of both, from the object's coordinates to the replacement's;
-    None: it stands on the same base, upright, turned alike, and is as large: ``match`` says along which length ·
-    up_object, up_replacement: the vertical in each one's own frame.
+    obj, T_object_scene, residual: the present object, as in a substitution · replacement: the new object ·
+    T_replacement_object: from the object's coordinates to the replacement's; None: same base, upright, same heading and
+    same size, along the length that ``match`` selects · up_object, up_replacement: up axis in each one's own frame.
     """
 
     obj: SdfField
@@ -130,10 +130,11 @@ class Replacement(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Removal(_Checked):
-    """What stands in a box is taken away; floor and walls go on, and what reaches in from outside stays.
+    """Removes the content of a box. Floor and walls are continued, and surface that extends into the box from outside
+    is kept.
 
-    detection: all of the thing, scene frame · obj, T_object_scene: what was registered there, where it is known: then
-    its surface says what belongs to the thing. One of the two is needed.
+    detection: a box around the whole object, scene frame · obj, T_object_scene: the registered object, if it is known:
+    its surface then defines what is removed. One of the two is needed.
     """
 
     detection: OrientedBox | None = None

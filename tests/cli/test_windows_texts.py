@@ -201,10 +201,10 @@ def test_failed_rows_are_shown(run: Run, tmp_path: Path) -> None:
             b"\x80\x01\x00\x00\x00\x00\x00\x00{",
             "not a text in UTF-8 from byte 1 (0x80) on, and it has control characters",
         ),
-        ("ä".encode() + b"\xff", "no text in UTF-8 from byte 3 (0xff) on"),
-        (b"\xef\xbb\xbfab\xff", "no text in UTF-8 from byte 6 (0xff) on"),
-        (b"\xff\xfea\x00b", "no text in UTF-16-LE from byte 5 (0x62) on"),
-        (b"{\x00\x01\x00", "no text in UTF-8 or UTF-16-LE: it has the control character 0x01"),
+        ("ä".encode() + b"\xff", "not a text in UTF-8 from byte 3 (0xff) on"),
+        (b"\xef\xbb\xbfab\xff", "not a text in UTF-8 from byte 6 (0xff) on"),
+        (b"\xff\xfea\x00b", "not a text in UTF-16-LE from byte 5 (0x62) on"),
+        (b"{\x00\x01\x00", "not a text in UTF-8 or UTF-16-LE: it has the control character 0x01"),
     ],
 )
 def test_what_is_no_text_says_what_was_tried(data: bytes, said: str) -> None:

@@ -474,7 +474,7 @@ def test_detections_that_match_nothing_are_dropped_and_said(monkeypatch: pytest.
     assert stream.boxes(2.0) == []
     assert "no depth image is within 0.1 s" in stream.said[-1]
     assert stream.boxes(0.5) == []
-    assert "too late: the oldest depth image kept is 0.5 s newer" in stream.said[-1]
+    assert "too late: the oldest stored depth image is 0.5 s newer" in stream.said[-1]
     assert stream.boxes(0.0) == []
     assert "without a time stamp" in stream.said[-1]
     stream.boxes(*(4.0 + n for n in range(part("matching").MOST_WAITING + 1)))
@@ -482,7 +482,7 @@ def test_detections_that_match_nothing_are_dropped_and_said(monkeypatch: pytest.
     monkeypatch.setattr(part("matching"), "MOST_BYTES", 3 * MILLIMETERS.nbytes)
     stream.depth(*(30.0 + n for n in range(9)))
     stream.boxes(35.0)
-    assert "the oldest depth image kept is 1.0 s newer" in stream.said[-1]
+    assert "the oldest stored depth image is 1.0 s newer" in stream.said[-1]
 
 
 def test_detections_wait_for_the_camera() -> None:

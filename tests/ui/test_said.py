@@ -37,7 +37,7 @@ def test_the_card_of_a_search_says_what_was_found_where_and_its_page_leads_on(
     page.goto(f"{service}/jobs")
     expect(page.locator(".tile h2")).to_have_text(title)
     expect(page.locator(".tile .word")).to_have_text("Registered")
-    expect(page.locator(".tile")).to_contain_text("the likeliest of 2 objects")
+    expect(page.locator(".tile")).to_contain_text("the most probable of 2 objects")
     box = re.compile(r"box [\d.]+ × [\d.]+ × [\d.]+ at [−\d.]+, [−\d.]+, [−\d.]+")
     expect(page.locator(".tile")).to_contain_text(box)
     page.get_by_role("link", name="Open").click()

@@ -160,7 +160,7 @@ def empty() -> str:
         ),
         ({"mask": empty(), "frame": "b"}, "INVALID_DETECTION", "frame b: the mask is empty"),
         ({"mask": {"size": [180, 240], "counts": [100, 5]}}, "INVALID_DETECTION", "runs have 105 pixels"),
-        ({"mask": {"size": [180, 240], "counts": "QQQ"}}, "INVALID_DETECTION", "run lengths"),
+        ({"mask": {"size": [180, 240], "counts": "QQQ"}}, "INVALID_DETECTION", "run-length encoding"),
         ({"mask": {"counts": [1]}}, "INVALID_DETECTION", "run-length encoding cannot be read"),
         ({"point_2d": [500, 3]}, "INVALID_DETECTION", "outside the image"),
         ({"box_2d": [500, 3, 600, 80]}, "INVALID_DETECTION", "outside the image"),

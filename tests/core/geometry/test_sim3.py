@@ -245,7 +245,7 @@ def rows(**changes: Any) -> list[list[Any]]:
         (rows(m03=INF), "finite"),
         (rows(m03=10**400), "finite"),
         (rows(m22=-2), "is a reflection"),
-        (rows(m22=2.01), "stretched"),
+        (rows(m22=2.01), "different lengths"),
         (rows(m02=0.01), "sheared"),
         (rows(m33=2), "last row"),
         (rows(m30=1e-3), "last row"),

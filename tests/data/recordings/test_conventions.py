@@ -83,9 +83,11 @@ WRONG: dict[str, tuple[str, Callable[[], Truth], Callable[[Path], None], str]] =
                              "or divide the poses"),
     "poses in reverse": ("scannet", lambda: posed(lambda T: T[::-1]), nothing, "correct pose in pose/"),
     "w first": ("tum", truth, edit("groundtruth.txt", ROW, r"\1 \2 \6 \3 \4 \5"), "quaternions of groundtruth.txt"),
-    "poses one off": ("redwood", lambda: posed(lambda T: np.roll(T, 1, axis=0)), nothing, "correct pose in the trajectory"),
+    "poses one off": (
+        "redwood", lambda: posed(lambda T: np.roll(T, 1, axis=0)), nothing, "correct pose in the trajectory"),
     "order of text": (
-        "replica", lambda: posed(lambda T: T[[0, 1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9]]), nothing, "correct pose in traj.txt"),
+        "replica", lambda: posed(lambda T: T[[0, 1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9]]), nothing,
+        "correct pose in traj.txt"),
 }  # fmt: skip
 
 

@@ -207,7 +207,7 @@ def test_masks_that_leave_nothing(tmp_path: Path) -> None:
     images = scenes.images()
     with pytest.raises(DatasetError, match="only 0 pixels") as caught:
         fuse_images(replace(images, masks=np.zeros(images.colors.shape[:3], bool)), tmp_path / "map.safetensors")
-    assert "the other way round" in str(caught.value.hint)
+    assert "whether these are inverted" in str(caught.value.hint)
 
 
 def test_an_empty_image_among_good_ones_is_passed_over(tmp_path: Path) -> None:

@@ -239,7 +239,7 @@ def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
     data = b"made by a program".ljust(80) + struct.pack("<I", 2) + 2 * facet
     found = read_mesh("stl", memoryview(data + bytes(7)))
     np.testing.assert_array_equal(found.faces, read_mesh("stl", memoryview(data)).faces)
-    assert found.left_out == ("7 bytes behind the triangles",)
+    assert found.left_out == ("7 bytes after the triangles",)
     with pytest.raises(FieldFormatError, match="ends within its 2 facets"):
         read_mesh("stl", memoryview(data[:-7]))
 
