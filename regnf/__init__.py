@@ -35,7 +35,7 @@ _HOMES = {
     **dict.fromkeys(("fit", "fuse"), "regnf.fitting"),
     **dict.fromkeys(("Frame", "register", "register_batch", "search"), "regnf.recordings"),
 }
-"""Every other name is regnf_core's."""
+"""All other names are those of regnf_core."""
 
 __all__ = ["AsyncClient", "Client", "Frame", "Pair", "PairResult", "fit", "fuse"]
 __all__ += regnf_core.__all__

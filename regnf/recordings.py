@@ -65,9 +65,10 @@ class Frame:
 
 
 SceneLike = FieldLike | Frame | Sequence[Frame] | Recording
-"""A field; or depth images: in memory, or the path of a recording (docs/datasets.md)."""
+"""A field, or depth images: in memory, or the path of a recording (docs/datasets.md)."""
 DetectionLike = BoxLike | ImageDetection | Sequence[ImageDetection] | None
-"""A box in the scene's frame; or, in depth images, a mask, box or point in one of them. None: the frames' own masks."""
+"""A box in the scene's frame. For depth images also a mask, box or point in one of them. None: the masks of the
+frames."""
 
 
 def register(

@@ -193,7 +193,7 @@ def shares(percents: str | None) -> tuple[float, ...]:
     except ValueError as error:
         raise InvalidOptionsError(f"snapshots are percentages such as 1,3,10, not {percents:.40}") from error
     if not all(0.0 < value < 1.0 for value in values):
-        raise InvalidOptionsError("snapshots lie between 0 and 100 percent")
+        raise InvalidOptionsError("snapshots must be between 0 and 100 percent")
     return values
 
 

@@ -187,7 +187,7 @@ def difference_in_words(difference: dict[str, Any]) -> str:
     """Whether what was seen tells a candidate of a search from the first one, to follow its number."""
     if not difference["distinguishable"]:
         return "cannot be distinguished from the first by the observed surface"
-    return f"is told apart from the first by {100 * difference['seen']:.1f} % of the surface, which was observed"
+    return f"is distinguished from the first by {100 * difference['seen']:.1f} % of the surface, which was observed"
 
 
 def axis_in_words(axis: Sequence[float]) -> str:

@@ -26,15 +26,15 @@ class ServiceError(RegnfError):
 
     reason = "SERVICE_ERROR"
     status: int | None = None
-    """Of HTTP; None for what was refused before anything was asked."""
+    """The HTTP status; None if the request was refused before it was sent."""
     unavailable = False
-    """Whether asking again later may help: the service is up but cannot take work now."""
+    """Whether a later retry may help: the service runs, but cannot accept work at the moment."""
     candidates: tuple[Candidate, ...] = ()
-    """What a refused field may be."""
+    """The possible readings of a refused field."""
     said: Said | None = None
-    """What the user said of that field."""
+    """The import options of that field."""
     offset: int | None = None
-    """How many bytes of an upload have arrived."""
+    """Number of bytes of an upload that have arrived."""
 
     def told(self, message: str) -> ServiceError:
         """The same error with another message."""

@@ -27,7 +27,7 @@ from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 
 JobLike = str | Job | Result | Rendering
-"""A job, its id, or what came of it."""
+"""A job, its id, or its result."""
 _PAGE = 200
 
 

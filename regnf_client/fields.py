@@ -26,8 +26,8 @@ from regnf_core.library_folder import digest_of
 
 Sendable = str | Path | FieldSource | HasVertices | HasPoints | HasGeometry
 FieldLike = Sendable | Field | Entry
-"""A file, a training run's folder or an archive of one; the SHA-256 of a field that the service has; or a Field or an
-Entry of its library; or a mesh or a cloud of trimesh or Open3D, or a mesh that regnf has opened."""
+"""A file, the folder of a training run or an archive of such a folder; the SHA-256 of a field on the service; a Field,
+or an Entry of the library; a mesh or point cloud of trimesh or Open3D; or a mesh that regnf has opened."""
 PIECE_BYTES = 8 << 20
 """A file that is larger is sent in pieces: a broken connection costs one of them."""
 _MOST_PIECES = 900

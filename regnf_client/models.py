@@ -103,7 +103,7 @@ class Job(Document):
     warnings: dict[str, list[str]] = {}
     links: dict[str, str] = {}
     sources: dict[str, str] = {}
-    """The objects as the caller named them, by the SHA-256s of their fields; of a job that this client submitted."""
+    """The objects as the caller gave them, by the SHA-256 of their fields, for a job that this client submitted."""
 
     @property
     def finished(self) -> bool:
@@ -159,7 +159,7 @@ class Result(Document, ResultDocument):
     artifacts: list[Artifact] = []  # type: ignore[assignment]
     source: str | None = None
     document: dict[str, Any] = MemberField(default={}, exclude=True)
-    """The same as the service sends it, plain (JSON) values."""
+    """The document of the service, plain (JSON) values."""
 
     @property
     def scale(self) -> float:
@@ -213,7 +213,7 @@ class EventReader:
     def __init__(self) -> None:
         self.last_id: str | None = None
         self.ended = False
-        """Whether the job's end has come."""
+        """Whether this event is the end of the job."""
         self._lines: dict[str, str] = {}
 
     def headers(self) -> dict[str, str]:

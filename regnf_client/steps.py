@@ -202,7 +202,7 @@ _AROUND = "\ufeff \t\r\n"
 """What a shell keeps of a file that Windows wrote."""
 _TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 Report = Callable[[str, float], None]
-"""Called with a phase and the share of it that is done, 0..1."""
+"""Called with a phase and its progress, 0..1."""
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ class Originals:
         if now is None or (now.attempt == field.attempt and now.state != "validating"):
             delete_upload(self._blobs, field)
             self._blobs.delete_prefix(candidates_prefix(field.sha256))
-            logger.info("the upload of field %s is no longer kept", field.sha256)
+            logger.info("the upload of field %s is not kept", field.sha256)
         return True
 
 

@@ -253,7 +253,7 @@ def _refuse_old_names(environment: Mapping[str, str]) -> None:
     """Raises SettingsError for a variable of an earlier version: what it says would be passed over in silence."""
     for name in environment:
         if name in _RENAMED:
-            raise SettingsError(f"{name} has a new name: did you mean {_RENAMED[name]}?")
+            raise SettingsError(f"{name} is not a setting: did you mean {_RENAMED[name]}?")
         if name.startswith(_PREFIX) and name.removeprefix(_PREFIX).lower() in Fixed.model_fields:
             raise SettingsError(f"{name} does not exist: the value is fixed")
 

@@ -149,7 +149,7 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
     ours = all(any(key in entry for key in ("mask", "box_2d", "point_2d")) for entry in entries)
     if index is not None:
         if not 0 <= index < len(entries):
-            raise InvalidDetectionError(f"there is no detection {index}: {len(entries)} are listed")
+            raise InvalidDetectionError(f"there is no detection {index}: the list has {len(entries)}")
         entries = [entries[index]]
     elif not ours and len(entries) > 1:
         known = ", ".join(f"{n}: {_name(entry)}" for n, entry in enumerate(entries[:8]))

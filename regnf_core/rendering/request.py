@@ -160,12 +160,12 @@ class RenderRequest(Closed):
     outputs: list[Output] = field(default_factory=lambda: ["color", "depth", "normal", "strip"])
     before: bool = True
     clear_unseen: bool = False
-    """Leave out the scene's matter where nothing was measured, where the scene knows that: fields invent it behind
-    things, and it hides them from there."""
+    """Whether unobserved matter of the scene is removed, if the scene has an observation. Networks invent such matter
+    behind objects, and it hides them from behind."""
     mesh_resolution: Annotated[int, Ge(2), Le(1024)] = 192
-    """Cells along the longest edge of the bounds, for ``mesh``."""
+    """Number of cells along the longest edge of the bounds, for ``mesh``."""
     field_resolution: Annotated[int, Ge(2), Le(1024)] = 192
-    """The same for ``field``."""
+    """Number of cells along the longest edge of the bounds, for ``field``."""
     seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
 
     @classmethod

@@ -25,7 +25,7 @@ FILL = 0.7
 """Share of the panel that the surfaces may fill: the legend stands below them."""
 _RAISED = 0.06  # share of the panel
 _SAID = {SHOWN: "observed in the scene", ABSENT: "free space in the scene", UNKNOWN: "unobserved or unclear"}
-_DRAWN = ("only the first has it", "only the second has it", "the first (faint: behind it)")
+_DRAWN = ("only the first has it", "only the second has it", "the first (faint: hidden)")
 _BODY_COLOR = (0.93, 0.935, 0.94)
 _SWATCH = (0.76, 0.77, 0.78)  # as the body looks in the shade
 _DOT = 0.012  # of the panel's edge: radius of a dot

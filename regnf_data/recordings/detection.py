@@ -248,14 +248,14 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
         columns, rows = (np.clip([a, b], 0, side) for a, b, side in ((left, right, width), (top, bottom, height)))
         mask[int(rows[0]) : int(np.ceil(rows[1])), int(columns[0]) : int(np.ceil(columns[1]))] = True
         if not mask.any():
-            raise InvalidDetectionError(f"frame {frame.name}: the box lies outside the image, {width} x {height}")
+            raise InvalidDetectionError(f"frame {frame.name}: the box is outside the image, {width} x {height}")
         middle = ((rows[0] + rows[1]) / 2.0, (columns[0] + columns[1]) / 2.0)
     else:
         assert detection.point_2d is not None
         u, v = detection.point_2d
         if not (0 <= u < width and 0 <= v < height):
             raise InvalidDetectionError(
-                f"frame {frame.name}: the point ({u:g}, {v:g}) lies outside the image of {width} x {height} pixels"
+                f"frame {frame.name}: the point ({u:g}, {v:g}) is outside the image of {width} x {height} pixels"
             )
         mask[:] = True
         middle = (v, u)

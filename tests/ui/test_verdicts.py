@@ -170,7 +170,7 @@ def test_a_search_shows_its_ranking(visit: Visit) -> None:
     assert shown[:3] == [
         ["field a0a0a0a0", "Registered, 99.0 %, strict", "0.021"],
         ["field a1a1a1a1", "Rejected, 30.0 %, below both levels", "0.34",
-         "told apart from the first by 3.7 % of the surface, which was observed"],
+         "distinguished from the first by 3.7 % of the surface, which was observed"],
         ["field b0b0b0b0", "coarse search", "0.4"],
     ]  # fmt: skip
     assert len(shown) == 8

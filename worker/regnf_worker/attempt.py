@@ -314,7 +314,7 @@ def _end(context: Context, job_id: str, attempt: int, **changes: Any) -> None:
     try:
         _update(context, job_id, attempt, **changes)
     except StaleAttemptError as error:
-        logger.info("job %s attempt %d is no longer current: %s", job_id, attempt, error)
+        logger.info("job %s attempt %d is not current: %s", job_id, attempt, error)
     else:
         logger.info("job %s attempt %d ended: %s", job_id, attempt, changes["status"])
 

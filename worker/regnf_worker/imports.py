@@ -116,7 +116,7 @@ def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
 
 
 def _retire(context: Context, sha256: str, attempt: int, error: StaleAttemptError) -> None:
-    logger.info("import %s attempt %d is no longer current: %s", sha256, attempt, error)
+    logger.info("import %s attempt %d is not current: %s", sha256, attempt, error)
     if context.records.get_field(sha256) is None:
         context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
 

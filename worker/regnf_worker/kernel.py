@@ -81,7 +81,7 @@ def forked(work: Callable[[], object]) -> int:
     finally:
         if os.getpid() != parent:
             os._exit(status)
-    raise AssertionError("a forked process goes on")
+    raise AssertionError("a forked process continues")
 
 
 def in_child(work: Callable[[], object]) -> bool:

@@ -133,7 +133,7 @@ class RegnfWorker(ResilientWorker):
                 self._prepare_import()
                 taken = self._until_available("waiting for a job", partial(self._taking.pop, _MONITOR_S))
             if taken is not None:
-                work = self._until_available("looking at what was taken", partial(self._taking.accept, taken))
+                work = self._until_available("checking the job that was taken", partial(self._taking.accept, taken))
                 if work is not None:
                     return made(work, self.connection), Queue(work.queue_name, connection=self.connection)
         return None

@@ -232,8 +232,8 @@ def test_a_thing_is_lifted_to_its_box(kind: str) -> None:
     [
         (ImageDetection(mask=np.zeros((H, W), np.bool_)), "frame 0: the mask is empty"),
         (ImageDetection(mask=np.ones((9, 9), np.bool_)), "frame 0: the mask has 9 x 9 pixels, not 160 x 120"),
-        (ImageDetection(box_2d=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box lies outside the image"),
-        (ImageDetection(point_2d=(-1.0, 5.0)), "frame 0: the point .* lies outside the image"),
+        (ImageDetection(box_2d=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box is outside the image"),
+        (ImageDetection(point_2d=(-1.0, 5.0)), "frame 0: the point .* is outside the image"),
     ],
 )
 def test_a_detection_beside_the_image_is_refused(detection: ImageDetection, said: str) -> None:
