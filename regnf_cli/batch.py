@@ -215,7 +215,7 @@ def batch(
     Example: **regnf batch pairs.jsonl**, with one line per pair, for example
     `{"key": "a", "scene": "room.ckpt", "object": "chair.ckpt", "detection": {"min": [0, 0, 0], "max": [1, 1, 1]}}`
 
-    Exit codes: 0 every pair has a result, 1 some failed, 2 bad input, 3 service unavailable.
+    Exit codes: 0 all pairs have a result, 1 some pairs failed, 2 bad input, 3 service unavailable.
     """
     if server is None:
         require("engine")

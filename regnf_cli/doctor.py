@@ -46,13 +46,13 @@ _COLORS = {"ok": "green", "warning": "yellow", "error": "bold red"}
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False) -> None:
-    """Look at libraries, GPU, Redis, storage, disk, memory, open files and the port, and say how to mend what is wrong.
+    """Check libraries, GPU, Redis, storage, disk, memory, open files and the port, and print how to correct problems.
 
-    The service's settings are read from REGNF_* in the environment.
+    The settings of the service come from the environment variables REGNF_*.
 
     Example: **regnf doctor**
 
-    Exit codes: 0 nothing is wrong (there may be warnings), 3 something is.
+    Exit codes: 0 no errors (there may be warnings), 3 errors.
     """
     findings = list(check_all())
     if as_json:

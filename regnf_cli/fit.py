@@ -29,7 +29,7 @@ SafeField = Annotated[Path, typer.Argument(help="The regnf field file to write (
 Bounds = Annotated[
     str | None,
     typer.Option(
-        help="Images: the region that the field covers, world frame. Default: the region that the images show.",
+        help="Region that the field covers, world frame (only for images). Default: the region that the images show.",
         metavar="X,Y,Z,X,Y,Z",
     ),
 ]

@@ -61,12 +61,12 @@ def inspect(
     layout: Layout = None,
     axes: CameraAxes = None,
 ) -> None:
-    """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility. Or what a
-    recording is (depth images with their cameras): layout, units, cameras, and whether its frames agree.
+    """Show the report of a field file: its format and how it was recognized, bounds, parameters, plausibility. For a
+    recording (depth images with cameras): layout, units, cameras, and whether its frames agree.
 
     Example: **regnf inspect step-000030000.ckpt --picture chair.png**
 
-    A file that may be one of several functions is refused with what to say for each; `--candidates` draws them.
+    If a file is ambiguous, the command prints the import option of each possible reading; `--candidates` draws them.
     """
     require("engine")
     if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):

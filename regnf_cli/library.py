@@ -208,7 +208,7 @@ def show(
 @app.command()
 def edit(
     name: Name,
-    rename: Annotated[str | None, typer.Option(help="Another name.")] = None,
+    rename: Annotated[str | None, typer.Option(help="The new name.")] = None,
     tag: Tags = None,
     unit: Unit = None,
     note: Note = None,
@@ -251,7 +251,7 @@ def export_(
     server: Server = None,
     token: Token = None,
 ) -> None:
-    """Write the library into one file: an index, and the fields in the safe format.
+    """Write the library into one file: an index and the regnf field files.
 
     Example: **regnf library export chairs.zip --tag seat**
     """
@@ -277,7 +277,7 @@ def import_(
     server: Server = None,
     token: Token = None,
 ) -> None:
-    """Add the entries of a file that `export` wrote. Each field goes through the import gate.
+    """Add the entries of a file written by `export`. Each field is imported and checked again.
 
     Example: **regnf library import chairs.zip**
     """

@@ -275,7 +275,7 @@ _Seven = Annotated[list[float | None], Field(min_length=7, max_length=7)]
 
 
 class TransformDocument(Outgoing):
-    """A similarity transform x -> s R x + t. `matrix` is row-major 4x4 and holds all of it."""
+    """A similarity transform x -> s R x + t. `matrix` is the complete transform, row-major 4x4."""
 
     matrix: list[list[float]]
     scale: float
@@ -403,7 +403,7 @@ class ArtifactEntry(Outgoing):
 
 
 class CameraDocument(Outgoing):
-    """The object in the frame of the camera whose image the detection was made in: x right, y down, z forward."""
+    """The object in the frame of the camera in whose image the detection was made: x right, y down, z forward."""
 
     frame: str = Field(description="The image's name.")
     T_camera_object: TransformDocument = Field(
@@ -418,7 +418,7 @@ class ResultDocument(Outgoing):
     """The result of a registration. The name of a transform gives its direction."""
 
     verdict: Verdict
-    verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
+    verdict_reason: str = Field(description="Reason of the verdict: one stable word, for example SURFACES_AGREE.")
     verdict_detail: str = Field(default="", description="The reason as a sentence, with numbers.")
     verdict_hint: str = Field(default="", description="What the user can do next. Empty for a registered result.")
     probability: float | None = Field(
@@ -459,7 +459,9 @@ class ResultDocument(Outgoing):
         "(omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s, so its covariance is J C J^T. "
         "docs/api.md has an example with numbers. Null with the preset `paper`.",
     )
-    covariance_ordering: list[str] | None = Field(default=None, description="omega (3), t (3), log_s.")
+    covariance_ordering: list[str] | None = Field(
+        default=None, description="Order of rows and columns: omega (3), t (3), log_s."
+    )
     uncertainty: UncertaintyDocument | None = None
     camera: CameraDocument | None = Field(
         default=None, description="The object in the camera frame, if the scene is a recording."

@@ -83,7 +83,7 @@ class OptimizationOptions(_Group):
     scale_rate: Annotated[float, Gt(0), Le(1)] = 0.01
     kernel_rate: Annotated[float, Gt(0), Le(1)] = 0.005
     regularizer_weight: Annotated[float, Ge(0), Le(1000)] = 1.0
-    """w, the weight of the nearest-neighbor regularizer. The paper gives no value."""
+    """Weight w of the nearest-neighbor regularizer. The paper gives no value."""
     stop_residual: Annotated[float, Ge(0), Le(1)] = 0.0005
     """Stop when the mean residuals of both directions are at most this."""
     samples_per_iteration: Annotated[int, Ge(16), Le(1_000_000)] = 2000
@@ -112,7 +112,7 @@ class ResamplingOptions(_Group):
 class RobustOptions(_Group):
     """The preset `robust`: a search over all of Sim(3), refinement on the fields, and a verdict.
 
-    Lengths are in object diameters, shares within 0 and 1: nothing depends on the fields' units.
+    Lengths are in object diameters, shares are from 0 to 1. Nothing depends on the units of the fields.
     """
 
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600

@@ -30,8 +30,8 @@ class RenderOptions:
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "use_attribute_docstrings": True}
 
     mode: Literal["surface", "volume"] = "surface"
-    """surface: where rays first meet the zero level. volume: NeuS's opacity along the ray; it shows how sharp a field
-    is, and takes three to four times as long."""
+    """surface: the first intersection of each ray with the zero level. volume: NeuS's opacity along the ray; it shows
+    how sharp a field is, and takes three to four times as long."""
     coloring: Literal["auto", "field", "shaded"] = "auto"
     """auto: the field's colors if it has colors, else shading. field: the field's colors, or an error if it has none.
     shaded: always shading."""

@@ -72,7 +72,8 @@ def field_etag(record: FieldRecord) -> str:
 
 async def _of_request(
     if_none_match: Annotated[
-        str | None, Header(description="One or several ETags, or `*`: 304 when one of them is the current one.")
+        str | None,
+        Header(description="One or several ETags, or `*`. The response is 304 if one of them is the current ETag."),
     ] = None,
 ) -> IfNoneMatch:
     return parse_if_none_match(if_none_match)

@@ -77,7 +77,7 @@ def require_field(services: Services, caller: str, sha256: str) -> FieldRecord:
 @get_and_head(
     router,
     "/fields/{sha256}",
-    summary="A field's state and what its import found",
+    summary="State of a field and report of its import",
     response_model=FieldDocument,
     responses=FIELD_ANSWERS,
 )
@@ -145,7 +145,7 @@ async def get_field_mesh(
     caller: CallerDep,
     held: IfNoneMatchDep,
     detail: Annotated[
-        Literal["fine", "coarse"], Query(description="At most 200,000 triangles, or at most 30,000.")
+        Literal["fine", "coarse"], Query(description="Level of detail: at most 200,000 triangles, or at most 30,000.")
     ] = "fine",
 ) -> Response:
     """The mesh is for display. It is flat-shaded if the field is a mesh, and has vertex colors if the field has colors.

@@ -110,7 +110,12 @@ def list_jobs(
     summary="A job's state",
     response_model=JobDocument,
     responses={
-        200: {"headers": {"ETag": header("For If-None-Match."), "Retry-After": header("While the job is active.")}},
+        200: {
+            "headers": {
+                "ETag": header("For If-None-Match."),
+                "Retry-After": header("Seconds to wait before the next request. Only while the job is active."),
+            }
+        },
         304: NOT_MODIFIED,
         **refusals("INVALID_QUERY", "JOB_NOT_FOUND", "JOB_EXPIRED"),
     },
@@ -199,7 +204,7 @@ async def job_events(
     status_code=202,
     responses={
         200: {"description": "The job was dismissed already.", "model": JobDocument},
-        202: {"description": "A waiting job is dismissed at once, a running one within seconds."},
+        202: {"description": "A waiting job is dismissed immediately, a running job within seconds."},
         **refusals("JOB_NOT_FOUND", "JOB_FINISHED", "JOB_EXPIRED"),
     },
 )

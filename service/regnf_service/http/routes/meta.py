@@ -89,7 +89,7 @@ async def version() -> dict[str, str]:
 
 @get_and_head(router, "/", summary="All addresses", response_model=IndexDocument, responses={200: {"content": HTML}})
 async def index(request: Request, prefix: PrefixDep) -> Response:
-    """Start here. A browser gets the home page, which needs no token."""
+    """The entry point of the API. A browser gets the home page, which needs no token."""
     if wants_page(request.scope):
         return page("home.html")
     paths = request.app.openapi()["paths"]

@@ -69,7 +69,7 @@ _REFUSALS = (
     "FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION INVALID_QUERY"
 )
 FRAME_PARTS: dict[str, Any] = {
-    "depth": FILE | {"description": "A PNG of 16 bits, a TIFF or a `.npy` file."},
+    "depth": FILE | {"description": "The depth image: a 16-bit PNG, a TIFF or a `.npy` file."},
     "color": FILE | {"description": "The color image of the same view: a PNG, JPEG, BMP or WebP file."},
     "camera": {
         "type": "object",
@@ -220,7 +220,7 @@ get_and_head(
     router,
     "/recordings/{sha256}",
     name="get_recording",
-    summary="A recording's state and what its import found",
+    summary="State of a recording and report of its import",
     response_model=FieldDocument,
     responses=FIELD_ANSWERS,
 )(get_field)
@@ -237,7 +237,7 @@ router.delete(
 @get_and_head(
     router,
     "/recordings/{sha256}/frames/{name:path}/color.png",
-    summary="A frame's color image, or its depth as gray",
+    summary="Color image of a frame, or its depth image in gray",
     response_class=Response,
     responses={
         200: {"description": "The image has its original size.", "content": {"image/png": BINARY}},

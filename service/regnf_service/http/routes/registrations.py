@@ -143,7 +143,7 @@ _ONE_SHOT = {
             "scene": FILE,
             "object": FILE,
             **FRAME_PARTS,
-            "mask": FILE | {"description": "The detection in the frame: a PNG of its size."},
+            "mask": FILE | {"description": "The mask of the object in the frame: a PNG of the same size."},
             "request": reference(OneShotRequest),
             **{f"{role}_description": reference(UploadDescription) for role in ("scene", "object")},
             **{f"{role}_settings": FILE for role in ("scene", "object")},

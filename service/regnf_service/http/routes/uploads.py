@@ -80,7 +80,7 @@ _MULTIPART = {
 
 @router.put(
     "/fields/{sha256}",
-    summary="Upload a field under its SHA-256",
+    summary="Upload a field with a known SHA-256",
     response_model=FieldDocument,
     status_code=201,
     responses={

@@ -28,7 +28,7 @@ _IGNORED = Field(None, description="A member of Open3D's boxes. It is ignored.")
 
 
 class Point(Incoming):
-    """A point by its coordinates' names."""
+    """A point, given by the names of its coordinates."""
 
     x: Coordinate
     y: Coordinate
@@ -36,7 +36,7 @@ class Point(Incoming):
 
 
 class Quaternion(Incoming):
-    """A quaternion by its components' names, as ROS has it."""
+    """A quaternion, given by the names of its components, as in ROS."""
 
     x: _Component
     y: _Component

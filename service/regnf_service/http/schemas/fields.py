@@ -18,7 +18,7 @@ from regnf_state.records import CANDIDATES, FieldRecord
 
 
 class SettingsDocument(Outgoing):
-    """A file that came with an upload."""
+    """A file that was uploaded with a field."""
 
     name: str
     sha256: Sha256
@@ -56,7 +56,7 @@ class FieldDocument(Outgoing):
     symmetry: SymmetryDocument | None = Field(
         None, description="The object's symmetry. The first job that registers the field as an object detects it."
     )
-    library: EntryNamed | None = Field(None, description="Its entry in the library: `GET /library/{name}`.")
+    library: EntryNamed | None = Field(None, description="Its library entry: `GET /library/{name}`.")
     queue_position: int | None = Field(
         None, description="Position in the queue, 1 is next. Null for an import that runs or has ended, and in lists."
     )

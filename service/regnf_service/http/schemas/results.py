@@ -26,7 +26,7 @@ class Incoming(BaseModel):
 
 
 class ProblemEntry(Outgoing):
-    """One fault: a JSON Pointer into the body, or the name of a query parameter or header."""
+    """One error: a JSON Pointer into the body, or the name of a query parameter or header."""
 
     pointer: str | None = None
     parameter: str | None = None

@@ -122,7 +122,9 @@ Edit = Annotated[Substitution | Replacement | Removal | Insertion, Discriminator
 MOST_CAMERAS = 256
 """That a request lists: its record is held until the job ends."""
 _Count = Annotated[int, Field(ge=1)]
-_Resolution = Annotated[int, Field(ge=2, le=1024, description="Cells along the longest edge of the scene's bounds.")]
+_Resolution = Annotated[
+    int, Field(ge=2, le=1024, description="Number of cells along the longest edge of the scene's bounds.")
+]
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ class FileEntry(ArtifactEntry):
 
     kind: Literal["color", "depth", "normal", "animation", "strip", "mesh", "field", "report"] | None = None
     frame: int | None = Field(None, description="Number of the frame; null for a file about all frames.")
-    before: bool = Field(False, description="Whether it shows the scene without its edits.")
+    before: bool = Field(False, description="Whether the file shows the scene without its edits.")
 
 
 class RenderResultDocument(Outgoing):
