@@ -1,4 +1,4 @@
-"""The sub-commands of ``regnf``. One that is asked for is loaded alone: others bring HTTP and fitting along."""
+"""The sub-commands of ``regnf``. One that is requested is loaded alone: others bring HTTP and fitting along."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ def check_access(settings: Settings) -> None:
     """Raises StartError for what would let strangers in, and for callers that cannot be read.
 
     PROXY_MISSING: others can reach the address, and no proxy is said to stand before it.
-    UNAUTHENTICATED_PUBLIC_BIND: others can reach the service while no token is asked for. TOKENS_UNUSABLE and
+    UNAUTHENTICATED_PUBLIC_BIND: others can reach the service while no token is requested. TOKENS_UNUSABLE and
     ALLOWED_HOSTS_UNUSABLE: see there.
     """
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:

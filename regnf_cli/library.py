@@ -83,7 +83,7 @@ class Shelf:
         self._kept.remove(name)
 
     def file(self, entry: Shown, folder: Path) -> Path:
-        """The entry's safe field: where it lies; of a service, written into ``folder``."""
+        """The entry's regnf field file: where it lies; of a service, written into ``folder``."""
         if self._client is None:
             return Path(entry.place)
         return self._client.library.download(entry.notes.name, folder / f"{entry.field}.safetensors")

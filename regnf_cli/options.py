@@ -155,7 +155,7 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
 def read_options(
     path: Path | None, preset: Preset | None, unit: Unit | None = None, scale: str = "known"
 ) -> dict[str, Any]:
-    """Plain options: those of a file, or none, with the preset that was asked for by name, and the object's unit.
+    """Plain options: those of a file, or none, with the preset that was requested by name, and the object's unit.
 
     Raises InvalidOptionsError when the file names another preset, or holds what is no option.
     """

@@ -95,7 +95,7 @@ def exit_code(document: dict[str, Any]) -> int:
 
 
 def show(document: dict[str, Any], as_json: bool, top: int = 0) -> None:
-    """Print a result document as JSON, or in words, after the ``top`` likeliest candidates of a search."""
+    """Print a result document as JSON, or in words, after the ``top`` most probable candidates of a search."""
     if as_json:
         out.print_json(json.dumps(document))
         return

@@ -372,7 +372,7 @@ def _submit(asking: Asking, scene: FieldLike, obj: FieldLike | list[FieldLike], 
 
 
 def _post(asking: Asking, address: str, body: Mapping[str, Any]) -> Flow[Job]:
-    """The job of a request. One that is sent again, because an answer was lost, starts nothing anew."""
+    """The job of a request. One that is sent again, because an answer was lost, starts nothing again."""
     return asking.document(Job, "POST", address, json=body, headers={"Idempotency-Key": uuid4().hex})
 
 

@@ -118,7 +118,7 @@ def png_of(array: Any) -> bytes:
 
 
 def detection_body(detection: Any) -> Any:
-    """A detection as it is sent: a box; or the thing in images, with masks as PNGs. Raises InvalidDetectionError."""
+    """A detection as it is sent: a box; or the object in images, with masks as PNGs. Raises InvalidDetectionError."""
     folder = Path()
     if isinstance(detection, str | os.PathLike) and Path(detection).is_file():
         folder = Path(detection).parent

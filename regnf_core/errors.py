@@ -32,7 +32,7 @@ from typing import Any
 # One of several functions that a file may stand for, where nothing in it tells which: what a person is asked.
 
 MOST_CANDIDATES = 6
-"""So many are shown at most, the likeliest first."""
+"""So many are shown at most, the most probable first."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class FitDivergedError(RegnfError):
 
 
 class CancelledError(RegnfError):
-    """The caller asked for the work to stop."""
+    """The caller requested the work to stop."""
 
     reason = "CANCELLED"
 

@@ -51,7 +51,7 @@ def require_file(path: Path) -> None:
 
 
 def stored_bounds(path: Path) -> Bounds | None:
-    """The lowest and the highest corner in a safe field's header; None where there is none to be read.
+    """The lowest and the highest corner in a regnf field file's header; None where there is none to be read.
 
     It needs no library beyond Python's, and promises nothing: opening the file says what is wrong with it.
     """

@@ -33,9 +33,9 @@ _WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "s
 
 @dataclass(frozen=True)
 class FieldSource:
-    """named: the path as the user gave it · file: what the gate reads · run: the settings found beside it · config: the
-    file of settings that the user named · said: what the user says of it, see UploadDescription · role: what it will be
-    used as, where that decides something and the user has not said it · use: the same, whatever it decides."""
+    """named: the path as the user gave it · file: what the importer reads · run: the settings found beside it · config:
+    the file of settings that the user named · said: what the user says of it, see UploadDescription · role: what it
+    will be used as, where that decides something and the user has not said it · use: the same, whatever it decides."""
 
     named: Path
     file: Path
@@ -47,7 +47,7 @@ class FieldSource:
 
     @property
     def description(self) -> dict[str, Any]:
-        """What the gate is told."""
+        """What the importer is told."""
         return dict(self.said) if self.role is None else {**self.said, "as": self.role}
 
     @property

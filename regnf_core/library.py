@@ -66,7 +66,7 @@ class LibraryObject:
 
 @dataclass(frozen=True)
 class LibrarySearch:
-    """ranking: every object of the library, the likeliest first · result: the registration of the first."""
+    """ranking: every object of the library, the most probable first · result: the registration of the first."""
 
     ranking: list[Candidate]
     result: RegistrationResult
@@ -81,7 +81,7 @@ def search_library(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> LibrarySearch:
-    """Rank the library's objects for one detection, and register the likeliest, by the preset `robust`.
+    """Rank the library's objects for one detection, and register the most probable, by the preset `robust`.
 
     All are compared by signature, the nearest 12 searched coarsely on samples, at most 4 refined on their fields and
     evaluated: the time hardly grows with the library. Deterministic for a seed. ``progress`` and ``clouds`` as in
@@ -143,7 +143,7 @@ _Refined = tuple[Evaluation, int, RegistrationProblem, int]
 
 
 def _decided(refined: list[_Refined]) -> list[Comparison]:
-    """Move the candidate that the surface speaks for by which it differs from the likeliest one to the first place,
+    """Move the candidate that the surface speaks for by which it differs from the most probable one to the first place,
     but no rejected one before an accepted one. Returns what tells each of the others from the first."""
     placed = {found[1]: found[0].placed(found[2]) for found in refined}
     for found in refined[1:]:

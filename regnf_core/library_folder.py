@@ -1,7 +1,7 @@
-"""A library in a folder: safe fields, their pictures, and an index. Torch-free but for adding.
+"""A library in a folder: regnf field files, their pictures, and an index. Torch-free but for adding.
 
 library.json              names, tags, units, notes, symmetries
-{sha256}.safetensors      a safe field, by the digest of its bytes
+{sha256}.safetensors      a regnf field file, by the digest of its bytes
 {sha256}.png              its picture, where there is one
 """
 
@@ -33,7 +33,7 @@ _DIGITS = 64
 
 @dataclass(frozen=True)
 class FolderEntry:
-    """field: SHA-256 of the safe field · detected: the symmetry that was found; None: there is no surface."""
+    """field: SHA-256 of the regnf field file · detected: the symmetry that was found; None: there is no surface."""
 
     notes: EntryNotes
     field: str
@@ -113,14 +113,14 @@ class LibraryFolder:
         raise InvalidInputError(f"{self.folder}: no entry {name!r}", reason="LIBRARY_ENTRY_NOT_FOUND", hint=hint)
 
     def file(self, entry: FolderEntry) -> Path:
-        """The safe field."""
+        """The regnf field file."""
         return self.folder / f"{entry.field}.safetensors"
 
     def picture(self, entry: FolderEntry) -> Path:
         return self.folder / f"{entry.field}.png"
 
     def add(self, source: FieldSource, notes: EntryNotes) -> FolderEntry:
-        """Import the field through the gate, find its symmetry, and keep it.
+        """Import the field through the importer, find its symmetry, and keep it.
 
         Raises FieldFormatError naming the file, InvalidInputError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY).
         """
@@ -191,7 +191,7 @@ def digest_of(path: Path) -> str:
 
 
 def _symmetry_of(field: Path) -> dict[str, Any] | None:
-    """Of the object in a safe field; its model is kept for searches. None for what has no surface."""
+    """Of the object in a regnf field file; its model is kept for searches. None for what has no surface."""
     from regnf_core.object_models import object_model
     from regnf_core.options import RobustOptions
 
@@ -217,7 +217,7 @@ _WRITTEN = (1980, 1, 1, 0, 0, 0)
 
 
 def write_archive(path: Path, entries: list[tuple[FolderEntry, Path]]) -> None:
-    """Entries and their safe fields. The file is there once it is whole."""
+    """Entries and their regnf field files. The file is there once it is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(INDEX, _WRITTEN), index_text([entry for entry, _ in entries]))
@@ -231,7 +231,7 @@ def write_archive(path: Path, entries: list[tuple[FolderEntry, Path]]) -> None:
 
 @dataclass(frozen=True)
 class Archive:
-    """An archive whose structure was checked; its fields still have to pass the import gate."""
+    """An archive whose structure was checked; its fields still have to pass the importer."""
 
     entries: list[FolderEntry]
     _data: memoryview

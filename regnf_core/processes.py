@@ -39,7 +39,7 @@ _MALLOPT = (-1, 1 << 26), (-3, 1 << 24)
 def keep_freed_memory() -> None:
     """Have the C library keep some freed memory for what is allocated next (glibc; nothing elsewhere).
 
-    Else each larger array is given back to the system, and the next one's pages are made anew, one by one.
+    Else each larger array is given back to the system, and the next one's pages are made again, one by one.
     """
     with suppress(OSError, AttributeError):
         for parameter, size in _MALLOPT:

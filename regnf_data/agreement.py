@@ -224,7 +224,7 @@ class _Sample:
 
 
 def _search(stated: _Views, sample: _Sample) -> tuple[_Views, Agreement]:
-    """The convention by which the images agree best, of those that differ from the stated one in up to two things."""
+    """The convention by which the images agree best, of those that differ from the stated one in up to two objects."""
     rough = sample.part(_ROUGH_PAIRS, _ROUGH_PIXELS)
     best, found = stated, sample.agreement(stated)
     for _ in range(_ROUNDS):

@@ -355,7 +355,7 @@ def _paths(
     return None
 
 
-# The things that a dataset names: their boxes and poses, in JSON and out of it.
+# The objects that a dataset names: their boxes and poses, in JSON and out of it.
 
 _REASON = "DATASET_INSTANCE_INVALID"
 _LABELS = ("label", "name", "id", "class", "class_name")

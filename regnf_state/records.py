@@ -103,7 +103,7 @@ class JobRecord(Closed):
     engine: dict[str, Any] = field(default_factory=dict)
     error: dict[str, Any] | None = None
     requeues: int = 0
-    """How often this request was handed out again because its worker vanished, since it was last asked for."""
+    """How often this request was handed out again because its worker vanished, since it was last requested."""
     worker: str | None = None
     """Who claimed the attempt."""
     phase_since: float | None = None
@@ -175,7 +175,7 @@ class FieldRecord(Closed):
     """What the import found: family, bounds, parameters, plausibility, warnings."""
     error: dict[str, Any] | None = None
     attempt: int = 1
-    """Grows each time the import starts anew; fences off the writer of an older one."""
+    """Grows each time the import starts again; fences off the writer of an older one."""
     requeues: int = 0
     """How often this upload was handed out again because its worker vanished."""
     symmetry: dict[str, Any] | None = None

@@ -220,7 +220,7 @@ class Room:
             try:
                 self._records.delete_job(job_id)
             except (StaleAttemptError, UnreadableRecordError):
-                continue  # it was asked for anew, or is of a later release
+                continue  # it was requested again, or is of a later release
             self._blobs.delete_prefix(f"jobs/{job_id}")
             self._owners.note_evicted(owner, job_id)
             counters.count(self._redis, "jobs_evicted")

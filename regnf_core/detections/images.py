@@ -91,7 +91,7 @@ def is_image_detection(values: Any) -> bool:
 
 
 AnyDetection = Detection | tuple[ImageDetection, ...]
-"""A box in the scene's frame; or one thing in one image, or in several."""
+"""A box in the scene's frame; or one object in one image, or in several."""
 
 
 def read_detection(values: Any, index: int | None = None, folder: Path | None = None) -> AnyDetection:
@@ -134,8 +134,8 @@ def plain_values(detection: AnyDetection) -> Any:
 
 
 def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageDetection, ...]:
-    """The detections of one thing in a document: regnf's own form, COCO's annotations or results, ultralytics' export,
-    BOP's results. index: of a detector's list, which one; None: the only one, of ours all, which are of one thing in
+    """The detections of one object in a document: regnf's own form, COCO's annotations or results, ultralytics' export,
+    BOP's results. index: of a detector's list, which one; None: the only one, of ours all, which are of one object in
     several frames.
 
     Raises InvalidDetectionError.

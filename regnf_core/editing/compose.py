@@ -77,7 +77,7 @@ def _middles(known: Observation, index: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _Planned:
-    """What an edit comes to. removed: the known thing that goes, or a box · placed: what comes."""
+    """What an edit comes to. removed: the known object that goes, or a box · placed: what comes."""
 
     removed: Place | None
     placed: PlacedObject | None
@@ -100,11 +100,11 @@ _POINTS = 12
 _MOST_COMMON = 0.05
 """Share of the smaller of two objects' matter that may lie in the other: things touch, and poses are not exact."""
 _MOST_OF_BOX = 0.5
-"""Share of a thing's matter that may lie in a box that another edit clears."""
+"""Share of an object's matter that may lie in a box that another edit clears."""
 
 
 def _require_apart(edits: Sequence[_Planned]) -> None:
-    """Raises InvalidInputError (EDIT_INVALID): two edits take away the same thing, or put matter in one place."""
+    """Raises InvalidInputError (EDIT_INVALID): two edits take away the same object, or put matter in one place."""
     for (first, one), (second, other) in combinations(enumerate(edits), 2):
         for a, b in ((one.removed, other.removed), (one.placed, other.placed)):
             if a is None or b is None:
@@ -254,7 +254,7 @@ def _planned(edit: Edit, number: int, surfaces: dict[int, OrientedBox]) -> _Plan
 
 
 def _require_in_scene(scene: SdfField, plan: _Planned, number: int) -> None:
-    """Raises InvalidInputError (EDIT_INVALID): nothing of the thing lies within the scene's bounds."""
+    """Raises InvalidInputError (EDIT_INVALID): nothing of the object lies within the scene's bounds."""
     low, high = scene.bounds
     for thing in (plan.removed, plan.placed):
         if thing is None:

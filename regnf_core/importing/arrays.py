@@ -12,7 +12,7 @@ from regnf_core.errors import FieldFormatError
 
 Float32Array = npt.NDArray[np.float32]
 StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.float16] | npt.NDArray[np.int32]
-"""What a safe field holds."""
+"""What a regnf field file holds."""
 
 _FINITE_CHUNK = 1 << 20
 _MAX_ELEMENTS = 1 << 60

@@ -1,4 +1,4 @@
-"""A mesh file as an exact distance field outside of the gate: for files that are the user's own."""
+"""A mesh file as an exact distance field outside of the importer: for files that are the user's own."""
 
 from __future__ import annotations
 

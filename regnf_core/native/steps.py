@@ -68,7 +68,7 @@ _FARTHEST = 1e150
 _FEW = 4096
 """Points below which another thread does not pay."""
 _AT_ONCE = 2048
-"""Points that a compiled model is asked for at once: what is worked out of them stays in a core's own cache."""
+"""Points that a compiled model is requested at once: what is worked out of them stays in a core's own cache."""
 
 
 def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -159,7 +159,7 @@ class NativeModel:
     """A function of points in compiled code, seen through a linear map: factor f(turn x + shift).
 
     ask: a regnf_ask · described: what it is given, with an ``address`` · turn: (9,) · shift: (3,) · checked: whether a
-    value that is not finite is a fault · counted: called with the number of points that it was asked for.
+    value that is not finite is a fault · counted: called with the number of points that it was requested.
     """
 
     ask: Any

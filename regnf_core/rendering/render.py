@@ -24,7 +24,7 @@ from regnf_core.surface.sphere_tracing import Rays, finite_distance
 
 # How far whole bundles of neighboring rays are free: one evaluation of the field for many rays.
 #
-# A ball of radius D round the point at length t of a bundle's middle ray is free of surfaces. All its rays have the
+# A ball of radius D around the point at length t of a bundle's middle ray is free of surfaces. All its rays have the
 # same origin, and at length t none is farther from the middle one than t times the largest chord between their unit
 # directions. So all of them are free up to the length t + D - t chord. Where that is no more worth a step, the bundle
 # is divided into four. (Cone marching: Bastos and Celes 2012 for height fields; Hart 1996 for the balls.)
@@ -154,7 +154,7 @@ def surface_samples(region: Region, rays: Rays, start: Start) -> TileSamples:
 
 
 Part = NDArray[Any]
-"""(P, ...): one thing that is known of the pixels of a tile."""
+"""(P, ...): one object that is known of the pixels of a tile."""
 Progress = Callable[[float], None]
 """Called with the share done, 0..1, after each tile. May raise CancelledError to stop the work."""
 

@@ -100,7 +100,7 @@ class OrbitRequest(Closed):
     """Cameras round one thing. edit: the number of an edit, whose object is looked at · detection: a box instead;
     neither: the first edit, or without edits the scene's bounds · elevation_deg: above the horizon · start_deg,
     sweep_deg: the first camera's turn about the vertical, and how far the last one is turned from it · distance: from
-    the thing's middle, scene units; None: all of it is in view."""
+    the instance's middle, scene units; None: all of it is in view."""
 
     edit: Annotated[int, Ge(0)] | None = None
     detection: Box = None

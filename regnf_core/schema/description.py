@@ -193,7 +193,7 @@ def _similarity(rows: Rows) -> Rows:
 
 @dataclass(frozen=True)
 class Placement(Closed):
-    """How a field lies in its dataset's frame, where it is asked for in that."""
+    """How a field lies in its dataset's frame, where it is requested in that."""
 
     transform: Annotated[Rows, AfterValidator(_similarity)]
     """4 x 4 matrix of a similarity, row by row: takes points of the function's frame, after ``world_scale``, to

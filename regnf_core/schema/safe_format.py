@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# What a safe field file says about its tensors: which function they parametrize, and which shapes they must have.
+# What a regnf field file says about its tensors: which function they parametrize, and which shapes they must have.
 #
-# Torch-free: the import gate writes descriptions and the worker's parent reads them without loading torch.
+# Torch-free: the importer writes descriptions and the worker's parent reads them without loading torch.
 
 _MAX_DEPTH = 32
 

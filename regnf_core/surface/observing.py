@@ -90,7 +90,7 @@ _MOST_CAMERAS, _RAYS_EACH = 128, 400
 _MARGIN = 1.0
 """Voxels before a surface that may be matter as well."""
 _CLOSE = 0.5
-"""Voxels behind the least depth of the rays round it at which a point is seen all the same."""
+"""Voxels behind the least depth of the rays around it at which a point is seen all the same."""
 _TRIES = 4
 """Cameras that a single point is looked for from."""
 _SEEING = 0.02
@@ -221,7 +221,7 @@ def _share_meeting(images: list[TracedDepths]) -> float:
 
 
 def _looked_through(points: Tensor, cameras: PinholeCameras, images: list[TracedDepths], margin: float) -> Tensor:
-    """(N,) bool: which points (N, 3) a camera looked through, before all of the rays round them by ``margin``."""
+    """(N,) bool: which points (N, 3) a camera looked through, before all of the rays around them by ``margin``."""
     through = torch.zeros(len(points), dtype=torch.bool)
     left = torch.arange(len(points))
     for camera, image in enumerate(images):

@@ -209,9 +209,9 @@ _BUDGET_S = 5.0
 
 
 def field_views(path: Path) -> FieldViews:
-    """Draw the safe field in the file ``path``. What cannot be drawn in good time is left out.
+    """Draw the regnf field file in the file ``path``. What cannot be drawn in good time is left out.
 
-    Raises FieldFormatError for a file that is no safe field.
+    Raises FieldFormatError for a file that is no regnf field file.
     """
     field, up_axis = open_field(path), read_description(path)["up_axis"]
     fine = coarse = None

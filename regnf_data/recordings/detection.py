@@ -121,7 +121,7 @@ def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
 # Lifting.
 
 _FEWEST = 30
-"""Measured pixels of a thing, at least."""
+"""Measured pixels of an object, at least."""
 _JUMP = 0.015
 """A share of the depth: neighbors that differ by more lie on different surfaces."""
 _AROUND, _EDGE = 0.5, 8
@@ -134,7 +134,7 @@ _PLANE_SHARE = 0.15
 _WHOLE, _MOSTLY = 0.9, 0.5
 """Shares of a surface within the detection: it ends there; it belongs to what is detected."""
 _LONGER = 1.2
-"""Diameters of the thing: a surface that is longer is not its own."""
+"""Diameters of the object: a surface that is longer is not its own."""
 _BEHIND = 0.2
 """Of what is in the middle of a detection, behind a plane of its background, at most."""
 _TRIMMED = 0.01
@@ -144,8 +144,8 @@ _LOOSE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """box: around the thing, in the world · points: (P, 3), of its surface, world · pixels: (H, W) of the depth image,
-    those of the thing · frame: in which."""
+    """box: around the object, in the world · points: (P, 3), of its surface, world · pixels: (H, W) of the depth image,
+    those of the object · frame: in which."""
 
     box: OrientedBox
     points: Array
@@ -156,8 +156,8 @@ class Lifted:
 @dataclass(frozen=True, eq=False)
 class _Part:
     """Of an image, around a detection, (h, w) pixels. depth: 0 for none · points: (h, w, 3), camera frame · inside:
-    what is detected · seed: the pixel (row, column) that it points at · clicked: whether that one is the thing's ·
-    diameter: the thing's, m."""
+    what is detected · seed: the pixel (row, column) that it points at · clicked: whether that one is the object's ·
+    diameter: the object's, m."""
 
     depth: NDArray[np.float32]
     points: Array
@@ -168,12 +168,12 @@ class _Part:
 
 
 def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None) -> Lifted:
-    """The thing of a detection, in space. diameter: of the known object, m, where its size is known.
+    """The instance of a detection, in space. diameter: of the known object, m, where its size is known.
 
     The depth in a mask, in a box or around a point falls into connected surfaces, without the planes that go on around
-    it (a table, a wall). The thing is the surface that fills most of the detection and does not go on beyond it: where
-    it ends a few pixels beyond an outline, the outline is taken to be off. Its box has the camera's axes; behind, it
-    reaches as far as the thing is wide, since its back was not seen.
+    it (a table, a wall). The instance is the surface that fills most of the detection and does not go on beyond it:
+    where it ends a few pixels beyond an outline, the outline is taken to be off. Its box has the camera's axes; behind,
+    it reaches as far as the instance is wide, since its back was not seen.
     Raises InvalidDetectionError, naming the frame, for detections without depth or of another size than the image.
     """
     region, seed = _region(frame, detection)
@@ -182,7 +182,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         raise _without_depth(frame, f"{int(measured.sum())} of {int(region.sum())} pixels of the detection")
     clicked = detection.point_2d is not None
     if clicked and seed is not None and diameter is not None:
-        # Nothing of a thing that was clicked on is farther from the click than its diameter.
+        # Nothing of an object that was clicked on is farther from the click than its diameter.
         here = _points(frame, measured)
         rows, columns = np.nonzero(measured)
         middle = here[np.hypot(rows - seed[0], columns - seed[1]).argmin()]
@@ -198,7 +198,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
     pixels[window] = _thing(_Part(frame.depth[window], points, region[window], moved, clicked, diameter or np.inf))
     camera_points = points[pixels[window]]
     if diameter is not None and len(camera_points):
-        # Nothing of the thing is farther from its middle than its diameter.
+        # Nothing of the object is farther from its middle than its diameter.
         near = np.linalg.norm(camera_points - np.median(camera_points, axis=0), axis=1) <= diameter
         pixels[pixels] = near
         camera_points = camera_points[near]
@@ -279,7 +279,7 @@ def _window(region: Mask) -> tuple[slice, slice]:
 
 
 def _thing(part: _Part) -> Mask:
-    """(h, w): the pixels of the thing."""
+    """(h, w): the pixels of the object."""
     measured = part.depth > 0.0
     kept = measured & ~_background(part)
     if (kept & part.inside).sum() < _FEWEST:
@@ -298,7 +298,7 @@ def _thing(part: _Part) -> Mask:
     total, held = (np.bincount(labels, each, minlength=count) for each in (None, inside))
     share = held / np.maximum(total, 1)
     best = int((np.bincount(labels, weight, minlength=count) * share**2).argmax())
-    # Something thin before it may part the thing: pieces at its depth belong to it.
+    # Something thin before it may part the object: pieces at its depth belong to it.
     depths = part.depth[kept]
     low, high = np.quantile(depths[labels == best], [0.05, 0.95])
     reach = max(high - low, _JUMP * high)
@@ -362,7 +362,7 @@ def _extent(points: Array) -> float:
 
 
 def _middle(part: _Part, own: Mask) -> Mask:
-    """Of the measured pixels ``own`` of a detection, those that are surely the thing's, or nearly so."""
+    """Of the measured pixels ``own`` of a detection, those that are surely the object's, or nearly so."""
     if part.seed is None:
         core = own & (ndimage.distance_transform_edt(part.inside) > _EDGE)
         return core if core.sum() >= _FEWEST else own

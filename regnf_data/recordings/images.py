@@ -37,7 +37,7 @@ def images_of(
     most: int = MOST_FRAMES,
     progress: Callable[[int, int], None] | None = None,
 ) -> TakenImages:
-    """The images at ``path``. A folder of sdfstudio is taken whole, with its masks, things and bounds.
+    """The images at ``path``. A folder of sdfstudio is taken whole, with its masks, objects and bounds.
 
     bounds: (2, 3), world; None: round what the depths show · most: frames; fewer where they are large.
     Raises DatasetError.

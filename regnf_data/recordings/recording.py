@@ -38,7 +38,7 @@ class Frame:
 
     depth: (H, W) float32, meters along the camera's axis, 0 where nothing was measured · camera: of the depth image ·
     T_world_camera: (4, 4), OpenCV's axes · color: (H', W', 3) uint8 as it was taken, by ``color_camera`` from the same
-    place · mask: (H', W') of the same size as the color, or as the depth without color: true on the thing.
+    place · mask: (H', W') of the same size as the color, or as the depth without color: true on the object.
     """
 
     name: str
@@ -130,7 +130,7 @@ class Recording:
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
     T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is
-    the meter, as far as files can tell · terms: what the layout's files call things.
+    the meter, as far as files can tell · terms: what the layout's files call objects.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """A recording in one file of plain arrays: what a service keeps, and what is sent to it. No image is decoded from it.
 
 A safetensors file. depth: (N, H, W) int16, steps of ``depth_unit``, (N, 1) float64, meters along the camera's axis, 0
-where nothing was measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4, 4) float64, OpenCV's
+where nothing was measured · K: (N, 3, 3) float64, pixel centers at + 0.5 · T_world_camera: (N, 4, 4) float64, OpenCV's
 axes · color: (N, H', W', 3) uint8 and color_K: (N, 3, 3), where the frames have colors. Its metadata: an entry
 ``recording``, JSON.
 """

@@ -126,7 +126,7 @@ def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:
 def _lifted(
     recording: Recording, detections: Sequence[ImageDetection], said: Unit, object_bounds: Floats | None
 ) -> tuple[list[Lifted], Unit, float | None]:
-    """The things of the detections, the object's unit, and its diameter in the world where that is known."""
+    """The instances of the detections, the object's unit, and its diameter in the world where that is known."""
     frames = [recording.frames[recording.index(one.frame)].read() for one in detections]
     pairs = list(zip(frames, detections, strict=True))
     shown: list[Lifted] = []
@@ -141,7 +141,7 @@ def _lifted(
 
 
 def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
-    """Of the things that detections of frames show, those that meet most others in space: they are one.
+    """Of the objects that detections of frames show, those that meet most others in space: they are one.
 
     Raises InvalidDetectionError, naming the frames, where none of several meets another.
     """
@@ -161,8 +161,8 @@ def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
 
 
 def _common(shown: Sequence[Lifted], diameter: float | None) -> OrientedBox:
-    """The box of the axes of the first one round what several frames show of one thing; behind, seen from the first,
-    it reaches as far as the thing is wide."""
+    """The box of the axes of the first one round what several frames show of one object; behind, seen from the first,
+    it reaches as far as the object is wide."""
     box = shown[0].box
     axes = box.rotation.numpy()
     local = np.concatenate([one.points for one in shown]) @ axes

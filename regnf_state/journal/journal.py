@@ -77,7 +77,7 @@ class Journal:
             self._write(job, "accepted")
 
     def _forget_before(self, job: JobRecord) -> None:
-        """Drop what is said of attempts before this one: a job that is asked for again and again must not grow."""
+        """Drop what is said of attempts before this one: a job that is requested again and again must not grow."""
         for key in list(self._blobs.list(_folder(job.id))) if job.attempt > 1 else ():
             if int(key.rpartition("/")[2].partition("-")[0]) < job.attempt:
                 self._blobs.delete(key)

@@ -198,7 +198,7 @@ class FairQueue:
         self._script = redis.register_script(_SCRIPT)
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
-        """One step. Where the keys are damaged the queue begins anew, and the reaper queues what waited."""
+        """One step. Where the keys are damaged the queue begins again, and the reaper queues what waited."""
         return self._mended(lambda: int(self._run(self._redis, step, name, *arguments)))
 
     def _run(self, client: Redis, step: str, name: str, *arguments: Any) -> Any:

@@ -131,7 +131,7 @@ def entering(before: JobRecord | None, after: JobRecord, expires: float) -> list
 
 
 def forgetting(record: JobRecord) -> list[Command]:
-    """What drops the messages of a job that is deleted or started anew."""
+    """What drops the messages of a job that is deleted or started again."""
     commands: list[Command] = []
     for place in range(len(record.webhooks)):
         message = Message.about(record, place)

@@ -1,4 +1,4 @@
-"""How many things of a kind may go on at once in this process: of each caller, and of all together."""
+"""How many objects of a kind may go on at once in this process: of each caller, and of all together."""
 
 from __future__ import annotations
 

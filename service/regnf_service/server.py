@@ -87,7 +87,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await in_thread(_check_storage, services)
-        contract = asyncio.create_task(in_thread(app.openapi))  # takes a while, so not when it is asked for
+        contract = asyncio.create_task(in_thread(app.openapi))  # takes a while, so not when it is requested
         reaping = asyncio.create_task(_reap(services))
         delivering = asyncio.create_task(deliver_until_stopped(services.webhooks, services.records, services.stopping))
         with served(metrics.registry, services.settings.metrics_address), stopping_on_signals(services.stopping):

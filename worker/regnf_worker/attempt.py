@@ -176,7 +176,7 @@ class Fields:
         return fields
 
     def file(self, sha256: str) -> Path:
-        """The safe field file of a field that is ready."""
+        """The regnf field file of a field that is ready."""
         return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
 
     def _checked(self, field: FieldRecord | None, name: str) -> FieldRecord:
@@ -242,7 +242,7 @@ logger = logging.getLogger(__name__)
 def run_attempt(context: Context, job_id: str, attempt: int, worker: str, make_engine: Callable[[], Engine]) -> None:
     """Claim the attempt, do its work with the engine, write down how it ended.
 
-    Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Writes that Redis
+    Does nothing when the attempt is not to be had: claimed already, canceled, or an older one. Writes that Redis
     refuses for a while are waited for, until the job's time is over. Raises RedisError, StorageUnavailableError and
     OSError when the end cannot be written down, or a volume is away; the worker's parent process then sees to it.
     """

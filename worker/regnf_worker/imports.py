@@ -1,4 +1,4 @@
-"""One attempt at importing an upload: a safe field and a report, or a reason why not."""
+"""One attempt at importing an upload: a regnf field file and a report, or a reason why not."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _beside(context: Context, field: FieldRecord, came: SettingsFile | None) -> 
 
 
 def _require_current(context: Context, field: FieldRecord) -> None:
-    """Somebody may have deleted the field, and uploaded it anew: what lies there now is no longer ours to touch."""
+    """Somebody may have deleted the field, and uploaded it again: what lies there now is no longer ours to touch."""
     now = context.records.get_field(field.sha256)
     if now is None or now.attempt != field.attempt or now.state != "validating":
         raise StaleAttemptError("the field was deleted, or is imported again")

@@ -124,7 +124,7 @@ logger = logging.getLogger(__name__)
 
 def run_worker(settings: Settings) -> None:
     """Work until told to stop (SIGTERM, SIGINT). It is a program's last call: it lowers the process's priority, and may
-    begin the program anew.
+    begin the program again.
 
     Raises NoRedisError when no Redis is configured, redis' ConnectionError or TimeoutError when it does not answer,
     PreloadError, StorageMismatchError.
@@ -146,7 +146,7 @@ def run_worker(settings: Settings) -> None:
 
 
 def _preload(environment: MutableMapping[str, str]) -> None:
-    """Load the engine. Where that starts threads, begin this process anew without it, unless somebody asked for it.
+    """Load the engine. Where that starts threads, begin this process again without it, unless somebody requested it.
 
     What is loaded cannot be unloaded. Raises PreloadError.
     """

@@ -109,7 +109,7 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
 
 
 def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: ChildExit) -> None:
-    """The same for an import: one that was given back, killed, or ended by itself starts anew; others are rejected."""
+    """The same for an import: one that was given back, killed, or ended by itself starts again; others are rejected."""
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
         return

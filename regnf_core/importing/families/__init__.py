@@ -1,4 +1,4 @@
-"""The families of checkpoints that the gate recognizes: one module a family, listed in ``FAMILIES``."""
+"""The families of checkpoints that the importer recognizes: one module a family, listed in ``FAMILIES``."""
 
 from __future__ import annotations
 

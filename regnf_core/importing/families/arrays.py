@@ -1,4 +1,4 @@
-"""The families of .npz files that the gate recognizes: one module a family, listed in ``ARRAY_FAMILIES``."""
+"""The families of .npz files that the importer recognizes: one module a family, listed in ``ARRAY_FAMILIES``."""
 
 from __future__ import annotations
 

@@ -75,8 +75,8 @@ class ConvertedField:
     tensors: Mapping[str, StoredArray]
     warnings: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
-    """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
-    one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
+    """Where shapes leave the function open: every possible one, the most usual first. The importer tries them and keeps
+    the one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
     assumed: Assumed | None = None
     untold: tuple[Variant, ...] = ()
     """Functions between which no behavior decides: a person is asked, once the readings are settled."""
@@ -99,7 +99,7 @@ class OpenCandidate:
 
 
 class AmbiguousError(FieldFormatError):
-    """The evidence leaves several functions; ``asked`` holds those that are shown, the likeliest first."""
+    """The evidence leaves several functions; ``asked`` holds those that are shown, the most probable first."""
 
     reason = "LAYOUT_AMBIGUOUS"
 

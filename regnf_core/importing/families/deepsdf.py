@@ -150,7 +150,7 @@ def at_code(layers: Layers, latent: Float32Array, whole: tuple[int, ...]) -> Lay
     return Layers(tuple(weights), tuple(biases))
 
 
-# DeepSDF as widespread later code writes it: blocks ``net.*.0`` of a layer and ReLU, ``final_layer.0`` and one tanh.
+# DeepSDF as widespread later code writes it: blocks ``net.*0.0`` of a layer and ReLU, ``final_layer.0`` and one tanh.
 #
 # A narrower ``skip_layer.0``, behind which the network sees its input again, is in the file even where it is not used,
 # and nothing says behind which block it is: if several places fit, it is asked.

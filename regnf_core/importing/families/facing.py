@@ -1,7 +1,7 @@
 """On which side of a mesh's faces space is free: outside an object, inside a room that was scanned from within.
 
 Across a face the generalized winding number (Jacobson et al. 2013) rises by one from front to back, whatever else of
-the surface is missing. So its values just before the faces tell what free space has: 0 round a closed object, -1 in a
+the surface is missing. So its values just before the faces tell what free space has: 0 around a closed object, -1 in a
 closed room whose faces look inward, in between where parts are missing. Halfway to the values just behind is the level
 that parts free space from matter.
 """
@@ -63,9 +63,9 @@ def _crossed(vertices: Float64Array, faces: Int64Array) -> Float64Array:
 
 
 SAMPLES = 2_000
-"""Places on the faces, and as many in the volume, where the winding number is asked for."""
+"""Places on the faces, and as many in the volume, where the winding number is requested."""
 _CLOSED = 0.1
-"""Free space this near to 0 counts as that round a closed mesh."""
+"""Free space this near to 0 counts as that around a closed mesh."""
 INWARD = -0.6
 """Below this, most faces look into a hollow: sheets that are open on one side have -0.5."""
 _FILLED, _WITHIN = 0.45, 0.05

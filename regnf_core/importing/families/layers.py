@@ -39,7 +39,7 @@ _SHARED = frozenset(
 
 
 def shared_entries(overrides: UploadDescription, bounds: Sequence[Sequence[float]]) -> dict[str, Any]:
-    """The entries of a safe field's description that all kinds share.
+    """The entries of a regnf field file's description that all kinds share.
 
     bounds: lowest and highest corner in the coordinates of the checkpoint's function. What ``overrides`` says goes
     before.
@@ -122,7 +122,7 @@ class Layers:
         )
 
     def tensors(self) -> dict[str, Float32Array]:
-        """The layers under the names of the safe field file."""
+        """The layers under the names of the regnf field file."""
         named = {f"layers.{i}.weight": weight for i, weight in enumerate(self.weights)}
         return named | {f"layers.{i}.bias": bias for i, bias in enumerate(self.biases)}
 

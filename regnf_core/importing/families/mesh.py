@@ -65,7 +65,7 @@ _APART = 0.7
 _BORDERS, _WRONG_EDGES, _BOTH_WAYS = 0.01, 0.2, 0.5
 """Shares of the points, of those at edges and of the points. Chosen on the same clouds as measured on: 22 shapes,
 1,000 and 30,000 points, noise of 0, 0.3 and 1 spacings. At edges whole clouds reached 0.17. Refused in vain were 1,000
-points of a sheet of 0.5 mm and of 200 blades; patches on thin things with few points are often missed."""
+points of a sheet of 0.5 mm and of 200 blades; patches on thin objects with few points are often missed."""
 _FEWEST, _ALL, _FEWEST_EDGES = 3, 0.9, 50
 """A point at an edge has so many neighbors across it; so many of them agree; so many such points are enough."""
 _NO_THICKNESS = 0.01
@@ -227,7 +227,7 @@ def _some(points: Float64Array) -> Float64Array:
 
 def _poisson(points: Float64Array, normals: Float64Array, depth: int) -> tuple[Float64Array, Int64Array]:
     """The closed surface (V, 3), (F, 3) through the points, faces outward."""
-    mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the gate's process may not
+    mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the importer's process may not
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

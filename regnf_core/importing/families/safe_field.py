@@ -1,4 +1,4 @@
-"""regnf's own safe field file, uploaded again: checked like anything else, then written anew."""
+"""regnf's own regnf field file, uploaded again: checked like anything else, then written again."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, override
         description = {name: value for name, value in description.items() if name != COLOR}
         tensors = split_color(tensors)[0]
     source = dict(description["source"])
-    warnings = kept_warnings(source.pop(WARNINGS, None))  # the import writes them anew
+    warnings = kept_warnings(source.pop(WARNINGS, None))  # the import writes them again
     return ConvertedField(FAMILY, why, description | {"source": source}, tensors, warnings)
 
 

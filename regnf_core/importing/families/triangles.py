@@ -41,7 +41,7 @@ BoolArray = npt.NDArray[np.bool_]
 _MOST = 300
 """Parts that are looked at, the largest ones."""
 _PLACES = 9
-"""On each of them, where the winding number is asked for."""
+"""On each of them, where the winding number is requested."""
 _CLOSED = -0.9
 """A part is closed, or nearly so, and looks into itself, if the median winding number of its own faces, at the places
 before them, is below this."""
@@ -50,7 +50,7 @@ _FEW = 0.002
 _ROUNDS = 2
 """A part within another is told only when the other one is right."""
 PLACES = _MOST * _PLACES * (2 * _ROUNDS + 1)
-"""At most so many winding numbers are asked for."""
+"""At most so many winding numbers are requested."""
 
 
 def facing_outward(vertices: Float64Array, faces: Int64Array, free: float) -> tuple[Int64Array, tuple[str, ...]]:

@@ -52,7 +52,7 @@ _KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 def settled(converted: ConvertedField, share: int = 1) -> ConvertedField:
     """``converted`` as the one function that its weights speak for, with what was decided, and by what, in ``why``.
 
-    share: after the first round the readings are tried at one ``share``-th of the points.
+    share: after the first around the readings are tried at one ``share``-th of the points.
 
     Raises AmbiguousError: readings that differ fit alike.
     """

@@ -65,7 +65,8 @@ def convert_file(
     picture: bool = False,
     beside: Companions | None = None,
 ) -> dict[str, Any]:
-    """Convert ``upload``, write the safe field, evaluate it once, draw it if asked to. Returns the report's values.
+    """Convert ``upload``, write the regnf field file, evaluate it once, draw it if asked to. Returns the report's
+    values.
 
     beside: what came with it, each the name and the path of one file or of an archive of files. Confines nothing: the
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
@@ -82,7 +83,7 @@ def convert_file(
     )
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
-    # Of warnings with the same word the last: a safe field brings those of its first import.
+    # Of warnings with the same word the last: a regnf field file brings those of its first import.
     latest = {warning.partition(":")[0]: warning for warning in (*warnings, *more)}
     warned = list(kept_warnings(list(latest.values())))
     add_to_source(target, {WARNINGS: warned} if warned else {})
@@ -93,7 +94,7 @@ def convert_file(
 def _stored(
     read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool
 ) -> tuple[dict[str, Any], Sequence[str], int | None, bool, str | None]:
-    """Write the safe field of what was read to ``target``. cameras: whether they came with it.
+    """Write the regnf field file of what was read to ``target``. cameras: whether they came with it.
 
     Returns values of the report, warnings, the sign where nobody has said it, whether the values will tell it, and the
     up axis. Raises FieldFormatError.
@@ -127,7 +128,7 @@ def _stored(
         "parameters": sum(array.size for name, array in own.items() if name not in _SEEN),
         "label": said["label"],
     }
-    # A mesh's faces say it, and a safe field was imported before.
+    # A mesh's faces say it, and a regnf field file was imported before.
     known = (
         read.description.sign or read.description.as_ or said["kind"] == "mesh" or converted.family == safe_field.FAMILY
     )

@@ -64,7 +64,7 @@ def _candidate(value: Any, folder: Path, number: int) -> Candidate | None:
 __all__ = ["FIELD_NAME", "ImportLimits", "ImportReport", "import_field"]
 
 FIELD_NAME = "field.safetensors"
-"""The name of the safe field file in the output folder."""
+"""The name of the regnf field file in the output folder."""
 
 _ROOT = Path(__file__).resolve().parents[3]
 _ENTRY = """

@@ -35,9 +35,9 @@ _ASKED = 1 << 14
 
 
 def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, required: bool) -> ConvertedField:
-    """The field with an observation, if anything tells. required: the caller has asked for that of the cameras.
+    """The field with an observation, if anything tells. required: the caller has requested that of the cameras.
 
-    An observation in the file stays, unless cameras were asked for: it was made of the images, which know most, or as
+    An observation in the file stays, unless cameras were requested: it was made of the images, which know most, or as
     here. A map's own weights go before cameras: they know of depths that were missing, through which lines of sight
     would pass. Cameras found beside the file come last, if they can be used. Raises FieldFormatError as
     ``observed_by_cameras`` does, if ``required``.

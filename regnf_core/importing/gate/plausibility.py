@@ -15,18 +15,19 @@ from regnf_core.fields.observation import SdfField
 from regnf_core.importing.cost.mesh_work import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
 from regnf_core.surface.result_clouds import newton_step
 
-# How the surface lies in a field's bounds: what tells a room from a thing turned inside out, and from no thing at
+# How the surface lies in a field's bounds: what tells a room from an object turned inside out, and from no object at
 # all.
 #
-# A thing stands in free space. A room's free space is enclosed, and fills most of what its surface encloses; that of
-# a thing turned inside out is the thing itself, which fills little of its own convex hull.
+# An object stands in free space. A room's free space is enclosed, and fills most of what its surface encloses; that of
+# an object turned inside out is the object itself, which fills little of its own convex hull.
 
 _RIM = 0.05
 """This share of each edge of the bounds, at either end, is their rim."""
 _ALL_ROUND = 0.95
 """More than this share of the bounds' faces inside matter: free space is enclosed."""
 _FILLED = 0.4
-"""Free space that fills less of its surface's convex hull is a thing's; of furnished rooms it fills three quarters."""
+"""Free space that fills less of its surface's convex hull is an object's; of furnished rooms it fills three
+quarters."""
 _MOSTLY = 0.9
 """More of the bounds inside matter leaves too little free space for a room."""
 _TOUCHED = 0.02

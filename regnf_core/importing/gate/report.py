@@ -124,7 +124,7 @@ class ImportReport:
 def placed(converted: ConvertedField, description: UploadDescription) -> ConvertedField:
     """``converted`` in the frame that the description asks for, and in ``why`` whether the dataset's is known.
 
-    Raises FieldFormatError (INVALID_DESCRIPTION) where the dataset's frame is asked for and not known.
+    Raises FieldFormatError (INVALID_DESCRIPTION) where the dataset's frame is requested and not known.
     """
     rows = description.dataset_transform
     if rows is None:

@@ -97,7 +97,7 @@ def strips(order: npt.NDArray[Any]) -> Int64Array:
 
 
 def fan(order: npt.NDArray[Any]) -> Int64Array:
-    """(N - 2, 3) triangles of corners (N,) round the first of them."""
+    """(N - 2, 3) triangles of corners (N,) around the first of them."""
     corners = np.asarray(order, dtype=np.int64)
     return fans(corners[None]) if len(corners) >= 3 else np.zeros((0, 3), np.int64)
 

@@ -1,4 +1,4 @@
-"""A training run on the user's own disk: its checkpoint, and the settings beside it, packed for the import gate.
+"""A training run on the user's own disk: its checkpoint, and the settings beside it, packed for the importer.
 
 Nothing is parsed here. Names decide, as in an archive; links that lead out of the run's folder are not followed.
 """
@@ -49,7 +49,7 @@ def find_run(folder: Path) -> Run:
 
 
 def settings_beside(checkpoint: Path) -> tuple[Path, ...]:
-    """The settings that a checkpoint's trainer leaves round it; only their own few folders are looked into."""
+    """The settings that a checkpoint's trainer leaves around it; only their own few folders are looked into."""
     path = checkpoint.resolve(strict=True)
     places = _places_of(path)
     top = places[-1]

@@ -39,7 +39,7 @@ _OTHER_FILES = re.compile(
 )
 _NUMBER = re.compile(r"\d+")
 _OF_TRAINING = re.compile(r"ckpt|checkpoint|model|epoch|step|iter|(?<![a-z])ep(?=[^a-z]*\d)", re.IGNORECASE)
-"""In a name or its folder's: the numbers are steps of a training, and not which of several things it is."""
+"""In a name or its folder's: the numbers are steps of a training, and not which of several objects it is."""
 _STEP_WORD = re.compile(r"(?<![a-z])(epochs?|ep|steps?|iterations?|iters?|it)(?=[^a-z]*#)", re.IGNORECASE)
 _STANDING = {"best": 1, "current": 3, "last": 4, "latest": 4, "final": 5}
 """Words in place of a number: where they stand beside numbered files, which have 2."""
@@ -123,7 +123,7 @@ class ZipRun:
         return {m.name: m.content(self._data, lambda pieces, size: kept(pieces, size, folder)) for m in wanted}
 
 
-# Which files of a run are its trainer's settings: known names at known places round the checkpoint, nearest first.
+# Which files of a run are its trainer's settings: known names at known places around the checkpoint, nearest first.
 
 _LEVELS = 4
 """How many folders above the checkpoint's own may be the run's."""
@@ -261,7 +261,7 @@ def _opened(data: memoryview, most: int) -> tuple[ZipRun | TarRun | None, list[M
 
 
 def _is_run(members: list[Member], kind: str) -> bool:
-    """Whether a zip whose first member's name would fit a checkpoint or arrays holds other things too."""
+    """Whether a zip whose first member's name would fit a checkpoint or arrays holds other objects too."""
     names = [member.name for member in members]
     if kind == "npz":
         return any("/" in name or not name.endswith(".npy") for name in names)

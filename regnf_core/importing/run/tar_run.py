@@ -145,7 +145,7 @@ class _Forward:
         return self._at
 
     def seek(self, position: int) -> None:
-        """Go over what nobody asked for."""
+        """Go over what nobody requested."""
         if position < self._at:
             raise archive_error("a header's number is malformed")
         for _ in self.pieces(position - self._at):

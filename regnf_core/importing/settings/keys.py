@@ -1,4 +1,4 @@
-"""The keys of one settings file, asked for by path and by type. What nobody asks for is never looked at."""
+"""The keys of one settings file, requested by path and by type. What nobody asks for is never looked at."""
 
 from __future__ import annotations
 

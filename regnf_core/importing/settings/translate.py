@@ -22,7 +22,7 @@ from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.library_entries import shown_path
 
-# One shape's latent code out of a file of codes beside the settings, through the gate's own reader of pickles.
+# One shape's latent code out of a file of codes beside the settings, through the importer's own reader of pickles.
 
 _MAX_CODE = 512
 

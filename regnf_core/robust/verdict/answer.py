@@ -94,8 +94,8 @@ def _alike(symmetry: SelfSymmetry) -> Sim3:
 # equal. The functions are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).
 # The second sum has several models: one for scenes of which it is known what was seen, one for the others. What a
 # feature tells depends on that: a field has surface that nobody saw, and only an observation says which it is. Where a
-# detection in an image says which surface is the thing's, it has a third one: nothing else is sampled, one side of the
-# thing was seen, and depths of one image are noisier than a map.
+# detection in an image says which surface is the instance's, it has a third one: nothing else is sampled, one side of
+# the thing was seen, and depths of one image are noisier than a map.
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
@@ -175,7 +175,7 @@ class PoseOdds:
 @cache
 def pose_odds(observed: bool, of_thing: bool = False) -> PoseOdds:
     """The models that are shipped. observed: whether it is known what was seen of the scene · of_thing: whether a
-    detection said which surface is the thing's."""
+    detection said which surface is the object's."""
     models = _stored()
     among = models["thing" if of_thing else "observed" if observed else "unobserved"]
     return PoseOdds(models["alone"], among, None if observed else models["observed"])

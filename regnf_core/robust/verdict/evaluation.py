@@ -24,7 +24,8 @@ from regnf_core.robust.verdict.evidence import HeldOut, gather_evidence, pose_fe
 
 # The verdict on an answer: one gate, its probability (`verdict/answer.py`), which holds all the evidence together. The
 # option ``acceptance`` names the least one, or ``min_probability`` gives it. The reason of a rejection is the first
-# share that is not usual. Beside the gate, a pose must stand within the detection: elsewhere, nothing was asked for.
+# share that is not usual. Beside the importer, a pose must stand within the detection: elsewhere, nothing was
+# requested.
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ _MOST = 6
 def considered_poses(
     problem: RegistrationProblem, candidates: PoseCandidates, held_out: HeldOut, answer: Answer, options: RobustOptions
 ) -> Considered:
-    """The best of the candidates that differ, the likeliest first."""
+    """The best of the candidates that differ, the most probable first."""
     points = problem.model.extremal_points
     ranked = distinct(candidates.T, answer.demerits, points, VERDICT.rivals_min_distance, len(candidates))
     chosen = ranked[:_MOST]
@@ -209,7 +210,7 @@ class Evaluation:
 def evaluate_candidates(
     problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions, known: HeldOut | None = None
 ) -> Evaluation:
-    """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
+    """Choose the most probable candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
 
     known: what they told before of the first of the candidates. The fields are evaluated on the problem's device; what
     follows is decided on the CPU.

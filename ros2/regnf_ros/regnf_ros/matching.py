@@ -18,7 +18,7 @@ MOST_BYTES = 128 << 20
 MOST_WAITING = 16
 """Arrays of detections that wait for a depth image."""
 BACK_NS = 1_000_000_000
-"""A stamp that lies so much before the last one begins anew: a recording was started again."""
+"""A stamp that lies so much before the last one begins again: a recording was started again."""
 
 
 @dataclass(frozen=True, eq=False)

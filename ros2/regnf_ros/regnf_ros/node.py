@@ -193,7 +193,7 @@ class RegisterObjects(Node):
         return box.moved(self.to_map(header))
 
     def camera_in_map(self, header: Any) -> Matrix | None:
-        """T_map_camera; None where no map is asked for, or tf does not know it: the camera's frame is the world then.
+        """T_map_camera; None where no map is requested, or tf does not know it: the camera's frame is the world then.
 
         Raises TransformException where tf knows it, but not at the time of the image.
         """
@@ -255,7 +255,7 @@ class RegisterObjects(Node):
 
 
 def best_class(detection: Detection3D) -> str | None:
-    """The class of the likeliest hypothesis; None where there is none."""
+    """The class of the most probable hypothesis; None where there is none."""
     hypotheses = [one.hypothesis for one in detection.results]
     return max(hypotheses, key=lambda one: one.score).class_id if hypotheses else None
 

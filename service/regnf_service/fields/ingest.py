@@ -131,7 +131,7 @@ def check_workers(services: Services, caller: str) -> None:
 
 @dataclass(frozen=True)
 class StoredUpload:
-    """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried anew."""
+    """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried again."""
 
     record: FieldRecord
     created: bool

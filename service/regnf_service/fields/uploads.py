@@ -57,7 +57,7 @@ class Upload:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        # also when the request is cancelled: what was written must go
+        # also when the request is canceled: what was written must go
         with anyio.CancelScope(shield=True):
             if self._writer is not None:
                 await UPLOADS.run(self._opened.close)

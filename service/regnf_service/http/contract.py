@@ -90,7 +90,7 @@ def _mend(operation: dict[str, Any]) -> None:
 
 
 def _say_who_may_call(path: str, operation: dict[str, Any]) -> None:
-    """401 wherever a token is asked for where some are configured; the other addresses need none."""
+    """401 wherever a token is requested where some are configured; the other addresses need none."""
     if OPEN_PATHS.fullmatch(path.replace("{id}", "id")):
         operation["security"] = [{}]
         return

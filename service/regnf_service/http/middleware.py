@@ -220,7 +220,7 @@ class RequestGate:
     and the answers to a caller that leaves very many unread. What is answered is sent in blocks: the server takes the
     next one when its client has read enough, so a connection holds no more than a block or two.
 
-    Where no token is asked for, an address counts as a caller. The slots are not for what needs no token elsewhere.
+    Where no token is requested, an address counts as a caller. The slots are not for what needs no token elsewhere.
     """
 
     def __init__(self, app: ASGIApp, slots: Slots) -> None:

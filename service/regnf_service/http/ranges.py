@@ -90,7 +90,7 @@ IfRangeHeader = Annotated[str | None, Header(description="The ETag of the file t
 
 
 def parse_range(header: str | None, size: int) -> range | None:
-    """The places of the bytes asked for, None for all: no header, a malformed one, or more ranges than one.
+    """The places of the bytes requested, None for all: no header, a malformed one, or more ranges than one.
 
     Raises Problem RANGE_NOT_SATISFIABLE.
     """

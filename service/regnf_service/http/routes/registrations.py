@@ -93,7 +93,7 @@ JOB_REFUSALS = (
 
 @dataclass(frozen=True)
 class Asking:
-    """How a job is asked for, beside what it is to do."""
+    """How a job is requested, beside what it is to do."""
 
     dry_run: bool
     prefer: str | None
@@ -199,7 +199,7 @@ async def register(
 
 
 async def _read(request: Request, services: Services, caller: str, keep: bool) -> RegistrationRequest:
-    """What is asked for, checked; files that come along are kept if ``keep``."""
+    """What is requested, checked; files that come along are kept if ``keep``."""
     match body.media_type(request):
         case "application/json":
             return await _by_reference(request, services, caller)

@@ -144,14 +144,14 @@ class InImage(_Labeled):
 
 
 MOST_IMAGES = 32
-"""Detections of one thing, each in an image of its own."""
+"""Detections of one object, each in an image of its own."""
 _MOST_NAME = 200
 _PNG = "iVBORw0KGgo"
 """How one begins as base64."""
 
 
 def read_images(value: Any) -> tuple[ImageDetection, ...]:
-    """A thing in images, as requests have it. Raises InvalidDetectionError."""
+    """An object in images, as requests have it. Raises InvalidDetectionError."""
     if isinstance(value, list) and len(value) > MOST_IMAGES:
         hint = "Give the images that show most of the object."
         raise InvalidDetectionError(f"has {len(value)} entries, expected {MOST_IMAGES} at most", hint=hint)
@@ -203,4 +203,4 @@ AnyDetection = Annotated[
     ),
     PlainSerializer(values_of, return_type=Any),
 ]
-"""The same of a scene that may be a recording: a box, or the thing in its images."""
+"""The same of a scene that may be a recording: a box, or the object in its images."""

@@ -135,7 +135,7 @@ def request_document(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_asked(detection: Any) -> Any:
-    """Of a box its members that were given; of things in images each one's."""
+    """Of a box its members that were given; of objects in images each one's."""
     if isinstance(detection, list | tuple):
         return [_as_asked(one) for one in detection]
     return {name: value for name, value in detection.items() if value is not None}

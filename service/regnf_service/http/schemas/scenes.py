@@ -56,7 +56,7 @@ class _OfObject(_Edit):
     )
 
     def named(self) -> bool:
-        """Whether a thing is named at all. Raises ValueError for half of a name, or for two."""
+        """Whether an object is named at all. Raises ValueError for half of a name, or for two."""
         pair = (self.object is not None, self.T_object_scene is not None)
         if pair[0] != pair[1] or (self.job is not None and pair[0]):
             raise ValueError(_EITHER)
