@@ -184,7 +184,7 @@ def show_ranking(document: dict[str, Any], top: int) -> None:
 
 
 def difference_in_words(difference: dict[str, Any]) -> str:
-    """Whether what was seen tells a candidate of a search from the first one, to follow its number."""
+    """Text after the number of a search candidate: whether the observed surface distinguishes it from the first one."""
     if not difference["distinguishable"]:
         return "cannot be distinguished from the first by the observed surface"
     return f"is distinguished from the first by {100 * difference['seen']:.1f} % of the surface, which was observed"

@@ -149,7 +149,7 @@ def refusal(answer: httpx.Response) -> ServiceError:
 
 
 def service_error(problem: Mapping[str, Any]) -> ServiceError:
-    """The error for a problem object. Its faults are told too, where the detail alone does not name them."""
+    """The error for a problem object. Its faults are added, if the detail does not name them."""
     if problem.get("reason") == "JOB_FAILED" and isinstance(problem.get("error"), dict):
         problem = problem["error"]  # why the job failed says more than that it did
     detail = str(problem.get("detail") or problem.get("title") or "the service gave no detail")

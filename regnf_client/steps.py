@@ -85,7 +85,7 @@ def work(do: Callable[[], _T]) -> Flow[_T]:
 # When a request is sent again, and after how long.
 
 _PASSING = frozenset({"RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE", "ARTIFACT_NOT_READY"})
-"""Refusals that time mends by itself. Quotas are told at once: they may last for hours."""
+"""Refusals that end by themselves. Quotas are reported immediately: they may last for hours."""
 _PATIENCE_S = 120.0
 """The most that the service's own `Retry-After` may cost one request."""
 _FIRST_PAUSE_S = 0.25

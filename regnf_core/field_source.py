@@ -47,7 +47,7 @@ class FieldSource:
 
     @property
     def description(self) -> dict[str, Any]:
-        """What the importer is told."""
+        """The input of the importer."""
         return dict(self.said) if self.role is None else {**self.said, "as": self.role}
 
     @property
@@ -58,7 +58,7 @@ class FieldSource:
 
     @property
     def description_to_send(self) -> dict[str, Any]:
-        """What a service is told: the same, and what to call it."""
+        """The input of a service: the same, and a name."""
         return {**self.description, **({"label": self.label} if self.label else {})}
 
     @property

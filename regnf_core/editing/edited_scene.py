@@ -224,7 +224,7 @@ class EditedScene:
         return colors
 
 
-# A scene without the matter that nobody saw: invented behind objects, and in the way of cameras there.
+# A scene without unobserved matter: networks invent it behind objects, and it blocks cameras there.
 
 _AROUND = 2
 """Voxels round measured surface whose matter stays."""

@@ -272,7 +272,7 @@ class VerdictConstants:
     usual_inliers: float = 0.6  # share of inliers in each direction, at least [main pairs]
     usual_unexplained: float = 0.1  # share of the surface near the object that is not the object's, at most [by hand]
     usual_explained: float = 0.4  # share of the surface in the box that the object explains, at least [main pairs]
-    # Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, the field
+    # Share of the object's samples. If there is no observation and more is hidden at the best pose, the field
     # itself says what was hidden, and the verdict is that of scenes of which it is known. Of the 282 right poses that
     # the other model is trained on 2 have more; of one depth image they have 0.6 to .9. [random worlds; one depth
     # image]
@@ -281,7 +281,7 @@ class VerdictConstants:
     # a similar object is as large. [derived]
     min_deciding: float = 0.01
     most_differing: float = 0.5  # share of both surfaces: candidates that differ by more are not alike [by hand]
-    # Share of what was seen of the difference that must speak for the one more than for the other, to decide against
+    # Share of the observed difference that must support the one more than the other, to decide against
     # their probabilities. [by hand]
     min_favor: float = 0.2
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
@@ -423,7 +423,8 @@ class OcclusionConstants:
     # such voxels, and those at its back are the farthest. 0.75 is too little for fits to a recorded kitchen. [by hand]
     clearance_quantile: float = 0.9
     # Voxels. One of the places at half of the clearance and at all of it in front of a surface element was seen to be
-    # free, or nobody saw the element from its front. The first lies beyond the surface's own voxel; next to a measured
+    # free, or no camera observed the element from its front. The first lies beyond the surface's own voxel; next
+    # to a measured
     # surface, a voxel may count as unobserved although it was seen. Compared with one and three voxels on random
     # worlds. [derived]
     min_clearance: float = 2.0

@@ -78,7 +78,7 @@ def free_depths(field: SdfField, position: Tensor, directions: Tensor) -> tuple[
 
 
 _BASE = 40
-"""Voxels along the longest side of what was seen, before they are halved."""
+"""Voxels along the longest side of the observed region, before they are halved."""
 _POINTS_A_RAY = 12
 _RAYS_SHARE = 0.4
 """Of all evaluations, those for the images' rays. The surface's voxels take about as many, and the rest is for single

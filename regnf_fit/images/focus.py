@@ -70,7 +70,7 @@ def focused_field(
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
     objects: of the first frames, (H, W) each, where they show the object of a detection. What they show beside it hides
-    and is in the way, but nobody saw the object there: its surface counts as unobserved.
+    and is in the way, but no camera observed the object there: its surface counts as unobserved.
     voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
     nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
     spread: a standard deviation of depths from frame to frame, beside the noise of each.

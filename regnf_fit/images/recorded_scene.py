@@ -112,7 +112,8 @@ def _around(box: OrientedBox) -> OrientedBox:
 
 
 def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:
-    """The object's unit. `auto`: the one in which the object is as large as what was seen, `free` without one."""
+    """The object's unit. `auto`: the one in which the object's size matches the observed surface, `free` without
+    one."""
     if said != "auto":
         return said
     if object_bounds is None:

@@ -44,7 +44,7 @@ from regnf_state.journal.journaled_records import Rebuilder
 from regnf_state.settings import Settings
 from regnf_state.stores import Stores, open_stores
 
-# Ending long answers when the process is told to stop.
+# Ends long responses when the process must stop.
 #
 # The server waits for open connections before it ends the application, so an event stream that waits for the
 # application's end would never end. Hence we listen to the signals ourselves, and pass them on.
@@ -210,7 +210,7 @@ def _include_routers(app: FastAPI, **how: Any) -> None:
 
 
 _DRAIN_S = 5
-"""How long open requests may go on once the process is told to stop."""
+"""How long open requests may continue when the process must stop."""
 _MOST_HEAD_BYTES = 16 * 1024
 _IDLE_S = 75
 """How long a connection stays open between two requests: longer than a proxy keeps one that it may use again."""

@@ -58,7 +58,7 @@ def level_of(probability: float) -> Acceptance | None:
 
 @dataclass(frozen=True)
 class _Usual:
-    """A number of right poses and what it usually is at least, or at most. name: in words."""
+    """A metric and its usual minimum or maximum for correct poses. name: in words."""
 
     reason: str
     name: str
@@ -67,7 +67,7 @@ class _Usual:
     upper: bool = True
 
     def broken(self, told: dict[str, float]) -> str:
-        """That it is not so, in words; "" where it is."""
+        """The violation, in words; "" if there is none."""
         value = told[self.metric]
         if (value <= self.limit) if self.upper else (value >= self.limit):
             return ""
@@ -82,16 +82,17 @@ _USUAL = (
     _Usual("SURFACE_UNEXPLAINED", "unexplained share", "unexplained_share_scene", VERDICT.usual_unexplained),
     _Usual("SCENE_UNEXPLAINED", "explained share", "explained_share_scene", VERDICT.usual_explained, upper=False),
 )
-"""What explains a rejection, the first that holds: the probability decides, these say why it is low."""
+"""Explanations of a rejection; the first violated one is used. The probability decides, these only explain a low
+one."""
 
 
 def evaluate_pose(
     held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float
 ) -> PoseVerdict:
-    """The verdict on pose number ``index``, which ``rivals`` other poses equal.
+    """The verdict on pose number ``index``, which has ``rivals`` alternatives.
 
-    probability: that the pose or one of its rivals is right, 0..1. Written so that a number that is not finite can only
-    lead to a rejection.
+    probability: that the pose or one of its alternatives is correct, 0..1. Written so that a number that is not finite
+    can only lead to a rejection.
     """
     least = least_probability(options)
     margin = probability - least if math.isfinite(probability) else -1.0
@@ -106,7 +107,7 @@ def evaluate_pose(
 
 
 def _reason(told: dict[str, float], probability: float, least: float) -> tuple[str, str]:
-    """Why a probability is low, and the same in words."""
+    """The reason of a low probability: the stable word and a sentence."""
     value, limit = f"{probability:.3g}", f"{least:.3g}"
     if value == limit:  # 0.6996 is not "0.7, at least 0.7"
         value, limit = str(probability), str(least)
@@ -117,8 +118,8 @@ def _reason(told: dict[str, float], probability: float, least: float) -> tuple[s
     return "LOW_PROBABILITY", words
 
 
-# The poses that a registration has looked at to the end, with what speaks for and against each: for people to look at.
-# Nothing is evaluated for it: the held-out samples tell it that the verdict rests on.
+# The candidate poses of a registration with the evidence for and against each, for display. It needs no further
+# evaluations: the evidence is that of the verification samples, on which the verdict is based.
 
 _MOST = 6
 
@@ -126,7 +127,7 @@ _MOST = 6
 def considered_poses(
     problem: RegistrationProblem, candidates: PoseCandidates, held_out: HeldOut, answer: Answer, options: RobustOptions
 ) -> Considered:
-    """The best of the candidates that differ, the most probable first."""
+    """The best distinct candidates, the most probable first."""
     points = problem.model.extremal_points
     ranked = distinct(candidates.T, answer.demerits, points, VERDICT.rivals_min_distance, len(candidates))
     chosen = ranked[:_MOST]

@@ -75,7 +75,7 @@ class Images:
 class Matcher:
     """Gives each array of detections its images. Depth and detections may complete shots, which are returned.
 
-    say: is told why detections are dropped.
+    say: called with the reason why detections are dropped.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:

@@ -1,4 +1,4 @@
-"""What the node is told: parameters as ROS hands them on. No ROS.
+"""The parameters of the node, as ROS passes them. No ROS.
 
 Launch files and command lines pass them through YAML, which makes a boolean of y and a number of 0.03 or 1e-3. So
 a parameter may have any type here, and each is read for what it is to mean.

@@ -33,7 +33,7 @@ _NO_TOKENS = "This service has no access tokens, so it accepts only requests fro
 class RequestContext:
     """Gives each request its id, the caller's own if it is well formed, and writes it on every answer.
 
-    ``count`` is told of each: its scope, status, seconds until the answer began, and bytes of its body.
+    ``count`` is called for each: its scope, status, seconds until the response began, and bytes of its body.
     """
 
     def __init__(self, app: ASGIApp, count: Callable[[Scope, int, float, int], None]) -> None:
