@@ -49,7 +49,7 @@ CASES = [
     Case("dictionary for a box of Open3D", "INVALID_DETECTION", 0, "a dict is not a box of Open3D", "Give an OrientedBoundingBox", "from_dict", lambda: wrong.OrientedBox.from_open3d(BOX)),
     Case("one box for a batch", "INVALID_DETECTION", 0, "detections is a single box", "expected a list", r"\[box\]", batch(regnf.OrientedBox.from_dict(BOX))),
     Case("pair beyond the lists", "PAIR_UNKNOWN", 0, r"no pair \(0, 1\)", "1 objects", "start at 0", batch([BOX], pairs=[(0, 1)])),
-    Case("pairs that are none", "PAIR_UNKNOWN", 0, "0 is not a pair", "pair of detection and object", r"Write \[\(0, 0\)", batch([BOX], pairs=[0, 0])),
+    Case("pairs that are none", "PAIR_UNKNOWN", 0, "0 is not a pair", "pair of detection and object", r"Write for example \[\(0, 0\)", batch([BOX], pairs=[0, 0])),
     Case("batch by the other preset", "INVALID_OPTIONS", 0, "`paper`", "only the preset `robust`", "docs/api.md", batch([BOX], options={"preset": "paper"})),
     Case("search among nothing", "LIBRARY_EMPTY", 0, "library", "no objects", "at least one", lambda: wrong.search(ROOM, [], BOX)),
     Case("search in an empty folder", "LIBRARY_EMPTY", 0, "nothing", "it has no fields", "Give the folder", lambda: wrong.search(ROOM, "nothing", BOX)),

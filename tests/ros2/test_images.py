@@ -327,7 +327,7 @@ def test_without_a_map_the_camera_is_the_world(monkeypatch: pytest.MonkeyPatch, 
     robot = Robot(monkeypatch, Answers(bounds=None), map_frame=map_frame, up_axis="z")
     array = robot.see(boxes(12.5, BOX))
     assert array.header.frame_id == "camera"
-    assert ("tf knows no 'camera' in 'map'" in robot.said) == bool(map_frame)
+    assert ("tf has no transform from 'camera' to 'map'" in robot.said) == bool(map_frame)
     assert "up_axis" not in robot.answers.json("request")["options"]
     wanted = T_CAMERA_OBJECT.matrix().numpy()
     np.testing.assert_allclose(matrix(robot.node.pose_out.sent[0].pose.pose, 0.001), wanted, atol=1e-6)
@@ -478,7 +478,7 @@ def test_detections_that_match_nothing_are_dropped_and_said(monkeypatch: pytest.
     assert stream.boxes(0.0) == []
     assert "without a time stamp" in stream.said[-1]
     stream.boxes(*(4.0 + n for n in range(part("matching").MOST_WAITING + 1)))
-    assert "no later depth image has come" in stream.said[-1]
+    assert "no later depth image has arrived" in stream.said[-1]
     monkeypatch.setattr(part("matching"), "MOST_BYTES", 3 * MILLIMETERS.nbytes)
     stream.depth(*(30.0 + n for n in range(9)))
     stream.boxes(35.0)
@@ -493,7 +493,7 @@ def test_detections_wait_for_the_camera() -> None:
     assert stream.depth(1.1) == [(1.0, 1.0)]
     stream = Stream(info=False)
     stream.boxes(*(4.0 + n for n in range(part("matching").MOST_WAITING + 1)))
-    assert "no camera_info has come" in stream.said[-1]
+    assert "no camera_info has arrived" in stream.said[-1]
 
 
 def test_a_recording_that_starts_again_is_matched_again() -> None:

@@ -94,8 +94,8 @@ def _alike(symmetry: SelfSymmetry) -> Sim3:
 # are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).
 # There are three decision models: one for scenes with an observation, one for scenes without. The meaning of a feature
 # depends on it: a network invents surface where no camera looked, and only an observation identifies this surface. The
-# third one is for detections in an image, which define the object's surface: only this surface is sampled, only one side
-# of the object is observed, and the depths of one image are noisier than a map.
+# third one is for detections in an image, which define the object's surface: only this surface is sampled, only one
+# side of the object is observed, and the depths of one image are noisier than a map.
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}

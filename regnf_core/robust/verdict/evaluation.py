@@ -71,7 +71,7 @@ class _Usual:
         value = told[self.metric]
         if (value <= self.limit) if self.upper else (value >= self.limit):
             return ""
-        return f"{self.name} {value:.3g}; it is usually {self.limit:g} or {'less' if self.upper else 'more'}"
+        return f"{self.name} {value:.3g}, usually {self.limit:g} or {'less' if self.upper else 'more'}"
 
 
 _USUAL = (
@@ -111,7 +111,7 @@ def _reason(told: dict[str, float], probability: float, least: float) -> tuple[s
     value, limit = f"{probability:.3g}", f"{least:.3g}"
     if value == limit:  # 0.6996 is not "0.7, at least 0.7"
         value, limit = str(probability), str(least)
-    words = f"probability {value}; at least {limit} is required"
+    words = f"probability {value}, at least {limit} is required"
     for usual in _USUAL:
         if broken := usual.broken(told):
             return usual.reason, f"{words}; {broken}"
