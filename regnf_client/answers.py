@@ -1,4 +1,4 @@
-"""A service's answers: the document of a good one, the error of a refusal."""
+"""Responses of a service: the document of a success, the error of a refusal."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def checked_address(address: str) -> httpx.URL:
 
 
 def checked_token(token: str) -> str:
-    """A token that a header can hold. Raises InvalidInputError (INVALID_TOKEN)."""
+    """A token, checked for use in a header. Raises InvalidInputError (INVALID_TOKEN)."""
     if token.isascii() and token.isprintable() and " " not in token and token:
         return token
     hint = "Give only the token, exactly as the operator gave it: without `Bearer`, quotes and line breaks."
@@ -113,7 +113,8 @@ _HINTS = {  # in place of the service's own, which are of HTTP
 
 
 def checked(answer: httpx.Response) -> dict[str, Any]:
-    """The JSON object of a good answer; raises ServiceError for a refusal, and for what is no regnf service."""
+    """The JSON object of a successful response. Raises ServiceError for a refusal, and if the address is not a regnf
+    service."""
     document = object_of(answer)
     if answer.is_success and document is not None:
         return document
@@ -121,7 +122,7 @@ def checked(answer: httpx.Response) -> dict[str, Any]:
 
 
 def parsed(model: type[_Model], values: Mapping[str, Any]) -> _Model:
-    """A document of the service as a model. Raises ServiceError for one that has not what every regnf service says."""
+    """A document of the service, parsed into a model. Raises ServiceError if required members are missing."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
@@ -134,7 +135,7 @@ def parsed(model: type[_Model], values: Mapping[str, Any]) -> _Model:
 
 
 def refusal(answer: httpx.Response) -> ServiceError:
-    """The error that an answer stands for."""
+    """The error of a response."""
     document = object_of(answer)
     if document is None or not (document.keys() & {"reason", "detail", "title"}):
         url = answer.request.url

@@ -1,4 +1,4 @@
-"""Many registrations in one request, and their results as they come."""
+"""Many registrations in one request, and their results as they become available."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def request_body(
 
 
 def plain(value: Any) -> Any:
-    """Arrays and tuples as lists, boxes as detections, transforms as their matrices: what JSON can hold."""
+    """JSON values: arrays and tuples become lists, boxes become detections, transforms become matrices."""
     if isinstance(value, Mapping):
         return {str(name): plain(part) for name, part in value.items()}
     if hasattr(value, "to_detection"):
@@ -134,10 +134,10 @@ def plain(value: Any) -> Any:
 
 
 class BatchReader:
-    """Any number of requests, from the first to the last result: several batches, one after the other.
+    """Any number of requests with their results, as several batches one after the other.
 
-    Call ``post``, then ``read`` until it says None; so on until ``post`` says None. What is posted twice is one job, so
-    after an interruption the same requests go on.
+    Call ``post``, then ``read`` until it returns None. Repeat until ``post`` returns None. The same request twice is
+    one job, so the same requests can be posted again after an interruption.
     """
 
     def __init__(self, asking: Asking, requests: Iterable[PairLike], deadline: Deadline) -> None:
@@ -155,8 +155,8 @@ class BatchReader:
         self._read = 0
 
     def post(self) -> Flow[list[PairResult] | None]:
-        """Upload what the service lacks and post the next pairs; the results of those that could not be posted. None
-        after the last. Where the service has no room for all of them, as many as it has room for, once it has."""
+        """Upload missing files and post the next pairs. Returns the results of pairs that could not be posted; None
+        after the last. If the service cannot accept all of them, as many as it can accept are posted."""
         refused = yield from self._fill()
         if not self._lines:
             return refused or None
@@ -199,7 +199,8 @@ class BatchReader:
         return refused
 
     def read(self) -> Flow[list[PairResult] | None]:
-        """The next results, some or none; None after the last of what was posted. Raises WaitTimeoutError."""
+        """The next results, possibly none; None after the last result of the posted requests. Raises
+        WaitTimeoutError."""
         if self._after >= len(self._indexes):
             return None
         params = {"after": self._after, "wait": self._deadline.hold_s()}

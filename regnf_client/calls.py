@@ -1,4 +1,4 @@
-"""What a service can be asked, each as a flow of steps: ``Client`` performs them, ``AsyncClient`` awaits them."""
+"""The methods of a client, each as a flow of steps. ``Client`` performs them, ``AsyncClient`` awaits them."""
 
 from __future__ import annotations
 

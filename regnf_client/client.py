@@ -1,4 +1,4 @@
-"""The client that blocks until an answer is there, and the same to be awaited."""
+"""The blocking client and the asynchronous client."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class SyncDriver:
 
 
 class AsyncDriver:
-    """The same, awaited; what takes time is done in threads."""
+    """The asynchronous driver. Slow steps run in threads."""
 
     def __init__(self, http: httpx.AsyncClient) -> None:
         self._http = http
@@ -239,8 +239,8 @@ class Client(_Client[SyncDriver]):
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
     ) -> Iterator[PairResult]:
-        """Run any number of registrations, each a ``Pair`` or the members of a request. Yields results in the order of
-        their completion.
+        """Run any number of registrations, each a ``Pair`` or the members of a request. Yields the results as they
+        become available.
 
         A pair that fails does not stop the others. After an interruption, call it again with the same requests to
         continue.

@@ -1,4 +1,4 @@
-"""Fields: what names one, and how it gets to the service. Nothing is sent of what the service has."""
+"""Fields: the ways to give one, and the upload to the service. Files that the service has are not sent again."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def source_of(
 
 
 def known_sha256(field: FieldLike) -> str | None:
-    """The SHA-256 of a field that is named by it; None for a file."""
+    """The SHA-256 of a field that is given by it; None for a file."""
     if isinstance(field, Field):
         return field.sha256
     if isinstance(field, Entry):
@@ -75,12 +75,12 @@ def known_sha256(field: FieldLike) -> str | None:
 
 
 def named(field: FieldLike, role: Role | None = None) -> str | FieldSource:
-    """The SHA-256 of a field that is named by it, or the file to send. Raises what ``source_of`` does."""
+    """The SHA-256 of a field that is given by it, or the file to send. Raises what ``source_of`` does."""
     return known_sha256(field) or source_of(cast("Sendable", field), role=role)
 
 
 def smallest_first(given: Mapping[Role, FieldLike]) -> list[tuple[Role, str | FieldSource]]:
-    """What the service has, then the files, the smallest first: what is refused is refused soon.
+    """Fields that the service has, then the files, smallest first, so that refusals come early.
 
     Raises what ``source_of`` does.
     """
@@ -101,7 +101,7 @@ def upload(asking: Asking, field: FieldLike, role: Role | None = None, wait: boo
 def upload_all(
     asking: Asking, given: Sequence[FieldLike], role: Role | None = None, wait: bool = True
 ) -> Flow[list[Field]]:
-    """The same of several: all are sent before the first import is waited for."""
+    """Upload several fields. All are sent before the first import is waited for."""
     sources = [named(one, role) for one in given]
     found = []
     for one in sources:
@@ -149,7 +149,7 @@ def _labeled(asking: Asking, known: Field, source: FieldSource) -> Flow[Field]:
 
 
 def find(asking: Asking, field: FieldLike) -> Flow[Field]:
-    """A field as the service has it now. Raises ServiceError (FIELD_NOT_FOUND)."""
+    """The current state of a field on the service. Raises ServiceError (FIELD_NOT_FOUND)."""
     source = named(field)
     sha256 = source if isinstance(source, str) else (yield from work(partial(digest_of, source.file)))
     return (yield from asking.document(Field, "GET", f"/fields/{sha256}"))
@@ -191,7 +191,7 @@ def _send(asking: Asking, source: FieldSource, sha256: str) -> Flow[Field]:
 
 
 def send_pieces(asking: Asking, file: Path, address: str, size: int) -> Flow[Field | None]:
-    """All pieces that have not arrived. The field, if the service has come to have it."""
+    """Send all pieces that have not arrived. Returns the field if the service has it."""
 
     def put(data: bytes, span: str) -> Flow[httpx.Response]:
         headers = {"Content-Range": f"bytes {span}/{size}", "Content-Type": _BYTES, "Upload-Complete": "?0"}

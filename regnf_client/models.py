@@ -42,7 +42,7 @@ Array = Annotated[Floats, BeforeValidator(_array), _PLAIN]
 
 
 class Document(BaseModel):
-    """Base of what the service sends."""
+    """Base of all documents of the service."""
 
     model_config = ConfigDict(extra="allow", frozen=True, arbitrary_types_allowed=True)
 
@@ -167,7 +167,7 @@ class Result(Document, ResultDocument):
         return float(np.cbrt(np.linalg.det(self.T_object_scene[:3, :3])))
 
     def apply(self, points: ArrayLike) -> Floats:
-        """Points (N, 3) of the scene in the object's frame."""
+        """Transform points (N, 3) of the scene into the object's frame."""
         moved: Floats = (
             np.asarray(points, dtype=np.float64) @ self.T_object_scene[:3, :3].T + self.T_object_scene[:3, 3]
         )
@@ -208,7 +208,8 @@ class BatchOutcome:
 
 
 class EventReader:
-    """Takes a stream's lines; of each blank line an event may come. Knows where a new connection would go on."""
+    """Parses the lines of an event stream. A blank line may complete an event. It knows the position at which a new
+    connection continues."""
 
     def __init__(self) -> None:
         self.last_id: str | None = None
@@ -221,11 +222,11 @@ class EventReader:
         return {"Accept": "text/event-stream"} | ({} if self.last_id is None else {"Last-Event-ID": self.last_id})
 
     def connected(self) -> None:
-        """A new connection begins; half an event of the one before is forgotten."""
+        """A new connection begins. An incomplete event of the previous one is dropped."""
         self._lines = {}
 
     def take(self, line: str) -> Event | None:
-        """The event that ends with this line, if one does."""
+        """The event that this line completes, if any."""
         if line:
             name, _, value = line.partition(":")
             self._lines[name] = value.removeprefix(" ")

@@ -97,7 +97,7 @@ def opened_pair(scene: FieldLike, obj: FieldLike) -> tuple[Opened, Opened]:
 
 
 def notes_of(scene: Opened, obj: Opened) -> dict[str, FieldNotes] | None:
-    """What is known of the imports, by role; None where nothing is."""
+    """Notes of the imports, by role; None if there are none."""
     found = {"scene": scene.notes, "object": obj.notes}
     return {name: notes for name, notes in found.items() if notes is not None} or None
 

@@ -103,7 +103,7 @@ class Considered:
 
 @dataclass(frozen=True)
 class ObjectSymmetry:
-    """The rotations that map the object onto itself. order: how many there are, the identity included.
+    """The rotations that map the object onto itself. order: their number, including the identity.
 
     axis: unit vector, object frame: the common axis of all of them; None where there is none, as for a box's three half
     turns. With ``continuous`` every rotation about the axis is a symmetry, and ``order`` is 2 where the two ends of the
@@ -195,7 +195,7 @@ class RegistrationResult(_Posed):
 
     @property
     def center_scene(self) -> Tensor:
-        """(3,) float64, scene frame: where the object's center is."""
+        """(3,) float64: the object's center in the scene frame."""
         return self.T_scene_object.apply(self.center_object[None])[0]
 
     @property
@@ -248,12 +248,12 @@ class Candidate:
 
 
 def level_in_words(level: Acceptance | None) -> str:
-    """Of an answer that has a probability."""
+    """The level as text, for a result with a probability."""
     return level or "below both levels"
 
 
 def sure_in_words(probability: float | None, level: Acceptance | None) -> str:
-    """To follow a verdict: `, probability 0.998 (strict)`; "" where there is no probability."""
+    """Text after a verdict: `, probability 0.998 (strict)`; "" if there is no probability."""
     return "" if probability is None else f", probability {probability:.3f} ({level_in_words(level)})"
 
 

@@ -1,4 +1,4 @@
-"""Fields of what lies in memory: arrays of a mesh, points or a grid, functions, and meshes of trimesh and Open3D.
+"""Fields from data in memory: arrays of a mesh, points or a grid, functions, and meshes of trimesh and Open3D.
 
 They are made by the import's own converters, so a mesh in memory is the same field as the same mesh in a file. Nothing
 runs in a sandbox: the numbers are the caller's own. Objects of other libraries are told by their attributes.
@@ -57,7 +57,7 @@ class HasGeometry(Protocol):
 
 
 class FieldWarning(UserWarning):
-    """A field was opened, and its import has warned of something."""
+    """The import of an opened field has a warning."""
 
 
 def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said = None) -> SdfField:
@@ -75,7 +75,7 @@ def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said =
 
 
 def from_points(points: Any, normals: Any, description: Said = None) -> SdfField:
-    """The field of a cloud of points with normals that point to free space: of its screened Poisson surface.
+    """The field of a point cloud with normals that point to free space, from its screened Poisson surface.
 
     points, normals: (N, 3), as ``from_mesh`` takes vertices; rows that are not finite, or of no normal, are left out.
     Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, POINT_CLOUD_TOO_SMALL,
@@ -144,7 +144,7 @@ def from_function(f: PointFunction, bounds: Any, sign: int = 1, device: str | No
 
 
 def field_of(thing: Any, role: Role | None = None, description: Said = None) -> SdfField:
-    """The field that an object stands for, whatever library it is of. role: what it will be used as.
+    """The field of a mesh or point cloud of any supported library. role: its use.
 
     Raises InvalidInputError (NO_FIELD) for what is none, and what the functions above raise.
     """
@@ -166,7 +166,7 @@ def field_of(thing: Any, role: Role | None = None, description: Said = None) -> 
 
 
 def geometry_of(thing: Any, role: Role | None = None) -> Geometry:
-    """The triangles or the points of an object of another library, or of a mesh that was opened here. Torch-free.
+    """The triangles or points of a mesh of another library, or of a mesh that regnf has opened. Torch-free.
 
     Raises InvalidInputError (NO_FIELD) for what has none, FieldFormatError (MESH_INVALID).
     """

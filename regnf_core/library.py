@@ -1,4 +1,4 @@
-"""Registration of two fields, and which object of a library a detection shows, and where it stands.
+"""Registration of two fields, and search for the object of a detection in a library.
 
 library = [LibraryObject(path.stem, partial(open_field, path), read_object_model(path.with_suffix(".model")))
            for path in paths]
@@ -57,7 +57,7 @@ _MAX_SQUARED_DISTANCE = 4.0  # of two signatures without a common bin
 
 @dataclass(frozen=True, eq=False)
 class LibraryObject:
-    """An object to look for. field: opens its field; called only for the few objects that may be the right one."""
+    """An object of a search. field: opens its field; it is called only for the most probable objects."""
 
     name: str
     field: Callable[[], SdfField]
@@ -218,7 +218,7 @@ def register(
 def with_late_clouds(
     result: RegistrationResult, scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions
 ) -> RegistrationResult:
-    """The result of ``register`` without clouds as it returns it with them, but for the seconds of this phase."""
+    """Adds the point clouds to a result of ``register`` without clouds. Only the time of this phase differs."""
     if options.preset == "robust":
         return with_clouds(result, scene, obj, detection, cloud_region(detection))
     from regnf_core.paper import pipeline as paper

@@ -1,4 +1,4 @@
-"""Options of a registration, grouped by the stage they steer. Torch-free: the HTTP contract is derived from them.
+"""Options of a registration, grouped by stage. Torch-free: the HTTP contract is derived from them.
 
 Every length is in normalized field units unless its name says otherwise, as in the paper.
 """
@@ -194,7 +194,7 @@ class RegistrationOptions(_Group):
     def from_dict(cls, values: dict[str, Any]) -> RegistrationOptions:
         """Options from plain (JSON) values. Options that are left out keep their defaults.
 
-        Raises InvalidOptionsError naming the first faulty option.
+        Raises InvalidOptionsError for the first invalid option.
         """
         if not values:
             return cls()
@@ -241,7 +241,7 @@ OptionsLike = RegistrationOptions | Mapping[str, Any] | None
 
 
 def options_of(options: OptionsLike) -> RegistrationOptions:
-    """The options of a caller. Raises InvalidOptionsError naming the first faulty one."""
+    """The options of a caller. Raises InvalidOptionsError for the first invalid one."""
     if options is None:
         return RegistrationOptions()
     if isinstance(options, RegistrationOptions):

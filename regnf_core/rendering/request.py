@@ -55,7 +55,7 @@ class RenderOptions:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RenderOptions:
-        """From plain (JSON) values. Raises InvalidOptionsError naming the first faulty one."""
+        """From plain (JSON) values. Raises InvalidOptionsError for the first invalid one."""
         try:
             return _OPTIONS_ADAPTER.validate_python(values)
         except ValidationError as error:

@@ -156,7 +156,7 @@ def test_the_shares_say_why_a_pose_is_rejected_and_decide_nothing(
 ) -> None:
     rejected = verdict_on(evidence, 0.5, unexplained)
     assert (rejected.verdict, rejected.reason) == ("rejected", reason)
-    assert rejected.broken.removeprefix("probability 0.5, at least 0.8 is needed").removeprefix("; ") == said
+    assert rejected.broken.removeprefix("probability 0.5, at least 0.8 is required").removeprefix("; ") == said
     assert verdict_on(evidence, 1.0, unexplained).verdict == "registered"
 
 
