@@ -265,7 +265,7 @@ Address = Annotated[str, WithJsonSchema({"type": "string", "format": "uri-refere
 
 
 class Outgoing(BaseModel):
-    """Base of what the service sends; it may gain members, so clients ignore those they do not know."""
+    """Base of all documents of the service. Documents may gain members, so clients ignore unknown ones."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -93,7 +93,7 @@ def verdict_hint(reason: str, options: Mapping[str, Any]) -> str:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str | None:
-    """The hint "Did you mean `center`?" for an unknown name; None if no known name is similar."""
+    """A hint for an unknown name: Did you mean `center`? None if no known name is similar."""
     near = nearest_name(name, known)
     return f"Did you mean `{near}`?" if near else None
 

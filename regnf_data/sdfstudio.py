@@ -181,7 +181,7 @@ def decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
     if pixels.shape[:2] != size or (mode is None and pixels.ndim != 2):
         raise DatasetError(f"{path.name} has more than one channel", reason="DATASET_IMAGE_INVALID")
     if mode is None and (kind == "P" or pixels.dtype.kind not in "fiu"):
-        what = "a palette of colors" if kind == "P" else "one bit a pixel, as masks have"
+        what = "a palette of colors" if kind == "P" else "one bit per pixel, as in masks"
         raise DatasetError(f"{path.name} holds no depths: it has {what}", reason="DATASET_IMAGE_INVALID")
     return pixels
 

@@ -179,7 +179,7 @@ class Room:
         if memory.is_below(self._reserve / 2) or (
             memory.is_below(self._reserve) and owner == self._owners.greediest(self._owners.held)
         ):
-            raise RecordsFullError("Redis has less than its reserve of memory left")
+            raise RecordsFullError("Redis has less free memory than its reserve")
 
     @property
     def is_full(self) -> bool:

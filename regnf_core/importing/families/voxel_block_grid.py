@@ -90,7 +90,7 @@ def _colors(arrays: ArraySource, blocks: _Blocks) -> npt.NDArray[np.float16] | N
     stored = arrays.weights(_attribute(arrays, "color"))  # 0 to 255
     edge = blocks.tsdf.shape[1]
     if stored.shape != (len(blocks.kept), edge, edge, edge, 3):
-        raise tensor_error(f"the colors have shape {stored.shape}, expected three numbers a voxel", "TENSOR_SHAPE")
+        raise tensor_error(f"the colors have shape {stored.shape}, expected three numbers per voxel", "TENSOR_SHAPE")
     if not stored.any():
         return None
     colors = (stored[blocks.kept].transpose(0, 3, 2, 1, 4) / np.float32(255.0)).clip(0.0, 1.0)

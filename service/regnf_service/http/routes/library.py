@@ -37,7 +37,7 @@ _BODY_REFUSALS = (
     "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
     "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST CONFLICT LIBRARY_NAME_TAKEN"
 )
-NamePath = Annotated[str, Path(description="Of the entry.", max_length=4 * MAX_NAME)]
+NamePath = Annotated[str, Path(description="Name of the entry.", max_length=4 * MAX_NAME)]
 
 
 @router.get(

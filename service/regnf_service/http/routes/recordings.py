@@ -79,7 +79,7 @@ FRAME_PARTS: dict[str, Any] = {
 }
 _WHOLE = {"file": FILE, "upload": UPLOAD_PART}
 _NAME = r"[A-Za-z0-9._-]{1,100}"
-LabelQuery = Annotated[Label | None, Query(description="A name for people.")]
+LabelQuery = Annotated[Label | None, Query(description="A name for display.")]
 DigestHeader = Annotated[str | None, Header(description="RFC 9530: the digest of the body as sent.")]
 
 

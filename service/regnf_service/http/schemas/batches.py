@@ -82,7 +82,7 @@ class BatchPage(Outgoing):
 class BatchResult(Outgoing):
     """A line of the results of a batch: a pair that has ended."""
 
-    number: int = Field(description="Of the pair, from 1 on: The value of `after` for the next call.")
+    number: int = Field(description="Number of the pair, from 1. It is the value of `after` for the next call.")
     line: int = Field(description="Line number of the pair in the posted body.")
     key: str | None
     job: str | None = Field(description="The job, which has the full result and its files.")

@@ -84,7 +84,7 @@ class JobDocument(Outgoing):
     )
     verdict: _Verdict | None = Field(None, description="The verdict of the result, for a successful job.")
     probability: float | None = Field(None, description="The probability of the result.")
-    level: _Level | None = Field(None, description="The probability of the result.")
+    level: _Level | None = Field(None, description="The named level of the result.")
     object_found: Sha256 | None = Field(
         None,
         description="The object of the result, for a successful search. If the verdict is `rejected`, no "
