@@ -26,7 +26,7 @@ def test_running_shows_phase_and_progress_and_cancel_ends_the_job(visit: Visit) 
     page.locator("#cancel").click()
     page.wait_for_selector("text=The job was dismissed")
     expect(page.locator("#status")).to_have_text("Dismissed")
-    expect(page.locator("#message-text")).to_contain_text("Run again starts it again.")
+    expect(page.locator("#message-text")).to_contain_text("Press Run again to start it again.")
     expect(page.locator("#run-again")).to_be_visible()
     assert visit.complaints == []
 

@@ -53,7 +53,7 @@ export function showFailed(job) {
 }
 
 export function showDismissed(job) {
-  const again = canRunAgain(job) ? 'Run again starts it again.' : 'Start it again on the page Register.';
+  const again = canRunAgain(job) ? 'Press Run again to start it again.' : 'Start it again on the page Register.';
   showBadge('dismissed', job.id);
   card({ eyebrow: 'No result', title: 'The job was dismissed', text: `It was canceled before it had a result. ${again}`, tone: 'still' });
 }
