@@ -94,5 +94,5 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
     options = ("--cameras", tmp_path / "poses.txt", *said, "--camera-axes", "opengl")
     refused = run("convert", tmp_path / "ball.glb", safe, *options, code=2).stderr
     assert "CAMERAS_OF_ANOTHER_FRAME" in refused
-    assert "say --camera-axes opencv" in " ".join(refused.split())
+    assert "give --camera-axes opencv" in " ".join(refused.split())
     assert "INVALID_OPTIONS" in run("convert", tmp_path / "ball.glb", safe, *said, code=2).stderr
