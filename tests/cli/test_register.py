@@ -135,7 +135,7 @@ def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
     assert read_options(file, None) == read_options(file, "paper") == {"preset": "paper"}
     assert read_options(None, "paper") == {"preset": "paper"}
     assert read_options(None, None) == {}
-    with pytest.raises(InvalidOptionsError, match="says 'paper', --preset robust"):
+    with pytest.raises(InvalidOptionsError, match="has 'paper', and --preset is robust"):
         read_options(file, "robust")
 
 

@@ -156,7 +156,7 @@ def test_tables(text: str, ending: str, tmp_path: Path) -> None:
 
 
 HEADERS = {
-    "misspelled": ("scen,object,detection\n", "no member `scen` is known", "Did you mean `scene`"),
+    "misspelled": ("scen,object,detection\n", "unknown member `scen`", "Did you mean `scene`"),
     "without a column": ("scene,object\n", "`detection` is missing", "Write the column names"),
     "none at all": ("room.ply,chair.ply,box.json\n", "unknown member `room.ply`", "Write the column names"),
     "twice": ("scene,object,detection,scene\n", "twice", "Write the column names"),
@@ -201,9 +201,9 @@ def test_failed_rows_are_shown(run: Run, tmp_path: Path) -> None:
             b"\x80\x01\x00\x00\x00\x00\x00\x00{",
             "not a text in UTF-8 from byte 1 (0x80) on, and it has control characters",
         ),
-        ("ä".encode() + b"\xff", "not a text in UTF-8 from byte 3 (0xff) on"),
-        (b"\xef\xbb\xbfab\xff", "not a text in UTF-8 from byte 6 (0xff) on"),
-        (b"\xff\xfea\x00b", "not a text in UTF-16-LE from byte 5 (0x62) on"),
+        ("ä".encode() + b"\xff", "not a text in UTF-8, from byte 3 (0xff) on"),
+        (b"\xef\xbb\xbfab\xff", "not a text in UTF-8, from byte 6 (0xff) on"),
+        (b"\xff\xfea\x00b", "not a text in UTF-16-LE, from byte 5 (0x62) on"),
         (b"{\x00\x01\x00", "not a text in UTF-8 or UTF-16-LE: it has the control character 0x01"),
     ],
 )

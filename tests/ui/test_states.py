@@ -33,7 +33,7 @@ def test_running_shows_phase_and_progress_and_cancel_ends_the_job(visit: Visit) 
 
 def test_queued_tells_the_place(visit: Visit) -> None:
     visit.page.goto(visit.server.view("queued"))
-    visit.page.wait_for_selector("text=3 jobs are before it.")
+    visit.page.wait_for_selector("text=3 jobs are ahead of it.")
     expect(visit.page.locator("#message-title")).to_have_text("In the queue")
 
 
@@ -42,7 +42,7 @@ def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
     """Where there is no stream of events, also past a connection that was lost."""
     page = visit.page
     page.goto(visit.server.view(story))
-    page.wait_for_selector("text=2 jobs are before it.")
+    page.wait_for_selector("text=2 jobs are ahead of it.")
     if story == "polled":
         page.context.set_offline(True)
         page.wait_for_selector("text=The service does not answer")

@@ -137,7 +137,9 @@ def layer_names(state: Mapping[str, Any], prefix: str, minimum: int = 2) -> list
     if layers > MAX_LAYERS or numbers != {str(i) for i in range(layers)}:
         raise FieldFormatError("the geometry network's layers are not numbered from 0 on", reason="TENSOR_MISSING")
     if layers < minimum:
-        raise FieldFormatError(f"a geometry network of {layers} layers", reason="FAMILY_NOT_SUPPORTED")
+        raise FieldFormatError(
+            f"a geometry network with {layers} layers is not supported", reason="FAMILY_NOT_SUPPORTED"
+        )
     return [f"{prefix}{i}" for i in range(layers)]
 
 

@@ -92,7 +92,9 @@ def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)
     if len(names) > 4:
-        raise FieldFormatError(f"a geometry network of {len(names)} layers", reason="FAMILY_NOT_SUPPORTED")
+        raise FieldFormatError(
+            f"a geometry network with {len(names)} layers is not supported", reason="FAMILY_NOT_SUPPORTED"
+        )
     return layers
 
 
