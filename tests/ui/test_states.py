@@ -45,7 +45,7 @@ def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
     page.wait_for_selector("text=2 jobs are ahead of it.")
     if story == "polled":
         page.context.set_offline(True)
-        page.wait_for_selector("text=The service does not answer")
+        page.wait_for_selector("text=The service does not respond")
         visit.server.stage.advance()
         page.context.set_offline(False)
         # only the refused stream and what was lost with the connection may be complained about
