@@ -181,7 +181,7 @@ MISREAD: dict[str, tuple[Axes, Callable[[Array], Array], str]] = {
     "OpenCV": ("opengl", lambda T: T, "along z.*give --camera-axes opencv"),
     "inverted": ("opencv", np.linalg.inv, "world to the camera: invert the matrices"),
     "inverted, OpenGL": ("opengl", lambda T: np.linalg.inv(T @ HALF_TURN), "world to the camera: invert the matrices"),
-    "inverted, OpenGL read as OpenCV": ("opencv", lambda T: np.linalg.inv(T @ HALF_TURN), "invert.*and say --camera"),
+    "inverted, OpenGL read as OpenCV": ("opencv", lambda T: np.linalg.inv(T @ HALF_TURN), "invert.*and give --camera"),
     "a body": ("opencv", lambda T: T @ FORWARD_X, "along x .*rotate the axes of the cameras"),
 }
 

@@ -96,8 +96,8 @@ WRONG: dict[str, tuple[Callable[[PosedImages], PosedImages], str]] = {
     "turned": (lambda images: replace(images, intrinsics=images.intrinsics[:, [1, 0, 2]][:, :, [1, 0, 2]]), "pixels"),
     "reversed": (with_poses(lambda T: T[::-1]), "each image its correct pose"),
     "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each image its correct pose"),
-    "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions of the poses anew"),
-    "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions of the poses anew"),
+    "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions of the poses in the expected order"),
+    "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions of the poses in the expected order"),
     "mirrored": (with_depths(lambda depths: depths[:, :, ::-1]), "Mirror the depth images"),
     "far from the origin": (with_poses(lambda T: T @ OPENGL + FAR), "opengl"),
 }  # fmt: skip
