@@ -39,7 +39,7 @@ def convert_mesh(
     if len(geometry.faces) > 0:
         return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
     if format_ not in CLOUD_FORMATS or len(geometry.vertices) == 0:
-        raise malformed(f"the {format_} file holds no triangles")
+        raise malformed(f"the {format_} file has no triangles")
 
     return convert_cloud(geometry, f"a {format_} file", overrides, work_s)
 
@@ -65,7 +65,7 @@ _APART = 0.7
 _BORDERS, _WRONG_EDGES, _BOTH_WAYS = 0.01, 0.2, 0.5
 """Shares of the points, of those at edges and of the points. Chosen on the same clouds as measured on: 22 shapes,
 1,000 and 30,000 points, noise of 0, 0.3 and 1 spacings. At edges whole clouds reached 0.17. Refused in vain were 1,000
-points of a sheet of 0.5 mm and of 200 blades; patches on thin things with few points are often missed."""
+points of a sheet of 0.5 mm and of 200 blades; patches on thin objects with few points are often missed."""
 _FEWEST, _ALL, _FEWEST_EDGES = 3, 0.9, 50
 """A point at an edge has so many neighbors across it; so many of them agree; so many such points are enough."""
 _NO_THICKNESS = 0.01
@@ -82,7 +82,7 @@ def convert_cloud(
     refused for.
     """
     if geometry.normals is None:
-        message = f"{origin} with points and no faces needs normals (nx, ny, nz) that point to free space"
+        message = f"{origin} has points without faces: it needs normals (nx, ny, nz) that point to free space"
         raise FieldFormatError(message, reason="POINT_CLOUD_WITHOUT_NORMALS")
     points, normals, dropped = _usable(geometry.vertices, geometry.normals)
     _require_surface(np.unique(points, axis=0), len(points))
@@ -99,13 +99,16 @@ def convert_cloud(
     near = tree.query(vertices, distance_upper_bound=reach)[0] < reach
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
-        raise malformed("no surface passes near the points: are the normals theirs?")
+        raise malformed("no surface passes near the points. Check that the normals belong to the points.")
     surface = Geometry(vertices * diagonal + low, faces, left_out=(*geometry.left_out, *dropped))
     width = f"{1 << depth} cells wide"
     found = mesh_field(surface, f"their screened Poisson surface, {width}", overrides, "point_cloud", work_s)
     beside = 100.0 * np.quantile(cKDTree(vertices[near]).query(_some(unit))[0], 0.95)
     why = (f"{origin}: {len(geometry.vertices)} points with normals", *found.why)
-    text = f"what lies between the points is a guess; 19 of 20 points are within {beside:.2g} % of the diagonal of it"
+    text = (
+        f"the surface between the points is interpolated; 95 % of the points are within {beside:.2g} % of the "
+        f"diagonal of it"
+    )
     if depth < FINEST:
         text += f"; it is {width} instead of {1 << FINEST}, because its points fill too many cells"
     return replace(found, why=why, warnings=(*found.warnings, f"SURFACE_RECONSTRUCTED: {text}"))
@@ -121,9 +124,9 @@ def _usable(points: Float64Array, normals: Float64Array) -> tuple[Float64Array, 
         placed = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e30).all(axis=1)
         turned = np.isfinite(length) & (length > 0)
     lost = (
-        (~placed, "points that are no finite numbers"),
+        (~placed, "points with NaN or infinity"),
         (placed & (length == 0), "points whose normals are zero"),
-        (placed & ~np.isfinite(length), "points whose normals are no finite numbers"),
+        (placed & ~np.isfinite(length), "points whose normals have NaN or infinity"),
     )
     dropped = tuple(f"{int(mask.sum())} {what}" for mask, what in lost if mask.any())
     sound = placed & turned
@@ -143,11 +146,11 @@ def _usable(points: Float64Array, normals: Float64Array) -> tuple[Float64Array, 
 def _require_surface(places: Float64Array, points: int) -> None:
     """Raise FieldFormatError (POINT_CLOUD_TOO_SMALL) for few places (N, 3), however many points, or those of a line."""
     if len(places) < _MIN_POINTS:
-        message = f"the {points} points lie at {len(places)} places, at least {_MIN_POINTS} are needed"
+        message = f"the {points} points have only {len(places)} different positions, at least {_MIN_POINTS} are needed"
         raise FieldFormatError(message, reason="POINT_CLOUD_TOO_SMALL")
     wide = np.linalg.svd(places - places.mean(axis=0), compute_uv=False, full_matrices=False)
     if wide[1] < _LINE * wide[0]:
-        raise FieldFormatError("the points lie on one line", reason="POINT_CLOUD_TOO_SMALL")
+        raise FieldFormatError("the points are on one line", reason="POINT_CLOUD_TOO_SMALL")
 
 
 def _require_agreeing(points: Float64Array, normals: Float64Array) -> None:
@@ -156,7 +159,7 @@ def _require_agreeing(points: Float64Array, normals: Float64Array) -> None:
     points: (N, 3), with a diagonal of one · normals: (N, 3), of length one.
     """
     if found := _turned(points, normals):
-        message = f"neighboring normals point to opposite sides: {found}; patches of them are turned round"
+        message = f"normals of neighboring points are opposite: {found}; the normals of some patches are flipped"
         raise FieldFormatError(message, reason="POINT_CLOUD_NORMALS_DISAGREE")
 
 
@@ -191,7 +194,7 @@ def _disagreement(points: Float64Array, normals: Float64Array) -> str:
         # Where a patch ends, the others lie to one side; those of a board's other side lie behind, all around.
         borders = float((aside > _APART).sum() / len(asked))
         if borders >= _BORDERS and (aside > _APART).mean() >= 0.5:
-            return f"{100.0 * borders:.0f} % of the points lie where one patch meets another"
+            return f"{100.0 * borders:.0f} % of the points are at the border of two patches"
         deep = (
             _mean(height[mixed][..., None], opposite[mixed])[:, 0] - _mean(height[mixed][..., None], same[mixed])[:, 0]
         )
@@ -206,7 +209,7 @@ def _disagreement(points: Float64Array, normals: Float64Array) -> str:
     wrong = (edge & (height * back < 0.0)).sum(axis=1)[told] >= _ALL * beside[told]
     if told.sum() < _FEWEST_EDGES or wrong.mean() < _WRONG_EDGES:
         return ""
-    return f"at {100.0 * wrong.mean():.0f} % of the edges one of two sides looks inward"
+    return f"at {100.0 * wrong.mean():.0f} % of the edges one of the two faces points inward"
 
 
 def _mean(values: Float64Array, chosen: npt.NDArray[np.bool_]) -> Float64Array:
@@ -224,7 +227,7 @@ def _some(points: Float64Array) -> Float64Array:
 
 def _poisson(points: Float64Array, normals: Float64Array, depth: int) -> tuple[Float64Array, Int64Array]:
     """The closed surface (V, 3), (F, 3) through the points, faces outward."""
-    mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the gate's process may not
+    mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the importer's process may not
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

@@ -95,11 +95,26 @@ HALF_ZERO = np.where(np.arange(2000)[:, None] % 2 == 0, directions(2000), 0.0)
     [
         (directions(500), None, "POINT_CLOUD_WITHOUT_NORMALS", "needs normals"),
         (directions(500), np.zeros((500, 3)), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are zero"),
-        (directions(500), np.full((500, 3), np.inf), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are no"),
+        (
+            directions(500),
+            np.full((500, 3), np.inf),
+            "POINT_CLOUD_WITHOUT_NORMALS",
+            "500 points whose normals have NaN",
+        ),
         (directions(50), directions(50), "POINT_CLOUD_TOO_SMALL", "50 of 50 points"),
-        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points that are no finite numbers"),
-        (np.zeros((500, 3)), directions(500), "POINT_CLOUD_TOO_SMALL", "the 500 points lie at 1 places"),
-        (np.tile(directions(9), (100, 1)), np.tile(directions(9), (100, 1)), "POINT_CLOUD_TOO_SMALL", "at 9 places"),
+        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points with NaN or infinity"),
+        (
+            np.zeros((500, 3)),
+            directions(500),
+            "POINT_CLOUD_TOO_SMALL",
+            "the 500 points have only 1 different positions",
+        ),
+        (
+            np.tile(directions(9), (100, 1)),
+            np.tile(directions(9), (100, 1)),
+            "POINT_CLOUD_TOO_SMALL",
+            "only 9 different positions",
+        ),
         (LINE, directions(500), "POINT_CLOUD_TOO_SMALL", "on one line"),
         (1e-30 * directions(500), directions(500), "MESH_INVALID", "its diagonal is"),
         (np.zeros((0, 3)), None, "MESH_INVALID", "no triangles"),
@@ -153,11 +168,11 @@ def turned(normals: NDArray[np.float64], which: NDArray[np.bool_]) -> NDArray[np
 @pytest.mark.parametrize(
     ("points", "normals", "says"),
     [
-        (BALL, turned(BALL, BALL[:, 2] > 0), "one patch meets another"),
-        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "one patch meets another"),
-        (BALL, turned(BALL, BALL[:, 0] > 0.8), "one patch meets another"),
+        (BALL, turned(BALL, BALL[:, 2] > 0), "at the border of two patches"),
+        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "at the border of two patches"),
+        (BALL, turned(BALL, BALL[:, 0] > 0.8), "at the border of two patches"),
         (BALL, turned(BALL, np.random.default_rng(0).random(len(BALL)) < 0.5), "mixed at one place"),
-        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "looks inward"),
+        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "points inward"),
     ],
 )
 def test_clouds_whose_normals_are_turned_in_patches_are_refused(
@@ -199,4 +214,4 @@ def test_who_insists_is_given_the_surface_of_turned_normals() -> None:
 def test_a_refusal_s_own_hint_comes_out_of_the_gate(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError) as caught:
         import_field(saved(tmp_path, ply(1e-30 * BALL, BALL)), tmp_path / "out")
-    assert caught.value.hint == "Give it in another unit, or without stray points."
+    assert caught.value.hint == "Give the mesh in another unit, or remove stray points."
