@@ -1,4 +1,4 @@
-"""One call: where is the library's armchair in this room?
+"""One call: find the pose of the library's armchair in this room.
 
 python examples/01_register.py [SCENE OBJECT DETECTION]
 """

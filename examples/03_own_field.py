@@ -24,7 +24,7 @@ SEAT, BACK, ARM = (
 
 @dataclass(frozen=True)
 class BoxesField:
-    """The union of axis-aligned boxes (center, full size), seen from a frame that ``T_own_frame`` carries to theirs."""
+    """The union of axis-aligned boxes (center, full size), seen from a frame that ``T_own_frame`` maps to theirs."""
 
     T_own_frame: Sim3
     bounds: Tensor

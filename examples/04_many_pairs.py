@@ -1,4 +1,4 @@
-"""Registers a long list of pairs, and goes on where it was interrupted.
+"""Registers a long list of pairs, and continues after an interruption.
 
 python examples/04_many_pairs.py PAIRS.jsonl RESULTS.jsonl
 

@@ -1,4 +1,4 @@
-"""Registers a thousand pairs at a service, and sorts what comes back: to be used, to be looked at, failed.
+"""Registers a thousand pairs with a service, and sorts the results: to use, to inspect, failed.
 
 python examples/05_pipeline.py ADDRESS PAIRS.jsonl FOLDER
 

@@ -1,4 +1,4 @@
-"""regnf: where a known object stands in a scanned room, from neural signed distance fields.
+"""regnf: find the pose of a known object in a scanned room, with neural signed distance fields.
 
     import regnf
 
@@ -6,8 +6,8 @@
     result = regnf.register("room.ckpt", "chair.glb", box)
     print(result.verdict, result.scale)
 
-The work is done here; ``regnf.Client`` has a service do it. Names are resolved on first use, so that a program which
-uses the client alone loads no torch.
+This process does the work; with ``regnf.Client`` a service does it. Names are resolved on first use, so a program that
+uses only the client does not load torch.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _HOMES = {
     **dict.fromkeys(("fit", "fuse"), "regnf.fitting"),
     **dict.fromkeys(("Frame", "register", "register_batch", "search"), "regnf.recordings"),
 }
-"""Every other name is regnf_core's."""
+"""All other names are those of regnf_core."""
 
 __all__ = ["AsyncClient", "Client", "Frame", "Pair", "PairResult", "fit", "fuse"]
 __all__ += regnf_core.__all__

@@ -1,4 +1,4 @@
-"""``fit`` and ``fuse`` as users call them: a neural field from a mesh or from posed images, a map of depth images."""
+"""``fit`` and ``fuse``: a neural field from a mesh or from posed images, and a TSDF map from depth images."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def fit(
     progress: Progress | None = None,
     label: str | None = None,
 ) -> FitReport | ReconstructionReport:
-    """Fit a field, write it to ``output``, a .safetensors file, and say how well it agrees.
+    """Fit a field and write it to ``output``, a .safetensors file. Returns how well it matches the source.
 
     source: a mesh file, any field, a mesh of trimesh or Open3D, or a recording of posed images (docs/datasets.md) ·
     options: entries of FitOptions, or for images of ReconstructionOptions · extent: of a mesh file, the length of its
@@ -51,7 +51,9 @@ def fit(
     given = Path(source)
     if given.is_dir() or is_recording(given):
         if extent is not None:
-            raise InvalidOptionsError("extent is for meshes: a dataset has its own frame", hint="Leave extent out.")
+            raise InvalidOptionsError(
+                "extent is only for meshes: a dataset has its own frame", hint="Leave extent out."
+            )
         files = FitFiles(path, path.with_suffix(".checkpoint"))
         chosen = _options(ReconstructionOptions, options)
         images, named = images_of(given).images, {"dataset": given.resolve().name}
@@ -69,11 +71,12 @@ def fuse(
     progress: Callable[[int], None] | None = None,
     label: str | None = None,
 ) -> FusionReport:
-    """Fuse a recording's depth images to a map, write it to ``output``, a .safetensors file, and say what was made.
+    """Fuse the depth images of a recording into a TSDF map and write it to ``output``, a .safetensors file. Returns a
+    summary of the map.
 
     recording: a path, in any layout of docs/datasets.md · options: entries of FusionOptions · bounds: (2, 3), lowest
-    and highest corner of what the map covers; None: what the images show · progress: told of the images that are fused.
-    Raises InvalidOptionsError, InvalidInputError, DatasetError (DATASET_FRAMES_DISAGREE ...).
+    and highest corner of the map's region; None: the region that the images show · progress: called with the images
+    that are fused. Raises InvalidOptionsError, InvalidInputError, DatasetError (DATASET_FRAMES_DISAGREE ...).
     """
     path, chosen = _checked_output(Path(output)), _options(FusionOptions, options)
     box = None if bounds is None else np.asarray(bounds, np.float64).reshape(2, 3)

@@ -1,4 +1,4 @@
-"""``register``, ``search`` and ``register_batch`` as users call them: in fields, and in depth images.
+"""``register``, ``search`` and ``register_batch``, for scenes that are fields or depth images.
 
 frame = regnf.Frame(depth, K, mask=mask, color=color)
 result = regnf.register(frame, "chair.stl", options={"robust": {"object_unit": "mm"}})
@@ -45,13 +45,14 @@ from regnf_fit.images.recorded_scene import RecordedScene, recorded_scene
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A depth image in memory with its camera, as a driver or a dataset gives it.
+    """A depth image in memory with its camera, as from a driver or a dataset.
 
     depth: (H, W), meters along the camera's axis; or whole numbers of ``depth_unit`` meters, by default millimeters; 0
     and NaN are no measurement · K: (3, 3) or fx, fy, cx, cy, pixels of the depth image, centers at whole numbers as
     OpenCV has them · color: (H', W', 3) uint8, taken by the same camera · mask: (H', W') of the color's or the depth's
-    size, true on the thing: the detection where no other one is given · T_world_camera: (4, 4), camera to world, x
-    right, y down, z forward; None: the camera's frame is the world · name: by which detections and results name it.
+    size, true on the object: the detection, unless another one is given · T_world_camera: (4, 4), camera to world, x
+    right, y down, z forward; None: the camera frame is the world · name: the name of the frame in detections and
+    results.
     """
 
     depth: Any
@@ -64,9 +65,10 @@ class Frame:
 
 
 SceneLike = FieldLike | Frame | Sequence[Frame] | Recording
-"""A field; or depth images: in memory, or the path of a recording (docs/datasets.md)."""
+"""A field, or depth images: in memory, or the path of a recording (docs/datasets.md)."""
 DetectionLike = BoxLike | ImageDetection | Sequence[ImageDetection] | None
-"""A box in the scene's frame; or, in depth images, a mask, box or point in one of them. None: the frames' own masks."""
+"""A box in the scene's frame. For depth images also a mask, box or point in one of them. None: the masks of the
+frames."""
 
 
 def register(
@@ -80,13 +82,12 @@ def register(
     object_model: ObjectModel | None = None,
     clouds: bool = True,
 ) -> Registered:
-    """Find where a known object stands in a scene, a field or depth images: rotation, position and scale, and a
-    verdict.
+    """Find the pose of a known object in a scene (a field or depth images): rotation, position, scale and a verdict.
 
-    As :func:`regnf_core.register`, which says more of the arguments. In depth images the result has ``camera``,
-    ``T_camera_object`` and the picture ``overlay``; the object's size tells its unit unless the option
-    ``robust.object_unit`` does.
-    Raises what that raises, DatasetError, and InvalidDetectionError naming the frame.
+    See :func:`regnf_core.register` for the arguments. For depth images the result also has ``camera``,
+    ``T_camera_object`` and the picture ``overlay``. The object's unit follows from its size, unless the option
+    ``robust.object_unit`` gives it. Raises the errors of that function, DatasetError, and InvalidDetectionError with
+    the name of the frame.
     """
     recording = _recording(scene)
     more = {"progress": progress, "initial_transform": initial_transform, "clouds": clouds}
@@ -109,7 +110,8 @@ def search(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> Search:
-    """Which object stands there, and where: :func:`regnf_core.search`, scenes and detections as of ``register``."""
+    """Find which object is in the box, and its pose: :func:`regnf_core.search`. Scenes and detections as in
+    ``register``."""
     recording = _recording(scene)
     if recording is None:
         return core.search(scene, objects, _box(detection), options, seed, progress, clouds)  # type: ignore[arg-type]
@@ -128,8 +130,8 @@ def register_batch(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> list[BatchOutcome[Registered]]:
-    """Register pairs of detection and object: :func:`regnf_core.register_batch`, with scenes and detections as of
-    ``register``. In depth images ``progress`` is told of one pair after the other."""
+    """Register pairs of detection and object: :func:`regnf_core.register_batch`. Scenes and detections as in
+    ``register``. For depth images ``progress`` is called for one pair after the other."""
     recording = _recording(scene)
     if recording is None:
         return core.register_batch(scene, detections, objects, pairs, options, seed, progress, clouds)  # type: ignore[arg-type]

@@ -79,7 +79,8 @@ def _in_processes(pairs: Sequence[FilePair], processes: int) -> Iterator[tuple[F
             for child in multiprocessing.active_children():  # in the midst of a pair that nobody waits for any more
                 child.kill()
         for pair in lost:
-            error = InvalidInputError("its process died", reason="WORKER_LOST", hint="Is there enough memory?")
+            hint = "Check that there is enough memory."
+            error = InvalidInputError("the process died", reason="WORKER_LOST", hint=hint)
             yield pair, failure(error)
 
 
@@ -154,7 +155,7 @@ def _require_nothing_of_one_object(request: Mapping[str, Any]) -> None:
     reasons = {"initial_transform": "PRESET_UNSUITABLE", "ground_truth": "INVALID_REQUEST"}
     for name, reason in reasons.items():
         if request.get(name) is not None:
-            hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
+            hint = f"Leave `{name}` out, or give `object` instead of `candidates`."
             message = f"`{name}` applies to one object, not to several candidates"
             raise InvalidInputError(message, reason=reason, hint=hint)
 
@@ -183,9 +184,12 @@ def _model(path: str, samples: int) -> ObjectModel:
 
 
 Results = Annotated[
-    Path | None, typer.Option(help="Results, a JSON line each. By default beside the pairs: PAIRS.results.jsonl.")
+    Path | None,
+    typer.Option(help="File for the results, one JSON line per pair. Default: PAIRS.results.jsonl next to the pairs."),
 ]
-Processes = Annotated[int | None, typer.Option(min=1, help="Processes, of one thread each. By default one a core.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Number of processes, each with one thread. Default: one per core.")
+]
 _REASONS_SHOWN, _LINES_SHOWN = 8, 5
 
 
@@ -193,7 +197,8 @@ def batch(
     pairs: Annotated[
         Path,
         typer.Argument(
-            help="JSON Lines, or CSV: scene, object, detection and more of each pair. Paths are relative to the file.",
+            help="File with the pairs, JSON Lines or CSV: scene, object, detection and optional members of "
+            "each pair. Paths are relative to this file.",
             exists=True,
             dir_okay=False,
             metavar="PAIRS",
@@ -205,12 +210,12 @@ def batch(
     worker_timeout: WorkerTimeout = 60,
     token: Token = None,
 ) -> None:
-    """Register many pairs; given again, the command goes on where it stopped, and does failed pairs again.
+    """Register many pairs. The same command again continues after an interruption and repeats failed pairs.
 
-    Example: **regnf batch pairs.jsonl**, with a line for each pair such as
+    Example: **regnf batch pairs.jsonl**, with one line per pair, for example
     `{"key": "a", "scene": "room.ckpt", "object": "chair.ckpt", "detection": {"min": [0, 0, 0], "max": [1, 1, 1]}}`
 
-    Exit codes: 0 every pair has a result, 1 some failed, 2 bad input, 3 service unavailable.
+    Exit codes: 0 all pairs have a result, 1 some pairs failed, 2 bad input, 3 service unavailable.
     """
     if server is None:
         require("engine")
@@ -245,7 +250,7 @@ def _show_failures(failures: dict[str, list[dict[str, Any]]]) -> None:
         place = f"line {lines}" if len(told) == 1 else f"{len(told)} pairs, lines {lines}{more}; the first"
         fail(reason, f"{place}: {first['detail']}", hint=first.get("hint"))
     if len(failures) > _REASONS_SHOWN:
-        err.print(f"and {len(failures) - _REASONS_SHOWN} other reasons, in the results", markup=False)
+        err.print(f"and {len(failures) - _REASONS_SHOWN} other reasons; see the results", markup=False)
 
 
 def _write(ended: Iterator[tuple[FilePair, dict[str, Any]]], results: ResultsFile, count: int) -> None:
@@ -256,7 +261,7 @@ def _write(ended: Iterator[tuple[FilePair, dict[str, Any]]], results: ResultsFil
                 results.add(pair, told)
                 bar.advance(task)
     except KeyboardInterrupt:
-        tell("interrupted: the same command goes on from here")
+        tell("interrupted: run the same command again to continue")
         raise
 
 

@@ -26,7 +26,7 @@ _MORE = ("initial_transform", "ground_truth", "pictures")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _KNOWN = frozenset((*MEMBERS, *_MORE))
 _HINT = 'Write {"scene": FILE, "object": FILE, "detection": BOX or FILE} on each line.'
-_HEADER_HINT = "Name the columns in the first line: scene,object,detection and more of " + ", ".join(MEMBERS) + "."
+_HEADER_HINT = "Write the column names in the first line: scene,object,detection and any of " + ", ".join(MEMBERS) + "."
 _LINE_BEGINS = b'{"id": "'
 """How every line of results begins: what is otherwise is another file of the user's."""
 _JSON_LINES = frozenset({".jsonl", ".ndjson", ".json"})
@@ -90,7 +90,7 @@ def _csv_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
             if any(cell.strip() for cell in row):
                 yield rows.line_num + skipped, _row(names, row)
     except csv.Error as error:
-        raise _wrong(f"{path}, line {rows.line_num + skipped}: no table: {error}", _HEADER_HINT) from error
+        raise _wrong(f"{path}, line {rows.line_num + skipped}: not a table: {error}", _HEADER_HINT) from error
 
 
 def _row(names: list[str], row: list[str]) -> dict[str, Any] | RegnfError:
@@ -98,7 +98,7 @@ def _row(names: list[str], row: list[str]) -> dict[str, Any] | RegnfError:
     cells = [cell.strip() for cell in row]
     if any(cells[len(names) :]):
         message = f"the row has {len(cells)} cells, the header {len(names)}"
-        return _wrong(message, "Put a cell that holds the separator into double quotes.")
+        return _wrong(message, "Put a cell that contains the separator into double quotes.")
     try:
         return {name: _cell(name, cell) for name, cell in zip(names, cells, strict=False) if cell}
     except InvalidInputError as error:
@@ -139,7 +139,7 @@ def _cell(name: str, text: str) -> Any:
 
 def _json_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
     if text.lstrip()[:1] == "[":
-        raise _wrong(f"{path}: one list, expected an object on each line")
+        raise _wrong(f"{path}: a single list, expected a JSON object on each line")
     for number, line in enumerate(text.split("\n"), 1):
         if line.strip():
             try:
@@ -157,7 +157,7 @@ def _pair(folder: Path, line: int, given: Any) -> FilePair:
         if isinstance(given, RegnfError):
             raise given
         if not isinstance(given, dict):
-            raise _wrong("the line is no object")
+            raise _wrong("the line is no JSON object")
         _check_names(given)
         scene, objects = _fields(folder, given)
         return FilePair(line, name, key, scene, objects, "candidates" in given, _request(folder, given))
@@ -169,7 +169,7 @@ def _check_names(given: Collection[str]) -> None:
     """Raises InvalidInputError (INVALID_REQUEST) for members that are unknown, or too few."""
     unknown = next((name for name in given if name not in _KNOWN), None)
     if unknown is not None:
-        raise _wrong(f"no member `{unknown}` is known", suggestion(unknown, _KNOWN) or _HINT)
+        raise _wrong(f"unknown member `{unknown}`", suggestion(unknown, _KNOWN) or _HINT)
     missing = [name for name in ("scene", "detection") if name not in given]
     if missing or not {"object", "candidates"} & set(given):
         what = f"`{missing[0]}`" if missing else "`object` or `candidates`"
@@ -185,7 +185,7 @@ def _fields(folder: Path, given: Mapping[str, Any]) -> tuple[str, tuple[str, ...
         raise _wrong("`candidates` is no list of files")
     names = (given["scene"], *several)
     if not all(isinstance(name, str) for name in names):
-        raise _wrong("a field is named by something else than a text")
+        raise _wrong("the name of a field is not a text")
     paths = [(name, folder / name) for name in names]
     named = [name if _SHA256.fullmatch(name) and not path.exists() else str(path) for name, path in paths]
     return named[0], tuple(named[1:])
@@ -271,5 +271,5 @@ class ResultsFile:
                 raise self._unreadable(number) from error
 
     def _unreadable(self, number: int) -> InvalidInputError:
-        hint = "Name another file with --output, or delete this one."
+        hint = "Give another file with --output, or delete this one."
         return InvalidInputError(f"{self._path}: line {number} is no result", reason="RESULTS_UNREADABLE", hint=hint)

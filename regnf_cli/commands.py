@@ -1,4 +1,4 @@
-"""The sub-commands of ``regnf``. One that is asked for is loaded alone: others bring HTTP and fitting along."""
+"""The sub-commands of ``regnf``. One that is requested is loaded alone: others bring HTTP and fitting along."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def app_of(names: Iterable[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
     """The command with these sub-commands."""
     app = typer.Typer(
         name="regnf",
-        help="Register neural signed distance fields: find where a known object stands in a scanned room.",
+        help="Register neural signed distance fields: find the pose of a known object in a scanned room.",
         epilog="Exit codes: 0 registered or done, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.",
         no_args_is_help=True,
         rich_markup_mode="markdown",
@@ -44,7 +44,7 @@ def app_of(names: Iterable[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
 
 
 def root(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
 ) -> None:
     if version:
         typer.echo(__version__)
@@ -68,7 +68,7 @@ def usage_fault(error: Any) -> int:
         return EXIT_BAD_INPUT
     command = "regnf" if context is None else " ".join(["regnf", *context.command_path.split()[1:]])
     command = command.replace("regnf -m regnf_cli.main", "regnf")
-    hint = f"`{command} --help` shows what it takes."
+    hint = f"`{command} --help` lists the arguments and options."
     if meant := _meant(message):
         hint = f"Did you mean {meant}? {hint}"
     return fail("USAGE", message, EXIT_BAD_INPUT, hint)

@@ -59,16 +59,14 @@ def _numbers(text: str) -> dict[str, Any]:
 _SUFFIXES = (".safetensors", ".glb", ".ply", ".npz")
 _GRID_MOST = 1024
 _IMPORTING = "importing"
-_FOLLOWING = "importing, and following the rays of the cameras: a minute for some hundred images"
+_FOLLOWING = "importing and tracing the rays of the cameras: about a minute for some hundred images"
 
 
 def convert(
     field: Field,
-    output: Annotated[
-        Path, typer.Argument(metavar="OUT", help="The file to write: *.safetensors, .glb, .ply or .npz.")
-    ],
+    output: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write: .safetensors, .glb, .ply or .npz.")],
     resolution: Annotated[
-        int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
+        int, typer.Option(min=2, max=_GRID_MOST, help="Number of cells along the longest edge, for meshes and grids.")
     ] = 128,
     description: Description = None,
     config: Config = None,
@@ -76,8 +74,8 @@ def convert(
     images: Annotated[
         Path | None,
         typer.Option(
-            help="The posed depth images that the field was fitted to: the safe field then records which parts the "
-            "cameras observed.",
+            help="The posed depth images from which the field was made. The regnf field file then records "
+            "which parts the cameras observed.",
             parser=folder,
             metavar="FOLDER",
         ),
@@ -85,32 +83,35 @@ def convert(
     cameras: Annotated[
         Path | None,
         typer.Option(
-            help="Where the cameras stood whose images the field was made from: transforms.json, meta_data.json, "
-            "poses of TUM, or a folder with a pose a file. The safe field then records which parts they observed; no "
-            "image is needed.",
+            help="The poses of the cameras from whose images the field was made: transforms.json, "
+            "meta_data.json, a TUM trajectory, or a folder with one pose per file. The regnf field "
+            "file then records which parts the cameras observed. No image is needed.",
             parser=existing,
             metavar="PATH",
         ),
     ] = None,
     intrinsics: Annotated[
         str | None,
-        typer.Option(help="Of the cameras, in pixels, where their file does not say.", metavar="FX,FY,CX,CY[,W,H]"),
+        typer.Option(
+            help="Intrinsics of the cameras in pixels, if they are not in the file.", metavar="FX,FY,CX,CY[,W,H]"
+        ),
     ] = None,
     axes: CameraAxes = None,
 ) -> None:
-    """Write a field as a safe field (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid (.npz).
+    """Write a field as a regnf field file (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid
+    (.npz).
 
     Example: **regnf convert step-000030000.ckpt chair.glb --resolution 256**
     """
     require("engine")
     check_output(output, _SUFFIXES, (cameras,))
     if (images or cameras) is not None and output.suffix.lower() != ".safetensors":
-        raise InvalidOptionsError("--images and --cameras go with a safe field (.safetensors)")
+        raise InvalidOptionsError("--images and --cameras need a regnf field file (.safetensors) as the output")
     if images is not None and cameras is not None:
-        raise InvalidOptionsError("--images and --cameras: images tell more, give them alone")
+        raise InvalidOptionsError("--images and --cameras: give only one of them; images have more information")
     said = with_cameras(description, intrinsics, None if cameras is None else axes)
     if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
-        raise InvalidOptionsError("--intrinsics goes with --cameras, --camera-axes with --cameras or --images")
+        raise InvalidOptionsError("--intrinsics needs --cameras; --camera-axes needs --cameras or --images")
     source = source_of(field, said, choice_of(config, no_config))
     check_output(output, _SUFFIXES, (source.file, *source.settings))
     if output.suffix.lower() == ".safetensors":

@@ -70,7 +70,7 @@ def _address(server: subprocess.Popen[str]) -> str:
             if word.startswith("http://"):
                 return word.rstrip("/")
     server.kill()
-    raise RuntimeError("the service did not start; see serve.log in its state folder")
+    raise RuntimeError("the service did not start; see serve.log in its state directory")
 
 
 MAX_ROTATION_RAD = 0.03
@@ -82,14 +82,15 @@ def demo(
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the demo's service; emptied first, kept afterwards. [default: a temporary folder]"
+            help="State directory of the demo's service. It is emptied first and kept afterwards. "
+            "[default: a temporary folder]"
         ),
     ] = None,
     keep_running: Annotated[
         bool | None,
         typer.Option(
             "--keep-running/--exit",
-            help="Wait for Enter at the end, so that the page can be looked at. [default: in a terminal only]",
+            help="Wait for Enter at the end, so that you can look at the page. [default: only in a terminal]",
         ),
     ] = None,
 ) -> None:
@@ -130,7 +131,7 @@ def _state_folder(chosen: Path | None) -> Iterator[Path]:
             yield Path(folder)
         return
     if chosen.exists() and any(chosen.iterdir()) and not (chosen / "serve.log").exists():
-        message = f"{chosen} holds files that are not the demo's; name an empty folder or one of an earlier demo"
+        message = f"{chosen} has files that are not from a demo; give an empty folder, or the folder of an earlier demo"
         raise typer.Exit(fail("STATE_DIR_NOT_EMPTY", message))
     shutil.rmtree(chosen, ignore_errors=True)
     yield chosen

@@ -46,13 +46,13 @@ _COLORS = {"ok": "green", "warning": "yellow", "error": "bold red"}
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False) -> None:
-    """Look at libraries, GPU, Redis, storage, disk, memory, open files and the port, and say how to mend what is wrong.
+    """Check libraries, GPU, Redis, storage, disk, memory, open files and the port, and print how to correct problems.
 
-    The service's settings are read from REGNF_* in the environment.
+    The settings of the service come from the environment variables REGNF_*.
 
     Example: **regnf doctor**
 
-    Exit codes: 0 nothing is wrong (there may be warnings), 3 something is.
+    Exit codes: 0 no errors (there may be warnings), 3 errors.
     """
     findings = list(check_all())
     if as_json:
@@ -76,7 +76,7 @@ def check_all() -> Iterator[Finding]:
     try:
         require("service")
     except MissingExtraError as error:
-        yield Finding("service", "warning", str(error), "Needed to serve, not to register here or to use a service.")
+        yield Finding("service", "warning", str(error), "It is needed only to run a service.")
         return
     from regnf_state.settings import read_settings
 
@@ -122,7 +122,7 @@ def _extra(extra: str) -> Finding:
         return Finding(extra, "ok", "installed")
     missing_all = all(text.endswith("not installed") for text in wrong)
     if missing_all and extra in _OPTIONAL:
-        return Finding(extra, "ok", f"not installed, and needed by no other part: {mend}")
+        return Finding(extra, "ok", f"not installed (optional): {mend}")
     return Finding(extra, "warning" if missing_all else "error", "; ".join(wrong), mend)
 
 
@@ -174,13 +174,13 @@ def _load(module: str) -> Finding:
     try:
         done = _python(f"import {module}")
     except subprocess.TimeoutExpired:
-        hint = "Is the disk or the machine very busy? Try again."
+        hint = "The disk or the machine may be very busy. Try again."
         return Finding(module, "warning", f"did not load within {_TIMEOUT_S} s", hint)
     if done.returncode == 0:
         return Finding(module, "ok", "loads")
     last = (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
     missing = next((package for library, package in _SYSTEM.items() if library in last), None)
-    hint = f"apt-get install {missing}" if missing else f"Install it again: pip install --force-reinstall {module}"
+    hint = f"apt-get install {missing}" if missing else f"Reinstall it: pip install --force-reinstall {module}"
     return Finding(module, "error", last, hint)
 
 
@@ -194,21 +194,24 @@ _ASK = (
 def check_gpu() -> Finding:
     """regnf needs none; a GPU that lies idle is a warning."""
     if find_spec("torch") is None:
-        return Finding("gpu", "ok", "not looked for: torch is not installed")
+        return Finding("gpu", "ok", "not checked: torch is not installed")
     done = _python(_ASK)
     name, _, cuda = done.stdout.strip().rpartition(" ") if done.returncode == 0 else ("", "", "")
     if name:
         return Finding("gpu", "ok", f"{name}, CUDA {cuda}")
     if shutil.which("nvidia-smi") is None:
-        return Finding("gpu", "ok", "none; everything runs on the processor")
-    hint = "Install a torch that is built for your CUDA: pytorch.org has the command. regnf works without it, slower."
-    return Finding("gpu", "warning", "there is an NVIDIA driver, but torch cannot use the GPU", hint)
+        return Finding("gpu", "ok", "none; everything runs on the CPU")
+    hint = (
+        "Install a torch build for your CUDA version; pytorch.org has the command. regnf also works without it, "
+        "but slower."
+    )
+    return Finding("gpu", "warning", "an NVIDIA driver is installed, but torch cannot use the GPU", hint)
 
 
 # The native evaluator: whether fields are evaluated by compiled code or with torch.
 
-_SLOWER = "Registrations take 30 to 50 percent longer than with it."
-_BUILD = "With a C compiler (apt-get install gcc libc6-dev) it is built when regnf is installed."
+_SLOWER = "Registrations take 30 to 50 percent longer without it."
+_BUILD = "Install a C compiler (apt-get install gcc libc6-dev), then reinstall regnf, which builds it."
 
 
 def check_native() -> Iterator[Finding]:
@@ -254,7 +257,7 @@ def _existing(folder: Path) -> Path:
 def _disk(folder: Path) -> Finding:
     there = _existing(folder)
     free = shutil.disk_usage(there).free
-    hint = "Make room, or name another folder: --state-dir, REGNF_STATE_DIR."
+    hint = "Free space on the disk, or give another folder: --state-dir, REGNF_STATE_DIR."
     return _bounded("disk", free, _DISK, f"{free / _GIB:.1f} GiB free at {there}", hint)
 
 
@@ -263,13 +266,13 @@ def _memory(meminfo: Path) -> Finding:
         lines = meminfo.read_text(encoding="ascii").splitlines()
         free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration, ValueError):
-        return Finding("memory", "ok", "not looked at: the system does not say")
-    hint = "A job takes about 1 GiB, with large fields more. Close other programs, or use fewer workers."
+        return Finding("memory", "ok", "not checked: the system does not report it")
+    hint = "A job needs about 1 GiB, and more with large fields. Close other programs, or use fewer workers."
     return _bounded("memory", free, _MEMORY, f"{free / _GIB:.1f} GiB available", hint)
 
 
 def _files(limit: int) -> Finding:
-    hint = "Raise it: `ulimit -n 4096`, or LimitNOFILE= of the service's unit."
+    hint = "Raise the limit: `ulimit -n 4096`, or LimitNOFILE= in the systemd unit."
     if limit == resource.RLIM_INFINITY:
         return Finding("open files", "ok", "no limit")
     return _bounded("open files", limit, _FILES, f"at most {limit}", hint)
@@ -296,7 +299,7 @@ def _taken(subject: str, host: str, port: int, error: OSError) -> Finding:
             return Finding(subject, "ok", f"regnf serves on {host}:{port}")
     except (httpx.HTTPError, ValueError, AttributeError):
         pass
-    hint = "Use another one: regnf serve --port 8081, or REGNF_PORT."
+    hint = "Use another port: regnf serve --port 8081, or REGNF_PORT."
     return Finding(subject, "error", f"cannot be used on {host}: {error.strerror}", hint)
 
 
@@ -336,7 +339,7 @@ def _folder(folder: Path) -> Finding:
     if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
         return Finding("storage", "ok", str(folder))
     what = "cannot be written" if there.is_dir() else "is no folder"
-    hint = f"Check its owner, or name another folder: --state-dir, REGNF_STATE_DIR. You are user {os.getuid()}."
+    hint = f"Check its owner, or give another folder: --state-dir, REGNF_STATE_DIR. You are user {os.getuid()}."
     return Finding("storage", "error", f"{there} {what}", hint)
 
 
@@ -347,5 +350,5 @@ def _object_store(settings: Settings) -> Finding:
         open_blobs(settings, _WAIT_S).probe()
     except Exception as error:  # noqa: BLE001 -- whatever the store's library raises is what is wrong
         hint = "Check REGNF_STORAGE_URL, and the credentials and the endpoint in AWS_*."
-        return Finding("storage", "error", f"takes no bytes: {type(error).__name__}", hint)
-    return Finding("storage", "ok", "the object store takes bytes")
+        return Finding("storage", "error", f"cannot be written: {type(error).__name__}", hint)
+    return Finding("storage", "ok", "the object store can be written")

@@ -92,11 +92,13 @@ _HOSTS_HINT = (
 _READ: tuple[tuple[Callable[[Settings], object], str], ...] = (
     (
         lambda settings: read_callers(settings.api_tokens),
-        "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list, or one a line in a file: @/its/path.",
+        "Write entries as NAME:TOKEN. REGNF_API_TOKENS is a JSON list of entries, or @/path of a file with one entry "
+        "per line.",
     ),
     (
         lambda settings: read_secrets(settings.webhook_secrets),
-        "Write REGNF_WEBHOOK_SECRETS as a JSON list of CALLER:whsec_BASE64, or one a line in a file: @/path.",
+        "Write REGNF_WEBHOOK_SECRETS as a JSON list of CALLER:whsec_BASE64, or as @/path of a file with one entry "
+        "per line.",
     ),
     (
         lambda settings: AllowList(settings.webhook_hosts),
@@ -113,21 +115,23 @@ def check_access(settings: Settings) -> None:
     """Raises StartError for what would let strangers in, and for callers that cannot be read.
 
     PROXY_MISSING: others can reach the address, and no proxy is said to stand before it.
-    UNAUTHENTICATED_PUBLIC_BIND: others can reach the service while no token is asked for. TOKENS_UNUSABLE and
+    UNAUTHENTICATED_PUBLIC_BIND: others can reach the service while no token is requested. TOKENS_UNUSABLE and
     ALLOWED_HOSTS_UNUSABLE: see there.
     """
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
         raise StartError(
-            f"{settings.publish or settings.host} can be reached by others, and no token is configured",
+            f"{settings.publish or settings.host} can be reached from other machines, and no token is configured",
             reason="UNAUTHENTICATED_PUBLIC_BIND",
             hint="Set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind a proxy that authenticates.",
         )
     if not is_loopback(settings.host) and not settings.behind_proxy:
         raise StartError(
-            f"{settings.host} can be reached by others, and the service bears no slow or hostile connections",
+            f"{settings.host} can be reached from other machines, and the service has no protection against slow or "
+            "hostile connections",
             reason="PROXY_MISSING",
-            hint="Listen on 127.0.0.1 with a proxy before it (deploy/helm/regnf/proxy), or, where one keeps others from"
-            " this address, set REGNF_BEHIND_PROXY=true.",
+            hint="Listen on 127.0.0.1 behind a proxy (deploy/helm/regnf/proxy). If a proxy already "
+            "protects this address,"
+            " set REGNF_BEHIND_PROXY=true.",
         )
     for read, hint in _READ:
         try:
@@ -136,7 +140,7 @@ def check_access(settings: Settings) -> None:
             raise StartError(str(error), reason=error.reason, hint=hint) from error
     if not settings.is_private and not settings.allowed_hosts:
         logger.warning(
-            "REGNF_ALLOWED_HOSTS is empty: who calls by a name, or through a port of another host, is refused"
+            "REGNF_ALLOWED_HOSTS is empty: requests that use a host name, or the port of another host, are refused"
         )
 
 
@@ -165,10 +169,10 @@ def open_socket(settings: Settings) -> socket.socket:
 
 def _address_hint(error: OSError, settings: Settings) -> str:
     if error.errno == errno.EADDRINUSE:
-        return f"Another program uses port {settings.port}: stop it, or give --port 0 for a free one."
+        return f"Another program uses port {settings.port}. Stop it, or give --port 0 to choose a free port."
     if error.errno == errno.EACCES:
-        return "Ports below 1024 need privileges: give --port 8080."
-    return "Give an address of this machine with --host: 127.0.0.1 for this machine alone."
+        return "Ports below 1024 need privileges. Give for example --port 8080."
+    return "Give an address of this machine with --host. 127.0.0.1 can be reached only from this machine."
 
 
 def address_of(listener: socket.socket) -> str:

@@ -25,12 +25,15 @@ if TYPE_CHECKING:
 _LONGEST_LABEL = 200  # of the safe format
 
 
-SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
+SafeField = Annotated[Path, typer.Argument(help="The regnf field file to write (.safetensors).")]
 Bounds = Annotated[
     str | None,
-    typer.Option(help="Images: what the field covers, world. By default what they show.", metavar="X,Y,Z,X,Y,Z"),
+    typer.Option(
+        help="Region that the field covers, world frame (only for images). Default: the region that the images show.",
+        metavar="X,Y,Z,X,Y,Z",
+    ),
 ]
-Label = Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")]
+Label = Annotated[str | None, typer.Option(help="A name that is stored in the file, up to 200 characters.")]
 
 
 def check_field_to_write(output: Path, label: str | None) -> None:
@@ -48,18 +51,22 @@ def print_report(figures: dict[str, Any]) -> None:
     warn(warnings)
 
 
-_Iterations = Annotated[int | None, typer.Option(min=1, help="Training steps; more is finer. Without it 3000.")]
+_Iterations = Annotated[
+    int | None, typer.Option(min=1, help="Number of training steps. More steps give finer details. Default: 3000.")
+]
 _TableLog2 = Annotated[
     int | None,
     typer.Option(
-        min=8, max=22, help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show."
+        min=8,
+        max=22,
+        help="log2 of the entries per hash level. Default: 15; for images 15 to 18, depending on what they show.",
     ),
 ]
 _Extent = Annotated[
     float | None,
     typer.Option(
-        help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
-        "Else its own frame."
+        help="Meshes: center the mesh and scale its longest edge to this many units (at most 2 always "
+        "fits). Default: its own frame."
     ),
 ]
 _OF_IMAGES_UNSAID = (None, None, False, "auto", False, "auto", None, None, None, None)
@@ -69,7 +76,7 @@ def fit(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A mesh (glb, obj, ply, stl), or a recording: posed images in any layout of docs/datasets.md.",
+            help="A mesh (glb, obj, ply, stl), or a recording: posed images in a layout of docs/datasets.md.",
             exists=True,
         ),
     ],
@@ -80,31 +87,34 @@ def fit(
     label: Label = None,
     seed: Seed = 0,
     hidden_width: Annotated[
-        int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
+        int | None, typer.Option(min=8, max=1024, help="Width of the network. Default: 128 for meshes, 64 for images.")
     ] = None,
     snapshots: Annotated[
-        str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
+        str | None,
+        typer.Option(help="Images: also write the field after these percentages of the training, for example 1,3,10."),
     ] = None,
     sdfstudio: Annotated[
-        Path | None, typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt).")
+        Path | None, typer.Option(help="Images: also write a checkpoint in sdfstudio's layout, with colors (.ckpt).")
     ] = None,
     pictures: Annotated[
-        bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")
+        bool,
+        typer.Option("--pictures", help="Images: write pictures of the field, early in the training and at the end."),
     ] = False,
-    start: Annotated[Literal["auto", "object", "room"], typer.Option(help="Images: the shape to start from.")] = "auto",
+    start: Annotated[Literal["auto", "object", "room"], typer.Option(help="Images: the initial shape.")] = "auto",
     refine_poses: Annotated[
-        bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
+        bool,
+        typer.Option("--refine-poses", help="Images with depths: refine the camera poses together with the field."),
     ] = False,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Images: where to compute.")] = "auto",
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Images: the device that computes.")] = "auto",
     bounds: Bounds = None,
     depth_unit: DepthUnit = None,
     intrinsics: Intrinsics = None,
     layout: Layout = None,
     axes: CameraAxes = None,
 ) -> None:
-    """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
+    """Fit a neus-facto field to the exact distance of a mesh, or to posed images. It takes minutes on two cores.
 
-    A fit to images that was interrupted goes on from OUTPUT's .checkpoint when the same command is given again.
+    To continue an interrupted fit to images, run the same command again. It starts from OUTPUT's .checkpoint.
 
     Examples: **regnf fit chair.glb chair.safetensors --extent 1.0**, **regnf fit images/ chair.safetensors**
     """
@@ -121,7 +131,7 @@ def fit(
     rest: dict[str, Any] = {"seed": seed, "label": label}
     if source.is_dir() or layout is not None or is_recording(source):
         if extent is not None:
-            raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
+            raise InvalidOptionsError("--extent is only for meshes: a dataset has its own frame")
         wanted = ReconstructionOptions(**settings, table_log2=table_log2, start=start, refine_poses=refine_poses)
         checkpoint = output.with_suffix(".checkpoint")
         files = FitFiles(output, checkpoint, shares(snapshots), pictures=pictures, sdfstudio=sdfstudio)
@@ -129,7 +139,7 @@ def fit(
         with _fitting() as (say, report):
             say("reading the images")
             images = _taken(source, given_of(depth_unit, intrinsics, layout, axes), bounds)
-            say("laying out the rays")
+            say("preparing the rays")
             fitted = reconstruct(images, files, wanted, progress=report, **rest)
         print_report(asdict(fitted))
         return
@@ -141,7 +151,7 @@ def fit(
     for done in target.source.get("mesh_faces", ()):
         tell(f"{source.name}: {done}")
     with _fitting() as (say, report):
-        say("sampling exact distances")
+        say("sampling the exact distances")
         figures = fit_field(target.field, output, options, progress=report, source=target.source, **rest)
     print_report(asdict(figures))
 
@@ -151,7 +161,7 @@ def _require_unsaid(*of_images: object) -> None:
     if of_images != _OF_IMAGES_UNSAID:
         named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device, --bounds, --depth-unit,"
         named += " --intrinsics, --layout and --camera-axes"
-        raise InvalidOptionsError(f"{named} are for images")
+        raise InvalidOptionsError(f"{named} are only for images")
 
 
 @contextmanager
@@ -181,9 +191,9 @@ def shares(percents: str | None) -> tuple[float, ...]:
     try:
         values = tuple(float(part) / 100.0 for part in percents.split(","))
     except ValueError as error:
-        raise InvalidOptionsError(f"snapshots are percents such as 1,3,10, not {percents:.40}") from error
+        raise InvalidOptionsError(f"snapshots are percentages such as 1,3,10, not {percents:.40}") from error
     if not all(0.0 < value < 1.0 for value in values):
-        raise InvalidOptionsError("snapshots lie between 0 and 100 percent")
+        raise InvalidOptionsError("snapshots must be between 0 and 100 percent")
     return values
 
 
@@ -191,21 +201,22 @@ def fuse(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="Depth images with cameras and poses: a folder in any layout of docs/datasets.md, or a bag.",
+            help="Posed depth images: a folder in a layout of docs/datasets.md, or a bag.",
             exists=True,
         ),
     ],
     output: SafeField,
     voxel: Annotated[
         float | None,
-        typer.Option(help="From node to node, the recording's units; without it as wide as a pixel is at its surface."),
+        typer.Option(help="Voxel size in the recording's unit. Default: the width of a pixel at the surface."),
     ] = None,
     truncation: Annotated[
         float | None,
         typer.Option(
             min=1.0,
             max=1000.0,
-            help="Voxels; without it 4, or 6 standard deviations of the depths from image to image.",
+            help="TSDF truncation in voxels. Default: 4, or more for noisy depth (6 standard deviations "
+            "between images).",
         ),
     ] = None,
     label: Label = None,
@@ -215,16 +226,17 @@ def fuse(
     layout: Layout = None,
     axes: CameraAxes = None,
 ) -> None:
-    """Fuse posed depth images to a map, with what they have seen of it: seconds, where a fit takes minutes.
+    """Fuse posed depth images into a TSDF map with its observation. It takes seconds; a fit takes minutes.
 
-    Images that contradict each other, as by a wrong unit or wrong axes, are refused with what mends it.
+    Images that contradict each other are refused, for example if a unit or an axis is wrong. The message has the
+    correction.
 
     Example: **regnf fuse room-images room.safetensors**
     """
     require("engine")
     check_field_to_write(output, label)
     if voxel is not None and not 1e-9 <= voxel <= 1e6:
-        raise InvalidOptionsError("the voxel's edge must lie between 1e-9 and 1e6")
+        raise InvalidOptionsError("the voxel size must be between 1e-9 and 1e6")
     from regnf_fit.images.fusion import FusionOptions, fuse_images
 
     said = given_of(depth_unit, intrinsics, layout, axes)
@@ -257,8 +269,8 @@ def _taken(
         try:
             box = np.array([float(one) for one in bounds.split(",")]).reshape(2, 3)
         except ValueError as error:
-            message = f"--bounds {bounds[:200]}: expected six numbers, the lowest corner and the highest"
-            raise InvalidOptionsError(message, hint="Give for example --bounds=-1,-1,0,1,1,2.") from error
+            message = f"--bounds {bounds[:200]}: expected six numbers, the lowest and the highest corner"
+            raise InvalidOptionsError(message, hint="Write for example --bounds=-1,-1,0,1,1,2.") from error
     taken = images_of(source, said, box, progress=report)
     for note in taken.notes:
         tell(f"note: {note}")

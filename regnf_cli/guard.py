@@ -1,4 +1,4 @@
-"""Starts a command that ends when the process that asked for it ends, however that one ends.
+"""Starts a command that ends when the process that requested it ends, however that one ends.
 
     python -m regnf_cli.guard PARENT_PID COMMAND [ARGUMENT ...]
 

@@ -43,12 +43,14 @@ def inspect(
     no_config: NoConfig = False,
     picture: Annotated[
         Path | None,
-        typer.Option(help="A PNG to write: two views and a section; of a recording images and a plan.", dir_okay=False),
+        typer.Option(
+            help="A PNG to write: two views and a section. For a recording: images and a plan.", dir_okay=False
+        ),
     ] = None,
     candidates: Annotated[
         Path | None,
         typer.Option(
-            help="Where to write pictures of what the file may be, if nothing in it tells.",
+            help="Folder for pictures of the possible readings, if the file is ambiguous.",
             file_okay=False,
             metavar="FOLDER",
         ),
@@ -59,12 +61,12 @@ def inspect(
     layout: Layout = None,
     axes: CameraAxes = None,
 ) -> None:
-    """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility. Or what a
-    recording is (depth images with their cameras): layout, units, cameras, and whether its frames agree.
+    """Show the report of a field file: its format and how it was recognized, bounds, parameters, plausibility. For a
+    recording (depth images with cameras): layout, units, cameras, and whether its frames agree.
 
     Example: **regnf inspect step-000030000.ckpt --picture chair.png**
 
-    A file that may be one of several functions is refused with what to say for each; `--candidates` draws them.
+    If a file is ambiguous, the command prints the import option of each possible reading; `--candidates` draws them.
     """
     require("engine")
     if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
@@ -90,7 +92,7 @@ def inspect(
         if picture is not None:
             made = Path(folder) / PICTURE_NAME
             if not made.exists():
-                raise InvalidInputError("no picture could be made: the field is too slow for it", reason="NO_PICTURE")
+                raise InvalidInputError("no picture was made: the field is too slow to draw", reason="NO_PICTURE")
             shutil.copyfile(made, picture)
     if as_json:
         out.print_json(json.dumps(report))

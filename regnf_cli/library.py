@@ -83,7 +83,7 @@ class Shelf:
         self._kept.remove(name)
 
     def file(self, entry: Shown, folder: Path) -> Path:
-        """The entry's safe field: where it lies; of a service, written into ``folder``."""
+        """The entry's regnf field file: where it lies; of a service, written into ``folder``."""
         if self._client is None:
             return Path(entry.place)
         return self._client.library.download(entry.notes.name, folder / f"{entry.field}.safetensors")
@@ -105,7 +105,7 @@ def open_shelf(folder: Path | None, server: str | None, token: str | None) -> It
 
 
 app = typer.Typer(
-    help="Keep objects by name, with tags: add, list, show, edit, remove, export, import.",
+    help="Manage a library of objects: add, list, show, edit, remove, export, import.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
 )
@@ -117,20 +117,22 @@ Folder = Annotated[
     Path | None,
     typer.Option(
         "--library",
-        help="The library's folder; without it $REGNF_LIBRARY, or your own.",
+        help="The library's folder. Default: $REGNF_LIBRARY, or your own library.",
         parser=output_folder,
         metavar="FOLDER",
     ),
 ]
-Server = Annotated[str | None, typer.Option(help="Address of a regnf service: your library there.")]
-Tags = Annotated[list[str] | None, typer.Option("--tag", help="A tag; give it several times for several.")]
-Unit = Annotated[str | None, typer.Option(help="Of the field: m, cm, mm, in or ft.")]
-Note = Annotated[str | None, typer.Option(help="A line for people.")]
+Server = Annotated[
+    str | None, typer.Option(help="Address of a regnf service. The command then uses your library there.")
+]
+Tags = Annotated[list[str] | None, typer.Option("--tag", help="A tag. Repeat the option for several tags.")]
+Unit = Annotated[str | None, typer.Option(help="Unit of the field: m, cm, mm, in or ft.")]
+Note = Annotated[str | None, typer.Option(help="A comment, one line.")]
 Symmetry = Annotated[
     str | None,
     typer.Option(
-        help='In place of the detected one, JSON: {"order": 4, "axis": [0, 0, 1], "continuous": false}. Or none: it '
-        "has no symmetry. Or detected."
+        help='Symmetry instead of the detected one, JSON: {"order": 4, "axis": [0, 0, 1], "continuous": false}. '
+        "none: the object has no symmetry. detected: use the detected one."
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -151,7 +153,7 @@ def add(
     server: Server = None,
     token: Token = None,
 ) -> None:
-    """Import a field as an object, find its symmetry, and keep it under a name.
+    """Import a field as an object, detect its symmetry, and store it under a name.
 
     Example: **regnf library add "office chair" chair.glb --tag seat --unit m**
     """
@@ -164,7 +166,7 @@ def add(
 @app.command("list")
 def list_(
     tag: Annotated[str | None, typer.Option(help="Only entries with this tag.")] = None,
-    name: Annotated[str | None, typer.Option(help="Only those with this in their names.")] = None,
+    name: Annotated[str | None, typer.Option(help="Only entries whose name contains this text.")] = None,
     library: Folder = None,
     server: Server = None,
     token: Token = None,
@@ -191,7 +193,7 @@ def list_(
 def show(
     name: Name, library: Folder = None, server: Server = None, token: Token = None, as_json: AsJson = False
 ) -> None:
-    """Show one entry, and where its field lies.
+    """Show one entry and the location of its field.
 
     Example: **regnf library show "office chair"**
     """
@@ -206,7 +208,7 @@ def show(
 @app.command()
 def edit(
     name: Name,
-    rename: Annotated[str | None, typer.Option(help="Another name.")] = None,
+    rename: Annotated[str | None, typer.Option(help="The new name.")] = None,
     tag: Tags = None,
     unit: Unit = None,
     note: Note = None,
@@ -215,8 +217,8 @@ def edit(
     server: Server = None,
     token: Token = None,
 ) -> None:
-    """Change what is said of an entry. What is not named stays; `none` takes unit, note or all tags back,
-    `detected` the symmetry.
+    """Change an entry. Options that are not given leave their value unchanged. `none` removes the unit, the note or all
+    tags; `detected` restores the detected symmetry.
 
     Example: **regnf library edit "office chair" --rename armchair --symmetry detected**
     """
@@ -232,7 +234,7 @@ def edit(
 
 @app.command()
 def remove(name: Name, library: Folder = None, server: Server = None, token: Token = None) -> None:
-    """Take an entry out of the library: in a folder with its field, at a service without.
+    """Remove an entry from the library. A folder deletes its field too; a service keeps it.
 
     Example: **regnf library remove "office chair"**
     """
@@ -243,21 +245,21 @@ def remove(name: Name, library: Folder = None, server: Server = None, token: Tok
 
 @app.command("export")
 def export_(
-    archive: Annotated[Path, typer.Argument(help="The file, .zip.", metavar="ARCHIVE")],
+    archive: Annotated[Path, typer.Argument(help="The .zip file to write.", metavar="ARCHIVE")],
     tag: Annotated[str | None, typer.Option(help="Only entries with this tag.")] = None,
     library: Folder = None,
     server: Server = None,
     token: Token = None,
 ) -> None:
-    """Write the library into one file: an index, and the fields in the safe format.
+    """Write the library into one file: an index and the regnf field files.
 
     Example: **regnf library export chairs.zip --tag seat**
     """
     with open_shelf(library, server, token) as shelf:
         entries = shelf.entries(tag)
         if not entries:
-            hint = "`regnf library list` shows what there is."
-            raise InvalidInputError("there is no entry to export", reason="LIBRARY_EMPTY", hint=hint)
+            hint = "`regnf library list` lists the entries."
+            raise InvalidInputError("no entry to export", reason="LIBRARY_EMPTY", hint=hint)
         with TemporaryDirectory(prefix="library-") as folder:
             files = [(one, shelf.file(one, Path(folder))) for one in entries]
             write_archive(
@@ -269,21 +271,21 @@ def export_(
 
 @app.command("import")
 def import_(
-    archive: Annotated[Path, typer.Argument(help="A file that `export` wrote.", parser=file, metavar="ARCHIVE")],
-    skip_taken: Annotated[bool, typer.Option("--skip-taken", help="Leave out entries whose names are taken.")] = False,
+    archive: Annotated[Path, typer.Argument(help="A file written by `export`.", parser=file, metavar="ARCHIVE")],
+    skip_taken: Annotated[bool, typer.Option("--skip-taken", help="Skip entries whose names exist already.")] = False,
     library: Folder = None,
     server: Server = None,
     token: Token = None,
 ) -> None:
-    """Add the entries of a file that `export` wrote. Each field goes through the import gate.
+    """Add the entries of a file written by `export`. Each field is imported and checked again.
 
     Example: **regnf library import chairs.zip**
     """
     with open_archive(archive) as opened, open_shelf(library, server, token) as shelf, TemporaryDirectory() as folder:
         taken = {one.notes.name for one in shelf.entries()} & {one.notes.name for one in opened.entries}
         if taken and not skip_taken:
-            message = f"{archive}: there are entries {', '.join(map(repr, sorted(taken)[:5]))} already"
-            hint = "Rename or remove them, or leave those of the file out with --skip-taken."
+            message = f"{archive}: these entries exist already: {', '.join(map(repr, sorted(taken)[:5]))}"
+            hint = "Rename or remove these entries, or skip those of the file with --skip-taken."
             raise InvalidInputError(message, reason="LIBRARY_NAME_TAKEN", hint=hint)
         wanted = [one for one in opened.entries if one.notes.name not in taken]
         for one in wanted:

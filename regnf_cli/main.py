@@ -1,4 +1,4 @@
-"""The command ``regnf``: runs the sub-command that is asked for and turns errors into exit codes.
+"""The command ``regnf``: runs the sub-command that is requested and turns errors into exit codes.
 
 Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable ·
 70 an error of regnf itself ·
@@ -18,7 +18,7 @@ import sys
 
 _ONE_THREAD = {"register", "search", "render", "edit"}
 _COLLECT_AFTER = 20_000
-"""Objects between two collections of garbage. With Python's 700 they take .06 s of the time in which torch loads."""
+"""Objects between two collections of garbage. With Python's 700 they take 0.06 s of the time in which torch loads."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_AFTER_S = 0.1
 """When an interrupt that something has swallowed comes again."""
@@ -31,8 +31,8 @@ _OUTPUT = frozenset({*_FULL, *_CLOSED, errno.EIO, None})
 def main() -> None:
     """Entry point of the console script. The process ends here, without the interpreter's own last steps.
 
-    These walk all that torch has made (.4 s), and compiled libraries that are cut off in their work complain of what is
-    left over (nanobind: "leaked function"). What was registered to be done at the exit is done.
+    These walk all that torch has made (0.4 s), and compiled libraries that are cut off in their work complain of what
+    is left over (nanobind: "leaked function"). What was registered to be done at the exit is done.
     """
     ended_by: list[int] = []
     code = 128 + signal.SIGINT
@@ -148,7 +148,7 @@ def _run() -> int:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
         hint = error.hint
         if hint == HINTS["INVALID_OPTIONS"] and "options." not in str(error):  # options of the command line
-            hint = f"`regnf {asked[0]} --help` shows what it takes."
+            hint = f"`regnf {asked[0]} --help` lists the arguments and options."
         fail(error.reason, str(error), code, hint)
         show_candidates(error)
         return code
@@ -158,8 +158,8 @@ def _run() -> int:
 
 def _what_to_do(number: int | None) -> str | None:
     if number in _CLOSED:
-        return "Check who may write there, or name another place."
-    return "Make room on the disk, or name another place." if number in (*_FULL, None) else None
+        return "Check the permissions, or give another path."
+    return "Free space on the disk, or give another path." if number in (*_FULL, None) else None
 
 
 if __name__ == "__main__":

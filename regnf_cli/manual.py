@@ -20,10 +20,10 @@ _LEFT_OUT = ("adr/*", "reference/*", "benchmarks/*")
 
 
 def manual(
-    page: Annotated[str | None, typer.Argument(help="Its name; without it, all pages are listed.")] = None,
-    raw: Annotated[bool, typer.Option("--raw", help="Print Markdown as it is written.")] = False,
+    page: Annotated[str | None, typer.Argument(help="Name of the page. Without it, all pages are listed.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="Print the Markdown source.")] = False,
 ) -> None:
-    """Print a page of the manual, as messages name it.
+    """Print a page of the manual.
 
     Example: **regnf manual families**
     """
@@ -44,7 +44,7 @@ def folder() -> Path:
     for found in (_PACKAGED, _CHECKOUT):
         if found.is_dir():
             return found
-    message = f"the manual is neither in {_PACKAGED} nor in {_CHECKOUT}"
+    message = f"the manual was not found in {_PACKAGED} or {_CHECKOUT}"
     raise InvalidInputError(message, reason="MANUAL_MISSING", hint="Install regnf from its wheel.")
 
 

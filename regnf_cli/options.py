@@ -52,7 +52,7 @@ def _parser(check: Callable[[Path], object], folders: bool = False) -> Callable[
 def _no_folder(path: Path) -> None:
     """Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_NO_FOLDER)."""
     require_file(path)
-    hint = f"Give the folder that holds it: {path.parent}"
+    hint = f"Give the folder that contains it: {path.parent}"
     raise InvalidInputError(f"{path}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
 
 
@@ -85,8 +85,8 @@ def output_folder(text: str) -> Path:
         if place.is_dir():
             break
         if place.exists():
-            message = f"{place}: a file, expected a folder to write into"
-            raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Name another folder.")
+            message = f"{place}: a file, expected a folder for the output"
+            raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Give another folder.")
     return path
 
 
@@ -96,13 +96,19 @@ def check_output(output: Path, endings: Sequence[str], given: Iterable[Path | No
     endings: those that its name may have. Raises InvalidOptionsError.
     """
     if output.suffix.lower() not in endings:
-        hint = "The ending chooses the format." if len(endings) > 1 else f"Write for example {output.stem}{endings[0]}."
+        hint = (
+            "The suffix of the name selects the format."
+            if len(endings) > 1
+            else f"Write for example {output.stem}{endings[0]}."
+        )
         expected = f"one of {', '.join(endings)}" if len(endings) > 1 else endings[0]
         raise InvalidOptionsError(f"{output}: expected a name that ends in {expected}", hint=hint)
     if not output.parent.is_dir():
         raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
     if any(one is not None and one.exists() and output.exists() and output.samefile(one) for one in given):
-        raise InvalidOptionsError(f"{output}: it is read, and would be overwritten", hint="Name another file to write.")
+        raise InvalidOptionsError(
+            f"{output}: this is an input file, and it would be overwritten", hint="Give another file for the output."
+        )
 
 
 def recording_file(text: str) -> Path:
@@ -142,21 +148,23 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
     value = read_json(path, what)
     if isinstance(value, dict):
         return value
-    hint = "Write an object: {...}."
+    hint = "Write a JSON object: {...}."
     raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
 
 
 def read_options(
     path: Path | None, preset: Preset | None, unit: Unit | None = None, scale: str = "known"
 ) -> dict[str, Any]:
-    """Plain options: those of a file, or none, with the preset that was asked for by name, and the object's unit.
+    """Plain options: those of a file, or none, with the preset that was requested by name, and the object's unit.
 
     Raises InvalidOptionsError when the file names another preset, or holds what is no option.
     """
     values = read_object(path, "options") if path else {}
     named = values.get("preset", preset)
     if preset is not None and named != preset:
-        raise InvalidOptionsError(f"options.preset: {path} says {named!r}, --preset {preset}: leave one of them out")
+        raise InvalidOptionsError(
+            f"options.preset: {path} has {named!r}, and --preset is {preset}: leave one of them out"
+        )
     options = values | {"preset": named} if named is not None else values
     if unit is not None or scale == "free":
         robust = options.get("robust", {})
@@ -211,7 +219,7 @@ def description(text: str) -> dict[str, Any]:
     try:
         UploadDescription.from_dict(values)
     except FieldFormatError as error:
-        hint = "docs/import-gate.md lists every entry of a description."
+        hint = "docs/import-gate.md lists all import options."
         raise FieldFormatError(str(error), reason=error.reason, hint=error.hint or hint) from error
     return values
 
@@ -255,7 +263,9 @@ DESCRIPTION: dict[str, Any] = {"parser": description, "metavar": "JSON"}
 
 # a field by itself
 
-Field = Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)]
+Field = Annotated[
+    Path, typer.Argument(help="A file, the folder of a training run, or an archive of such a folder.", **FIELD)
+]
 FieldOrRecording = Annotated[
     Path,
     typer.Argument(
@@ -263,19 +273,24 @@ FieldOrRecording = Annotated[
     ),
 ]
 Description = Annotated[
-    dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
+    dict[str, Any] | None,
+    typer.Option(help="Import options that are not in the file: a JSON file, or JSON.", **DESCRIPTION),
 ]
 Config = Annotated[
-    Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **FILE)
+    Path | None,
+    typer.Option(
+        help="The trainer's config file of the field (for example config.yml), or an archive with several.", **FILE
+    ),
 ]
-NoConfig = Annotated[bool, typer.Option("--no-config", help="Leave settings that lie beside the checkpoint unread.")]
+NoConfig = Annotated[bool, typer.Option("--no-config", help="Ignore config files next to the checkpoint.")]
 
 # a scene, what stands in it, and where
 
 Scene = Annotated[
     Path,
     typer.Argument(
-        help="The scene: a field (a file, a run's folder or an archive), or a recording (depth images, a bag).",
+        help="The scene: a field (a file, the folder of a training run, or an archive), or a recording "
+        "(depth images, a bag).",
         parser=scene_path,
         metavar="SCENE",
     ),
@@ -283,25 +298,35 @@ Scene = Annotated[
 DetectionFile = Annotated[
     Path,
     typer.Option(
-        help="JSON: a box in the scene's frame and units, or of a recording a mask, box or point in an image.", **FILE
+        help="JSON: a box in the scene's frame and units. For a recording also a mask, box or point in an image.",
+        **FILE,
     ),
 ]
 DetectionIndex = Annotated[
-    int | None, typer.Option(min=0, help="Which one, where the file holds a list of detections; 0 is the first.")
+    int | None,
+    typer.Option(min=0, help="Index of the detection, if the file has a list of detections; 0 is the first."),
 ]
 SceneConfig = Annotated[
-    Path | None, typer.Option(help="The settings that the scene was trained with: a file or an archive.", **FILE)
+    Path | None,
+    typer.Option(
+        help="The trainer's config file of the scene (for example config.yml), or an archive with several.", **FILE
+    ),
 ]
-NoConfigs = Annotated[bool, typer.Option("--no-config", help="Leave settings that lie beside a checkpoint unread.")]
+NoConfigs = Annotated[bool, typer.Option("--no-config", help="Ignore config files next to the checkpoints.")]
 SceneDescription = Annotated[
-    dict[str, Any] | None, typer.Option(help="What the scene's file does not say: a file or JSON.", **DESCRIPTION)
+    dict[str, Any] | None,
+    typer.Option(help="Import options that are not in the scene's file: a JSON file, or JSON.", **DESCRIPTION),
 ]
 
 ObjectUnit = Annotated[
-    Unit | None, typer.Option(help="The object's unit. With a scene in meters it tells the scale within 1 %.")
+    Unit | None,
+    typer.Option(help="The unit of the object's file. With a scene in meters it determines the scale within 1 %."),
 ]
 Scale = Annotated[
-    Literal["known", "free"], typer.Option(help="free: whatever the object's unit is, the scale is not known.")
+    Literal["known", "free"],
+    typer.Option(
+        help="known: use the object's unit if it is known. free: the scale is unknown, also if the unit is given."
+    ),
 ]
 
 # what a recording does not say, or says wrongly
@@ -309,18 +334,23 @@ Scale = Annotated[
 CameraAxes = Annotated[
     Literal["opencv", "opengl"] | None,
     typer.Option(
-        "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
+        "--camera-axes",
+        help="Camera convention: opencv (+z forward) or opengl (-z forward). Default: as in the file format.",
     ),
 ]
 DepthUnit = Annotated[
     str | None,
-    typer.Option(help="Of depth images: m, cm, mm, meters a step or steps a meter. By default what the layout says."),
+    typer.Option(
+        help="Unit of depth images: m, cm, mm, meters per step, or steps per meter. Default: the unit of the layout."
+    ),
 ]
 Intrinsics = Annotated[
     str | None,
-    typer.Option(help="Of the depth images' camera: a file, or numbers in pixels.", metavar="FILE|FX,FY,CX,CY[,W,H]"),
+    typer.Option(
+        help="Intrinsics of the depth camera: a file, or fx,fy,cx,cy in pixels.", metavar="FILE|FX,FY,CX,CY[,W,H]"
+    ),
 ]
-Layout = Annotated[str | None, typer.Option(help="Of the recording, where another one is found: bop, tum ...")]
+Layout = Annotated[str | None, typer.Option(help="Layout of the recording, if the detected one is wrong: bop, tum ...")]
 
 
 def given_of(
@@ -338,8 +368,8 @@ def given_of(
     if depth_unit is not None:
         step = {str(name): meters for name, meters in METERS.items()}.get(depth_unit) or step_of(_positive(depth_unit))
         if step is None:
-            hint = "Give mm, m, or meters a step such as 0.001 or 0.0002, or steps a meter such as 5000."
-            raise InvalidOptionsError(f"--depth-unit {depth_unit}: no unit of depth images", hint=hint)
+            hint = "Give mm, m, meters per step such as 0.001 or 0.0002, or steps per meter such as 5000."
+            raise InvalidOptionsError(f"--depth-unit {depth_unit}: not a unit of depth images", hint=hint)
     camera = None
     if intrinsics is not None and Path(intrinsics).is_file():
         found = read_camera_file(Path(intrinsics))
@@ -350,7 +380,7 @@ def given_of(
         if all(numbers):
             camera = camera_of(fx, fy, cx, cy, size, whole_centers=True).check("--intrinsics")
     if intrinsics is not None and camera is None:
-        hint = "Give fx,fy,cx,cy in pixels, or a file of Open3D, RealSense, ROS or a 3x3 matrix."
+        hint = "Give fx,fy,cx,cy in pixels, a file of Open3D, RealSense or ROS, or a file with a 3x3 matrix."
         raise InvalidOptionsError(f"--intrinsics {intrinsics[:200]}: no intrinsics", hint=hint)
     return Given(camera, step, layout, axes)
 
@@ -367,12 +397,12 @@ def _positive(text: str) -> float:
 # the work and its result
 
 Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1)]
-Output = Annotated[Path | None, typer.Option(help="Folder for the result, point clouds and pictures.", **OUTPUT)]
+Output = Annotated[Path | None, typer.Option(help="Output folder for the result, point clouds and pictures.", **OUTPUT)]
 Recording = Annotated[
     Path | None,
-    typer.Option(help="File (.rrd) for a recording to look at in the viewer of rerun. Needs its extra.", **RECORDING),
+    typer.Option(help="File (.rrd) to write for the rerun viewer. Needs the extra `rerun`.", **RECORDING),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result document.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the complete result as JSON.")]
 
 # a service elsewhere
 
@@ -386,12 +416,15 @@ def client_of(server: str | None, token: str | None, worker_timeout: int = 60) -
     return Client(server, token, worker_timeout_s=worker_timeout)
 
 
-Server = Annotated[str | None, typer.Option(help="Address of a regnf service; without it the work is done here.")]
-WorkerTimeout = Annotated[
-    int, typer.Option(min=0, help="With --server: seconds to wait for a worker before giving up.")
+Server = Annotated[
+    str | None, typer.Option(help="Address of a regnf service that does the work. Default: this machine does it.")
 ]
+WorkerTimeout = Annotated[int, typer.Option(min=0, help="With --server: longest time to wait for a worker, seconds.")]
 CancelOnInterrupt = Annotated[
-    bool, typer.Option("--cancel-on-interrupt", help="With --server: Ctrl+C cancels the job; it goes on otherwise.")
+    bool,
+    typer.Option(
+        "--cancel-on-interrupt", help="With --server: Ctrl+C cancels the job. Without this option the job continues."
+    ),
 ]
 Token = Annotated[
     str | None,

@@ -28,7 +28,11 @@ if TYPE_CHECKING:
     from regnf_data.recordings.recording import Recording
 
 LibraryObject = Annotated[
-    Path, typer.Argument(help="The library object's field, in the same forms.", **cli.FIELD | {"metavar": "OBJECT"})
+    Path,
+    typer.Argument(
+        help="The object: a field (a file, the folder of a training run, or an archive).",
+        **cli.FIELD | {"metavar": "OBJECT"},
+    ),
 ]
 
 
@@ -38,24 +42,35 @@ def register(
     detection: cli.DetectionFile,
     detection_index: cli.DetectionIndex = None,
     preset: Annotated[
-        Preset | None, typer.Option(help="robust (the default) needs no initial guess; paper is the published method.")
+        Preset | None,
+        typer.Option(help="The method. robust needs no initial guess; paper is the published method. Default: robust."),
     ] = None,
     options: Annotated[
-        Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **cli.FILE)
+        Path | None, typer.Option(help="JSON file with registration options (see `regnf manual api`).", **cli.FILE)
     ] = None,
     scene_config: cli.SceneConfig = None,
-    object_config: Annotated[Path | None, typer.Option(help="The same of the object.", **cli.FILE)] = None,
+    object_config: Annotated[
+        Path | None,
+        typer.Option(help="The trainer's config file of the object, or an archive with several.", **cli.FILE),
+    ] = None,
     no_config: cli.NoConfigs = False,
     scene_description: cli.SceneDescription = None,
     object_description: Annotated[
-        dict[str, Any] | None, typer.Option(help="The same of the object.", **cli.DESCRIPTION)
+        dict[str, Any] | None,
+        typer.Option(help="Import options that are not in the object's file: a JSON file, or JSON.", **cli.DESCRIPTION),
     ] = None,
     initial_transform: Annotated[
         Path | None,
-        typer.Option(help="JSON: a T_object_scene to try first, as a 4x4 or in a result document.", **cli.FILE),
+        typer.Option(
+            help="Initial guess: a JSON file with a 4x4 T_object_scene, or a result.json. It is searched first.",
+            **cli.FILE,
+        ),
     ] = None,
     ground_truth: Annotated[
-        Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **cli.FILE)
+        Path | None,
+        typer.Option(
+            help="JSON file with the true T_object_scene. The errors of the result are then printed.", **cli.FILE
+        ),
     ] = None,
     object_unit: cli.ObjectUnit = None,
     scale: cli.Scale = "known",
@@ -72,7 +87,7 @@ def register(
     token: cli.Token = None,
     as_json: cli.AsJson = False,
 ) -> None:
-    """Find where a known object stands in a scanned scene: rotation, position and scale.
+    """Find the pose of a known object in a scanned scene: rotation, position and scale.
 
     Example: **regnf register room.ckpt chair.ckpt --detection box.json --output out/**
 
@@ -83,7 +98,7 @@ def register(
     request = _request(found, cli.read_options(options, preset, object_unit, scale), seed)
     if initial_transform and RegistrationOptions.from_dict(request["options"]).preset != "robust":
         raise InvalidInputError(
-            "only the preset robust starts from a given transform",
+            "only the preset robust can use an initial transform",
             reason="PRESET_UNSUITABLE",
             hint="Leave --initial-transform out, or use --preset robust.",
         )
@@ -94,8 +109,8 @@ def register(
     if server is None:
         require("engine", *(["rerun"] if recording else []))
     elif recording is not None:
-        hint = "Leave --server out, or look at the page of the job."
-        raise InvalidOptionsError("--recording is for registrations that are done here", hint=hint)
+        hint = "Leave --server out, or use the web page of the job."
+        raise InvalidOptionsError("--recording works only without --server", hint=hint)
     said = depth_unit, intrinsics, layout, camera_axes
     thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
     place = _place(
@@ -151,21 +166,29 @@ def search(
     library: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Libraries, folders of fields, or fields: the objects. Without any, your library.",
+            help="The objects: libraries, folders of fields, or fields. Default: your library.",
             parser=cli.library_path,
             metavar="[LIBRARY]...",
         ),
     ] = None,
-    tag: Annotated[str | None, typer.Option(help="Of libraries, only the entries with this tag.")] = None,
+    tag: Annotated[str | None, typer.Option(help="Search only library entries with this tag.")] = None,
     detection_index: cli.DetectionIndex = None,
-    top: Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")] = 5,
-    options: Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **cli.FILE)] = None,
+    top: Annotated[int, typer.Option(min=1, help="Number of most probable candidates to print.")] = 5,
+    options: Annotated[
+        Path | None, typer.Option(help="JSON file with options of the preset robust.", **cli.FILE)
+    ] = None,
     scene_config: cli.SceneConfig = None,
-    object_config: Annotated[Path | None, typer.Option(help="The same of every object.", **cli.FILE)] = None,
+    object_config: Annotated[
+        Path | None,
+        typer.Option(help="The trainer's config file of all objects, or an archive with several.", **cli.FILE),
+    ] = None,
     no_config: cli.NoConfigs = False,
     scene_description: cli.SceneDescription = None,
     object_description: Annotated[
-        dict[str, Any] | None, typer.Option(help="The same of every object.", **cli.DESCRIPTION)
+        dict[str, Any] | None,
+        typer.Option(
+            help="Import options that are not in the objects' files: a JSON file, or JSON.", **cli.DESCRIPTION
+        ),
     ] = None,
     object_unit: cli.ObjectUnit = None,
     scale: cli.Scale = "known",
@@ -181,18 +204,18 @@ def search(
     token: cli.Token = None,
     as_json: cli.AsJson = False,
 ) -> None:
-    """Find which object of a library stands in the box, and where.
+    """Find which object of a library is in the box, and its pose.
 
     Example: **regnf search room.ckpt chairs/ --detection box.json --top 3**, or of your library
     **regnf search room.ckpt --tag seat --detection box.json**
 
-    Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
+    Exit codes: 0 registered, 4 ambiguous, 1 rejected (no candidate fits), 2 bad input, 3 service unavailable.
     """
     found = cli.read_detection(detection, detection_index)
     request = _request(found, cli.read_options(options, None, object_unit, scale), seed)
     if RegistrationOptions.from_dict(request["options"]).preset != "robust":
         message = f"{options}: only the preset robust searches a library"
-        hint = "Leave the preset out of the options."
+        hint = "Remove the preset from the options."
         raise InvalidInputError(message, reason="PRESET_UNSUITABLE", hint=hint)
     if server is None:
         require("engine")
@@ -219,7 +242,7 @@ def _objects_of(named: list[Path] | None, tag: str | None) -> Iterator[FieldSour
     entries = [(library, one) for library in libraries for one in library.entries(tag)]
     if libraries and not entries:
         which = "" if tag is None else f" with the tag {tag!r}"
-        hint = "`regnf library add NAME FIELD` adds one; or name a folder of fields."
+        hint = "`regnf library add NAME FIELD` adds an entry. Or give a folder of fields."
         raise InvalidInputError(f"{libraries[0].folder}: no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
     yield from (FieldSource(Path(one.notes.name), library.file(one)) for library, one in entries)
     files = [path for path in paths if path not in [library.folder for library in libraries]]

@@ -260,7 +260,7 @@ def _register_remotely(
         searched: Any = objects or [one for one in client.library.entries(tag) if one.state != "rejected"]
         if not searched:
             which = "" if tag is None else f" with the tag {tag!r}"
-            hint = "`regnf library add NAME FIELD --server ...` adds one."
+            hint = "`regnf library add NAME FIELD --server ...` adds an entry."
             raise InvalidInputError(f"the library has no entries{which}", reason="LIBRARY_EMPTY", hint=hint)
         more = {name: value for name, value in request.items() if name != "detection"}
         place: Any = scene
@@ -292,7 +292,7 @@ def _leave(client: Client, job: Job, page: str, cancel: bool) -> None:
         said = f"canceled the job {job.id}"
     else:
         said = (
-            f"the job {job.id} goes on: the same command follows it again, {page} shows it\n"
+            f"the job {job.id} continues. Run the same command to follow it again, or see {page}\n"
             f"To cancel it: curl -X POST {client.address}/jobs/{job.id}/cancel, "
             "or give --cancel-on-interrupt next time."
         )

@@ -16,35 +16,46 @@ from regnf_core.errors import InvalidInputError, InvalidOptionsError, filled_fol
 from regnf_core.field_source import FieldSource, find_source
 from regnf_core.rendering.request import MOST_FRAMES, RenderRequest
 
-Folder = Annotated[Path, typer.Option(help="The folder for the pictures.", **cli.OUTPUT)]
+Folder = Annotated[Path, typer.Option(help="Output folder for the pictures.", **cli.OUTPUT)]
 Request = Annotated[
     Path | None,
-    typer.Option(help="JSON: the whole request (docs/editing.md); other options take precedence.", **cli.FILE),
+    typer.Option(
+        help="JSON file with a complete request (docs/editing.md). Options of the command line take precedence.",
+        **cli.FILE,
+    ),
 ]
-Size = Annotated[str | None, typer.Option(help="Of every picture; 480x360 by default.", metavar="WIDTHxHEIGHT")]
+Size = Annotated[str | None, typer.Option(help="Size of the pictures. Default: 480x360.", metavar="WIDTHxHEIGHT")]
 ModeChoice = Annotated[
     Literal["surface", "volume"] | None,
     typer.Option(
-        help="surface: the zero level (the default). volume: as NeuS renders; takes three to four times as long."
+        help="surface: the zero level. volume: as NeuS renders; it takes three to four times as long. Default: surface."
     ),
 ]
-Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 8 by default.")]
-Elevation = Annotated[float | None, typer.Option(help="Of the orbit above the horizon, degrees; 25 by default.")]
-Around = Annotated[
-    Path | None, typer.Option(help="JSON: a box to orbit round; by default the first edit's, or the scene.", **cli.FILE)
+Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Number of cameras on the orbit. Default: 8.")]
+Elevation = Annotated[
+    float | None, typer.Option(help="Elevation of the orbit above the horizon, degrees. Default: 25.")
 ]
-UpAxis = Annotated[str | None, typer.Option(help="The scene's vertical: x, y, z, -x, -y or -z; z by default.")]
+Around = Annotated[
+    Path | None,
+    typer.Option(
+        help="JSON file with the box at the center of the orbit. Default: the box of the first edit, or the scene.",
+        **cli.FILE,
+    ),
+]
+UpAxis = Annotated[str | None, typer.Option(help="Up axis of the scene: x, y, z, -x, -y or -z. Default: z.")]
 Outputs = Annotated[
     str | None,
     typer.Option(
-        help="Which files: color, depth, normal, animation, strip, mesh, field. color,depth,normal,strip by default.",
+        help="Files to write: color, depth, normal, animation, strip, mesh, field. Default: color,depth,normal,strip.",
         metavar="LIST",
     ),
 ]
-Antialias = Annotated[int | None, typer.Option(min=1, max=4, help="Rays along each side of a pixel.")]
-Processes = Annotated[int | None, typer.Option(min=1, help="Processes that share the frames. By default one a core.")]
+Antialias = Annotated[int | None, typer.Option(min=1, max=4, help="Number of rays along each side of a pixel.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Number of processes that share the frames. Default: one per core.")
+]
 CutAway = Annotated[
-    bool, typer.Option("--cut-away", help="Cameras may stand in matter: what is before them is cut away.")
+    bool, typer.Option("--cut-away", help="Allow cameras inside solid matter: it is cut away in front of them.")
 ]
 _FILES = ("object", "replacement")
 
@@ -58,19 +69,20 @@ def render(
     frames: Frames = None,
     elevation: Elevation = None,
     distance: Annotated[
-        float | None, typer.Option(help="Of the orbit's cameras, scene units; by default all is in view.")
+        float | None, typer.Option(help="Distance of the orbit's cameras, scene units. Default: everything is in view.")
     ] = None,
     around: Around = None,
     up_axis: UpAxis = None,
     cameras: Annotated[
         Path | None,
         typer.Option(
-            help="Take these cameras in place of an orbit: transforms.json, meta_data.json or their folder.",
+            help="Use these cameras instead of an orbit: transforms.json, meta_data.json, or the folder of "
+            "such a file.",
             parser=cli.existing,
             metavar="PATH",
         ),
     ] = None,
-    every: Annotated[int, typer.Option(min=1, help="With --cameras: take one of so many.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="With --cameras: use every N-th camera.")] = 1,
     outputs: Outputs = None,
     antialias: Antialias = None,
     cut_away: CutAway = False,
@@ -100,8 +112,8 @@ def edit(
     edits: Annotated[
         Path,
         typer.Option(
-            help="JSON: a list of edits (docs/editing.md). Objects are named by their files, from this file's folder "
-            "on; a T_object_scene is a 4x4, or the name of a result.json that has one.",
+            help="JSON file with a list of edits (docs/editing.md). Objects are paths of files, relative "
+            "to the folder of this file. A T_object_scene is a 4x4, or the path of a result.json.",
             **cli.FILE,
         ),
     ],

@@ -95,7 +95,7 @@ def exit_code(document: dict[str, Any]) -> int:
 
 
 def show(document: dict[str, Any], as_json: bool, top: int = 0) -> None:
-    """Print a result document as JSON, or in words, after the ``top`` likeliest candidates of a search."""
+    """Print a result document as JSON, or in words, after the ``top`` most probable candidates of a search."""
     if as_json:
         out.print_json(json.dumps(document))
         return
@@ -113,7 +113,7 @@ def show_result(document: dict[str, Any]) -> None:
     )
     if detail := document.get("verdict_detail"):
         _line("", detail)
-    meant = "one of the poses listed" if verdict == "ambiguous" else "the pose"
+    meant = "one of the listed poses" if verdict == "ambiguous" else "the pose"
     if sure := in_percent(document, f" that {meant} is right"):
         _line("probability", sure)
     if hint := document.get("verdict_hint"):
@@ -159,7 +159,7 @@ def show_pose(document: dict[str, Any]) -> None:
         _line("", f"frame {camera['frame']}; rotation {' '.join(f'{value:.4f}' for value in turn)} (x, y, z, w)")
     deviation = sigmas.get("scale_percent")
     give_or_take = "" if deviation is None else f", ± {deviation:.2g} %"
-    _line("scale", f"{1.0 / transform['scale']:.6f} object units for each scene unit{give_or_take}")
+    _line("scale", f"{1.0 / transform['scale']:.6f} object units per scene unit{give_or_take}")
     if sigmas:
         _line("rotation", f"± {_numbers(sigmas['rotation_deg'])} degrees about the object's x, y, z")
         _line("", "± is one standard deviation")
@@ -184,10 +184,10 @@ def show_ranking(document: dict[str, Any], top: int) -> None:
 
 
 def difference_in_words(difference: dict[str, Any]) -> str:
-    """Whether what was seen tells a candidate of a search from the first one, to follow its number."""
+    """Text after the number of a search candidate: whether the observed surface distinguishes it from the first one."""
     if not difference["distinguishable"]:
-        return "cannot be told apart from the first by what was seen"
-    return f"is told apart from the first by {100 * difference['seen']:.1f} % of the surface, which was seen"
+        return "cannot be distinguished from the first by the observed surface"
+    return f"is distinguished from the first by {100 * difference['seen']:.1f} % of the surface, which was observed"
 
 
 def axis_in_words(axis: Sequence[float]) -> str:
@@ -204,7 +204,7 @@ def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     about = "" if axis is None else f" about {axis_in_words(axis)} of the object"
     if symmetry["continuous"]:
         return f"any rotation{about}" + (", and upside down" if order > 1 else "")
-    return "none found" if order == 1 else f"{order} rotations{about} look the same, the identity included"
+    return "none found" if order == 1 else f"{order} rotations{about} look the same, including the identity"
 
 
 def _line(name: str, value: str) -> None:

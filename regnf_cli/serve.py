@@ -17,16 +17,18 @@ FILES = ("mix-room.safetensors", "armchair.safetensors", "detection.json", "trut
 
 
 def serve(
-    host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0: a free one. [default: 8080]")] = None,
-    state_dir: Annotated[
-        Path | None, typer.Option(help="Where fields, results and records are kept. [default: ~/.local/state/regnf]")
+    host: Annotated[str | None, typer.Option(help="Address on which the service listens. [default: 127.0.0.1]")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="TCP port; 0 chooses a free port. [default: 8080]")
     ] = None,
-    workers: Annotated[int | None, typer.Option(min=0, max=64, help="Worker processes. [default: 1]")] = None,
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Folder for fields, results and records. [default: ~/.local/state/regnf]")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=0, max=64, help="Number of worker processes. [default: 1]")] = None,
 ) -> None:
-    """Serve the HTTP interface and the web page, with workers and a private Redis of its own.
+    """Run the HTTP service and its web page, with workers and a private Redis.
 
-    What is not given here is read from REGNF_* in the environment. Ctrl+C stops everything.
+    Other settings come from the environment variables REGNF_*. Ctrl+C stops everything.
 
     Example: **regnf serve --port 8080**
     """
@@ -46,13 +48,13 @@ def serve(
 
 def worker(
     redis_url: Annotated[
-        str | None, typer.Option(help="The service's Redis. [default: REGNF_REDIS_URL]", show_default=False)
+        str | None, typer.Option(help="Address of the service's Redis. [default: REGNF_REDIS_URL]", show_default=False)
     ] = None,
 ) -> None:
-    """Take jobs from the service's queue until told to stop; a running job goes back to the queue.
+    """Run jobs from the service's queue until it is stopped. A running job is then put back into the queue.
 
-    It needs the service's Redis and its storage (REGNF_STORAGE_URL, or the same REGNF_STATE_DIR). What is not given
-    here is read from REGNF_*.
+    It needs the service's Redis and its storage (REGNF_STORAGE_URL, or the same REGNF_STATE_DIR). Other settings come
+    from the environment variables REGNF_*.
 
     Example: **regnf worker --redis-url redis://queue:6379/0**
     """
@@ -74,13 +76,13 @@ def worker(
     try:
         run_worker(read_settings())
     except NoRedisError as error:
-        message = "no Redis is named: neither --redis-url nor REGNF_REDIS_URL is given"
-        hint = "Give --redis-url redis://HOST:6379/0, or start `regnf serve`, which brings its own Redis and worker."
+        message = "no address of a Redis: neither --redis-url nor REGNF_REDIS_URL is given"
+        hint = "Give --redis-url redis://HOST:6379/0, or use `regnf serve`, which starts its own Redis and worker."
         raise StartError(message, reason=error.reason, hint=hint) from error
     except (PreloadError, StorageMismatchError) as error:
         raise StartError(str(error), reason=error.reason) from error
     except (RedisConnectionError, RedisTimeoutError) as error:
-        hint = "Start Redis, or check the address in --redis-url or REGNF_REDIS_URL."
+        hint = "Start Redis, or check its address in --redis-url or REGNF_REDIS_URL."
         raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE", hint=hint) from error
 
 
@@ -90,8 +92,8 @@ def demo_folder() -> Path:
         if all((folder / name).is_file() for name in FILES):
             return folder
     raise InvalidInputError(
-        f"the demo's files ({', '.join(FILES)}) are neither in {_PACKAGED} nor in {_CHECKOUT}; "
-        "install regnf from its wheel or run from a checkout",
+        f"the demo's files ({', '.join(FILES)}) were not found in {_PACKAGED} or {_CHECKOUT}; install regnf from its "
+        f"wheel, or run it from a checkout",
         reason="DEMO_DATA_MISSING",
     )
 

@@ -98,7 +98,7 @@ class Child:
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
-            logger.warning("%s does not stop: killed", self.name)
+            logger.warning("%s did not stop and was killed", self.name)
             self._process.kill()
             self._process.wait()
 
@@ -136,9 +136,9 @@ class StateLock:
             _take_back(made)
             inside = error.filename is not None and Path(error.filename).is_relative_to(self._state_dir)
             detail = f"cannot keep state in {error.filename if inside else self._state_dir}: {error.strerror}"
-            hint = "Give a folder that can be written with --state-dir."
+            hint = "Give a writable folder with --state-dir."
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                hint = "Make room on the disk, or give a folder on another one with --state-dir."
+                hint = "Free space on the disk, or give a folder on another disk with --state-dir."
             raise StartError(detail, reason="STATE_DIR_UNUSABLE", hint=hint) from error
         return self
 
@@ -152,7 +152,7 @@ class StateLock:
             self._file.close()
             who = f" (process {held['pid']}, {held.get('address', 'not listening yet')})" if "pid" in held else ""
             detail = f"another `regnf serve`{who} uses {self._state_dir}"
-            hint = "Use that one, or stop it, or give this one its own folder with --state-dir."
+            hint = "Use the running one, or stop it, or give this one its own folder with --state-dir."
             raise StartError(detail, reason="STATE_DIR_IN_USE", hint=hint) from error
 
     def __exit__(self, *_: object) -> None:
@@ -235,7 +235,7 @@ def check_storage(settings: Settings) -> None:
     except StorageMismatchError as error:
         raise StartError(str(error), reason=error.reason) from error
     except (RedisError, OSError) as error:
-        logger.warning("whose records Redis holds is looked up later: %s", type(error).__name__)
+        logger.warning("the owner of Redis's records is checked later: %s", type(error).__name__)
     finally:
         stores.redis.close()
 
@@ -331,7 +331,7 @@ class Supervisor:
             if look():
                 return True
             if not child.is_running:
-                raise StartError(f"{what} ended while it was starting; the log above says why")
+                raise StartError(f"{what} ended while it was starting; see the log above")
             if time.monotonic() > deadline:
                 raise StartError(f"{what} did not start within {_START_DEADLINE_S:.0f} s")
             self._stop.wait(_ASK_EVERY_S)

@@ -1,4 +1,4 @@
-"""A client of a regnf service: httpx, pydantic and NumPy, no torch.
+"""A client of a regnf service. It needs httpx, pydantic and NumPy, but not torch.
 
     from regnf_client import Client
 

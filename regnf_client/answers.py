@@ -1,4 +1,4 @@
-"""A service's answers: the document of a good one, the error of a refusal."""
+"""Responses of a service: the document of a success, the error of a refusal."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _HOST = re.compile(r"[A-Za-z0-9.-]+(:\d+)?(/.*)?")
 
 
 class ServiceError(RegnfError):
-    """The service refused, or could not do, what was asked; ``reason`` is the one it gave."""
+    """The service refused the request, or could not do it; ``reason`` is the service's."""
 
     reason = "SERVICE_ERROR"
     status: int | None = None
-    """Of HTTP; None for what was refused before anything was asked."""
+    """The HTTP status; None if the request was refused before it was sent."""
     unavailable = False
-    """Whether asking again later may help: the service is up but cannot take work now."""
+    """Whether a later retry may help: the service runs, but cannot accept work at the moment."""
     candidates: tuple[Candidate, ...] = ()
-    """What a refused field may be."""
+    """The possible readings of a refused field."""
     said: Said | None = None
-    """What the user said of that field."""
+    """The import options of that field."""
     offset: int | None = None
-    """How many bytes of an upload have arrived."""
+    """Number of bytes of an upload that have arrived."""
 
     def told(self, message: str) -> ServiceError:
-        """The same error in other words."""
+        """The same error with another message."""
         error = ServiceError(message, reason=self.reason, hint=self.hint)
         error.status, error.unavailable = self.status, self.unavailable
         error.candidates, error.said, error.offset = self.candidates, self.said, self.offset
@@ -45,21 +45,21 @@ class ServiceError(RegnfError):
 
 
 class UnreachableError(RegnfError):
-    """Nothing answers at the service's address."""
+    """There is no response from the service's address."""
 
     reason = "SERVICE_UNAVAILABLE"
     unavailable = True
 
 
 class NoWorkerError(RegnfError):
-    """The service had no live worker for as long as the caller was ready to wait."""
+    """The service had no live worker within the caller's time limit."""
 
     reason = "NO_WORKER"
     unavailable = True
 
 
 class WaitTimeoutError(RegnfError):
-    """The job, or the import of a field, has not finished within the time that the caller gave."""
+    """The job or the import of a field did not finish within the caller's time limit."""
 
     reason = "WAIT_TIMEOUT"
     unavailable = True
@@ -79,17 +79,17 @@ def checked_address(address: str) -> httpx.URL:
 
 
 def checked_token(token: str) -> str:
-    """A token that a header can hold. Raises InvalidInputError (INVALID_TOKEN)."""
+    """A token, checked for use in a header. Raises InvalidInputError (INVALID_TOKEN)."""
     if token.isascii() and token.isprintable() and " " not in token and token:
         return token
-    hint = "Give the token alone, as the operator wrote it: without `Bearer`, quotes and line breaks."
-    raise InvalidInputError("the token has characters that no token has", reason="INVALID_TOKEN", hint=hint)
+    hint = "Give only the token, exactly as the operator gave it: without `Bearer`, quotes and line breaks."
+    raise InvalidInputError("the token has invalid characters", reason="INVALID_TOKEN", hint=hint)
 
 
 def unreachable(error: httpx.RequestError) -> UnreachableError:
     """The error for a service that does not answer."""
     url = error.request.url
-    hint = "Is it running? `regnf serve` starts one and prints its address; without a service the work is done here."
+    hint = "Check that the service is running. `regnf serve` starts one and prints its address."
     return UnreachableError(f"{url.scheme}://{url.netloc.decode()} does not answer: {error}", hint=hint)
 
 
@@ -104,16 +104,17 @@ _HINTS = {  # in place of the service's own, which are of HTTP
     "UNAUTHENTICATED": "Give the service's token: token=..., --token, or the environment variable REGNF_API_TOKEN.",
     "RATE_LIMITED": "Wait a moment, and try again.",
     "QUEUE_FULL": "Try again later.",
-    "JOB_NOT_FOUND": "Look at the id: `client.jobs()` lists your jobs. Another caller's jobs are not shown.",
+    "JOB_NOT_FOUND": "Check the id: `client.jobs()` lists your jobs. Jobs of other callers are not shown.",
     "JOB_NOT_READY": "Wait for the job first: `client.wait(job)`.",
     "JOB_EXPIRED": "Register again: the service keeps results for a limited time.",
-    "FIELD_NOT_FOUND": "Upload it first: `client.upload(path)`. Another caller's fields are not shown.",
-    "ARTIFACT_NOT_FOUND": "The result's `artifacts` has the names of all files.",
+    "FIELD_NOT_FOUND": "Upload it first: `client.upload(path)`. Fields of other callers are not shown.",
+    "ARTIFACT_NOT_FOUND": "`artifacts` of the result has the names of all files.",
 }
 
 
 def checked(answer: httpx.Response) -> dict[str, Any]:
-    """The JSON object of a good answer; raises ServiceError for a refusal, and for what is no regnf service."""
+    """The JSON object of a successful response. Raises ServiceError for a refusal, and if the address is not a regnf
+    service."""
     document = object_of(answer)
     if answer.is_success and document is not None:
         return document
@@ -121,24 +122,26 @@ def checked(answer: httpx.Response) -> dict[str, Any]:
 
 
 def parsed(model: type[_Model], values: Mapping[str, Any]) -> _Model:
-    """A document of the service as a model. Raises ServiceError for one that has not what every regnf service says."""
+    """A document of the service, parsed into a model. Raises ServiceError if required members are missing."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        hint = "Client and service are of releases that differ too much, or the address is another service's."
-        raise ServiceError(f"the answer is no {model.__name__}: {where}: {first['msg']}", hint=hint) from error
+        hint = "The releases of client and service differ too much, or this is the address of another service."
+        raise ServiceError(
+            f"the response is not a valid {model.__name__}: {where}: {first['msg']}", hint=hint
+        ) from error
 
 
 def refusal(answer: httpx.Response) -> ServiceError:
-    """The error that an answer stands for."""
+    """The error of a response."""
     document = object_of(answer)
     if document is None or not (document.keys() & {"reason", "detail", "title"}):
         url = answer.request.url
         place = f"{url.scheme}://{url.netloc.decode()}{url.path}"
-        hint = "Check address and port: `regnf serve` prints them. A proxy in front must pass every path on."
-        error = ServiceError(f"HTTP status {answer.status_code} from {place}: no regnf service", hint=hint)
+        hint = "Check address and port: `regnf serve` prints them. A proxy must forward all paths."
+        error = ServiceError(f"HTTP status {answer.status_code} from {place}: this is no regnf service", hint=hint)
     else:
         error = service_error(document)
     error.status = answer.status_code
@@ -147,7 +150,7 @@ def refusal(answer: httpx.Response) -> ServiceError:
 
 
 def service_error(problem: Mapping[str, Any]) -> ServiceError:
-    """The error for a problem object. Its faults are told too, where the detail alone does not name them."""
+    """The error for a problem object. Its faults are added, if the detail does not name them."""
     if problem.get("reason") == "JOB_FAILED" and isinstance(problem.get("error"), dict):
         problem = problem["error"]  # why the job failed says more than that it did
     detail = str(problem.get("detail") or problem.get("title") or "the service gave no detail")

@@ -1,4 +1,4 @@
-"""Many registrations in one request, and their results as they come."""
+"""Many registrations in one request, and their results as they become available."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _HEADERS = {"Content-Type": "application/x-ndjson"}
 
 @dataclass(frozen=True)
 class Pair:
-    """One registration of many. object: or a list of candidates, among which the likeliest is searched · key: your name
-    of it · more: further members of ``POST /register``, such as ``initial_transform``."""
+    """One registration of many. object: the object, or a list of candidates to search · key: your own name of the pair
+    · more: further members of ``POST /register``, such as ``initial_transform``."""
 
     scene: FieldLike
     object: FieldLike | list[FieldLike]
@@ -50,7 +50,7 @@ class Pair:
             return given
         hint = 'Write {"scene": ..., "object": ..., "detection": ...}.'
         if not isinstance(given, Mapping):
-            raise InvalidInputError("a pair is no object", reason="INVALID_REQUEST", hint=hint)
+            raise InvalidInputError("a pair is no JSON object", reason="INVALID_REQUEST", hint=hint)
         objects = given.get("object", given.get("candidates"))
         if "scene" not in given or objects is None or "detection" not in given:
             raise InvalidInputError(
@@ -69,8 +69,8 @@ def _error(value: Any) -> RegnfError | None:
 
 
 class PairResult(Document):
-    """What became of one pair. index: its place among the requests, from 0 on · job: its id; ``client.result(it)`` has
-    the whole result. error: what went wrong, unless ``status`` is ``successful``."""
+    """The outcome of one pair. index: its position among the requests, from 0 · job: the id of its job;
+    ``client.result(job)`` returns the full result · error: the failure; None if ``status`` is ``successful``."""
 
     index: int
     key: str | None = None
@@ -108,7 +108,7 @@ def request_body(
     initial_transform: Any = None,
     more: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """What a registration asks for beside its fields, as it is sent. initial_transform: a T_object_scene, or
+    """The request of a registration without its fields, as it is sent. initial_transform: a T_object_scene, or
     ``{"T_scene_object": ...}``. Raises InvalidDetectionError and InvalidOptionsError."""
     body = {
         "detection": detection_body(detection),
@@ -121,7 +121,7 @@ def request_body(
 
 
 def plain(value: Any) -> Any:
-    """Arrays and tuples as lists, boxes as detections, transforms as their matrices: what JSON can hold."""
+    """JSON values: arrays and tuples become lists, boxes become detections, transforms become matrices."""
     if isinstance(value, Mapping):
         return {str(name): plain(part) for name, part in value.items()}
     if hasattr(value, "to_detection"):
@@ -134,10 +134,10 @@ def plain(value: Any) -> Any:
 
 
 class BatchReader:
-    """Any number of requests, from the first to the last result: several batches, one after the other.
+    """Any number of requests with their results, as several batches one after the other.
 
-    Call ``post``, then ``read`` until it says None; so on until ``post`` says None. What is posted twice is one job, so
-    after an interruption the same requests go on.
+    Call ``post``, then ``read`` until it returns None. Repeat until ``post`` returns None. The same request twice is
+    one job, so the same requests can be posted again after an interruption.
     """
 
     def __init__(self, asking: Asking, requests: Iterable[PairLike], deadline: Deadline) -> None:
@@ -155,8 +155,8 @@ class BatchReader:
         self._read = 0
 
     def post(self) -> Flow[list[PairResult] | None]:
-        """Upload what the service lacks and post the next pairs; the results of those that could not be posted. None
-        after the last. Where the service has no room for all of them, as many as it has room for, once it has."""
+        """Upload missing files and post the next pairs. Returns the results of pairs that could not be posted; None
+        after the last. If the service cannot accept all of them, as many as it can accept are posted."""
         refused = yield from self._fill()
         if not self._lines:
             return refused or None
@@ -199,7 +199,8 @@ class BatchReader:
         return refused
 
     def read(self) -> Flow[list[PairResult] | None]:
-        """The next results, some or none; None after the last of what was posted. Raises WaitTimeoutError."""
+        """The next results, possibly none; None after the last result of the posted requests. Raises
+        WaitTimeoutError."""
         if self._after >= len(self._indexes):
             return None
         params = {"after": self._after, "wait": self._deadline.hold_s()}

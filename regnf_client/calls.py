@@ -1,4 +1,4 @@
-"""What a service can be asked, each as a flow of steps: ``Client`` performs them, ``AsyncClient`` awaits them."""
+"""The methods of a client, each as a flow of steps. ``Client`` performs them, ``AsyncClient`` awaits them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 
 JobLike = str | Job | Result | Rendering
-"""A job, its id, or what came of it."""
+"""A job, its id, or its result."""
 _PAGE = 200
 
 
@@ -50,14 +50,14 @@ class Calls:
         timeout_s: float | None = None,
         wait: bool = True,
     ) -> Flow[Field]:
-        """The field at the service, once its import has ended, or while it may still run (``wait``). ``description``
-        says what no file says, ``settings`` names the trainer's settings (None: those beside the file, False: none), as
-        in ``regnf.open_field``."""
+        """Upload a field and wait for its import (unless ``wait`` is False). ``description`` has import options that
+        are in no file. ``settings`` is the trainer's config file (None: those next to the file, False: none), as in
+        ``regnf.open_field``."""
         source = source_of(field, description, settings, role)
         return fields.upload(self._connection.asking(progress, timeout_s), source, wait=wait)
 
     def field(self, field: FieldLike) -> Flow[Field]:
-        """A field as it is now. Raises ServiceError (FIELD_NOT_FOUND)."""
+        """The current state of a field. Raises ServiceError (FIELD_NOT_FOUND)."""
         return fields.find(self._connection.asking(), field)
 
     def fields(self, label: str | None = None) -> Flow[list[Field]]:
@@ -66,7 +66,7 @@ class Calls:
         return [parsed(Field, one) for one in found]
 
     def delete_field(self, field: FieldLike) -> Flow[None]:
-        """Forget a field. Raises ServiceError (FIELD_IN_USE)."""
+        """Delete a field. Raises ServiceError (FIELD_IN_USE)."""
         asking = self._connection.asking()
         known = yield from fields.find(asking, field)
         yield from _done(asking, "DELETE", f"/fields/{known.sha256}")
@@ -82,7 +82,7 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[Result]:
-        """Find where an object stands in a scene. initial_transform: a T_object_scene (4, 4) to look at first."""
+        """Find the pose of an object in a scene. initial_transform: an initial guess, a T_object_scene (4, 4)."""
         body = request_body(detection, options, seed, initial_transform)
         return _registered(self._connection.asking(progress, timeout_s), scene, obj, body)
 
@@ -97,8 +97,8 @@ class Calls:
         more: Mapping[str, Any] | None = None,
         progress: Report | None = None,
     ) -> Flow[Job]:
-        """The same without waiting; a search where ``obj`` is a list. more: members of the request that have no
-        parameter here, such as ``webhook``."""
+        """As ``register``, without waiting. If ``obj`` is a list, it is a search. more: members of the request that
+        have no parameter here, such as ``webhook``."""
         body = request_body(detection, options, seed, initial_transform, more or {})
         return _submit(self._connection.asking(progress), scene, obj, body)
 
@@ -112,7 +112,7 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[Result]:
-        """Which of the objects it is, and where; the result's ``candidates`` rank them all."""
+        """Find which of the objects is in the box, and its pose. ``candidates`` of the result ranks all objects."""
         body = request_body(detection, options, seed)
         return _registered(self._connection.asking(progress, timeout_s), scene, _several(objects), body)
 
@@ -127,7 +127,7 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[list[BatchOutcome]]:
-        """Several registrations in one scene; pairs: numbers of detection and object, None: each with each.
+        """Several registrations in one scene. pairs: indices of detection and object; None: all combinations.
 
         A pair that fails does not stop the others.
         """
@@ -157,9 +157,9 @@ class Calls:
         progress: Report | None = None,
         timeout_s: float | None = None,
     ) -> Flow[Rendering]:
-        """Pictures, a mesh and a field of a scene with its edits. request: members of ``POST /render``.
+        """Render a scene with edits: pictures, a mesh, a field. request: members of ``POST /render``.
 
-        Objects of edits may be paths, jobs may be results.
+        An object of an edit may be a path. A job of an edit may be a result.
         """
         asking = self._connection.asking(progress, timeout_s)
         place = yield from fields.upload(asking, scene, "scene")
@@ -177,7 +177,7 @@ class Calls:
         return (yield from self.rendering(job))
 
     def job(self, job: JobLike) -> Flow[Job]:
-        """A job as it is now. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
+        """The current state of a job. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
         return self._connection.asking().document(Job, "GET", f"/jobs/{id_of(job)}")
 
     def jobs(self, status: str | None = None) -> Flow[list[Job]]:
@@ -186,19 +186,19 @@ class Calls:
         return [parsed(Job, one) for one in found]
 
     def wait(self, job: JobLike, progress: Report | None = None, timeout_s: float | None = None) -> Flow[Job]:
-        """The job once it has finished. Raises WaitTimeoutError, NoWorkerError."""
+        """Wait until a job has finished. Raises WaitTimeoutError, NoWorkerError."""
         return _wait(self._connection.asking(progress, timeout_s), job)
 
     def cancel(self, job: JobLike) -> Flow[Job]:
-        """Stop a job; no error if it was stopped before. Raises ServiceError (JOB_FINISHED)."""
+        """Cancel a job. It is no error if the job was canceled already. Raises ServiceError (JOB_FINISHED)."""
         return self._connection.asking().document(Job, "POST", f"/jobs/{id_of(job)}/cancel")
 
     def result(self, job: JobLike) -> Flow[Result]:
-        """What a registration found. Raises ServiceError: JOB_NOT_READY, or the job's own reason where it failed."""
+        """The result of a registration. Raises ServiceError: JOB_NOT_READY, or the job's own reason if it failed."""
         return _result(self._connection.asking(), job)
 
     def rendering(self, job: JobLike) -> Flow[Rendering]:
-        """What a rendering made. Raises ServiceError as ``result`` does."""
+        """The result of a rendering. Raises ServiceError like ``result``."""
         document = yield from _document(self._connection.asking(), job)
         return parsed(Rendering, {**document, "job": id_of(job)})
 
@@ -210,7 +210,7 @@ class Calls:
         return answer.content
 
     def download(self, job: JobLike, name: str, target: str | Path) -> Flow[Path]:
-        """Write one file of a result to ``target``, which is there only once it is whole."""
+        """Write one file of a result to ``target``. The target appears only when it is complete."""
         return _download(self._connection.asking(), _artifact_address(job, name), Path(target))
 
     def save(self, found: Result | Rendering, folder: str | Path, progress: Report | None = None) -> Flow[list[Path]]:
@@ -226,7 +226,7 @@ class Calls:
 
 
 class RecordingCalls:
-    """Recordings: depth images with their camera. One may be given as the scene wherever a field may; the detection may
+    """Recordings: depth images with their camera. A recording can be the scene of a registration. The detection can
     then be in its images: ``{"frame": ..., "mask" | "box_2d" | "point_2d": ...}``, or a list of these."""
 
     def __init__(self, connection: Connection) -> None:
@@ -241,9 +241,9 @@ class RecordingCalls:
         wait: bool = True,
         description: Mapping[str, Any] | None = None,
     ) -> Flow[Field]:
-        """A folder, an archive of one, a bag or a stored recording; once its import has ended, unless ``wait`` is
-        False. description: what no file says: ``depth_unit``, ``layout``, ``camera_axes``, ``intrinsics``. Raises
-        ServiceError with the import's reason."""
+        """Upload a folder, an archive of a folder, a bag or a stored recording, and wait for its import (unless
+        ``wait`` is False). description: import options that are in no file: ``depth_unit``, ``layout``,
+        ``camera_axes``, ``intrinsics``. Raises ServiceError with the import's reason."""
         asking = self._connection.asking(progress, timeout_s)
         return recordings.upload(asking, Path(path), label, description, wait)
 
@@ -259,8 +259,8 @@ class RecordingCalls:
         wait: bool = True,
     ) -> Flow[Field]:
         """One frame: paths, bytes or arrays (depth: (H, W), meters, or whole numbers of ``depth_unit`` meters; color:
-        (H, W, 3) uint8). camera: a document of intrinsics, its path, or K. after: the recording whose frames come
-        before, to which this one is added as ``name``."""
+        (H, W, 3) uint8). camera: a document of intrinsics, its path, or K. after: a recording to which this frame is
+        added, with the name ``name``."""
         more = {"depth_unit": depth_unit, "T_world_camera": T_world_camera}
         form = recordings.frame_form(depth, camera, color, more)
         asking, address = self._connection.asking(), "/recordings"
@@ -283,12 +283,12 @@ class RecordingCalls:
         return answer.content
 
     def delete(self, recording: Field | str) -> Flow[None]:
-        """Forget a recording. Raises ServiceError (FIELD_IN_USE)."""
+        """Delete a recording. Raises ServiceError (FIELD_IN_USE)."""
         return _done(self._connection.asking(), "DELETE", f"/recordings/{known_sha256(recording)}")
 
 
 class LibraryCalls:
-    """Objects by name. An ``Entry`` may be given wherever a field may."""
+    """Objects by name. An ``Entry`` can be used in place of a field."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -303,7 +303,8 @@ class LibraryCalls:
         symmetry: dict[str, Any] | None = None,
         progress: Report | None = None,
     ) -> Flow[Entry]:
-        """Make a field an entry; a file is uploaded. symmetry: order, axis, continuous; None: the detected one.
+        """Add a field to the library. A file is uploaded first. symmetry: order, axis, continuous; None: the detected
+        one.
 
         Raises ServiceError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY), InvalidInputError (LIBRARY_ENTRY_INVALID).
         """
@@ -313,7 +314,7 @@ class LibraryCalls:
         return (yield from asking.document(Entry, "POST", "/library", json=notes.to_dict() | {"field": sent.sha256}))
 
     def entries(self, tag: str | None = None, name: str | None = None) -> Flow[list[Entry]]:
-        """Those with the tag, and with ``name`` in their names; the one added last first."""
+        """The entries with this tag, and with ``name`` in their names; newest first."""
         found = yield from _pages(self._connection.asking(), "library", {"tag": tag, "name": name})
         return [parsed(Entry, one) for one in found]
 
@@ -322,15 +323,15 @@ class LibraryCalls:
         return self._connection.asking().document(Entry, "GET", _entry_address(name))
 
     def change(self, name: str, /, **changes: Any) -> Flow[Entry]:
-        """Change name, tags, unit, note or symmetry; None takes one back. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
+        """Change name, tags, unit, note or symmetry; None removes a value. Raises ServiceError (LIBRARY_NAME_TAKEN)."""
         return self._connection.asking().document(Entry, "PATCH", _entry_address(name), json=changes)
 
     def remove(self, name: str) -> Flow[None]:
-        """Take an entry out; its field stays. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        """Remove an entry; its field is kept. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
         return _done(self._connection.asking(), "DELETE", _entry_address(name))
 
     def download(self, name: str, target: str | Path) -> Flow[Path]:
-        """Write an entry's field, in the safe format. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
+        """Write an entry's field as a regnf field file. Raises ServiceError (LIBRARY_ENTRY_NOT_FOUND)."""
         return _download(self._connection.asking(), f"{_entry_address(name)}/file", Path(target))
 
 
@@ -341,8 +342,8 @@ def id_of(job: JobLike) -> str:
     name = job if isinstance(job, str) else getattr(job, "job", None)
     if isinstance(name, str) and name and all(part.isalnum() or part in "-_" for part in name):
         return name
-    hint = "Give what `submit` returned, or its `id`."
-    raise InvalidInputError(f"{job!r} names no job", reason="INVALID_JOB", hint=hint)
+    hint = "Give the return value of `submit`, or its `id`."
+    raise InvalidInputError(f"{job!r} is no job", reason="INVALID_JOB", hint=hint)
 
 
 def _registered(
@@ -371,7 +372,7 @@ def _submit(asking: Asking, scene: FieldLike, obj: FieldLike | list[FieldLike], 
 
 
 def _post(asking: Asking, address: str, body: Mapping[str, Any]) -> Flow[Job]:
-    """The job of a request. One that is sent again, because an answer was lost, starts nothing anew."""
+    """The job of a request. One that is sent again, because an answer was lost, starts nothing again."""
     return asking.document(Job, "POST", address, json=body, headers={"Idempotency-Key": uuid4().hex})
 
 
@@ -438,7 +439,7 @@ def _download(asking: Asking, address: str, target: Path, sha256: str | None = N
     if sha256 is not None and (yield from work(partial(digest_of, part))) != sha256:
         part.unlink()
         hint = "Download it again; if that does not help, register again."
-        message = f"{target.name}: the bytes that came are not the result's"
+        message = f"{target.name}: the received bytes differ from the result's file"
         raise ServiceError(message, reason="DIGEST_MISMATCH", hint=hint)
     part.replace(target)
     return target
@@ -459,7 +460,7 @@ def _several(objects: Sequence[FieldLike]) -> list[FieldLike]:
         hint = "Write a list: [object]."
         raise InvalidInputError("objects must be a list of fields", reason="INVALID_INPUT", hint=hint)
     if not objects:
-        hint = "Give the objects to choose among."
+        hint = "Give the candidates."
         raise InvalidInputError("the list of objects is empty", reason="LIBRARY_EMPTY", hint=hint)
     return list(objects)
 

@@ -1,4 +1,4 @@
-"""The client that blocks until an answer is there, and the same to be awaited."""
+"""The blocking client and the asynchronous client."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class SyncDriver:
 
 
 class AsyncDriver:
-    """The same, awaited; what takes time is done in threads."""
+    """The asynchronous driver. Slow steps run in threads."""
 
     def __init__(self, http: httpx.AsyncClient) -> None:
         self._http = http
@@ -139,7 +139,7 @@ class _Method(Generic[_P, _T]):
 
 
 class Library(_Performing[_Driver]):
-    """Objects by name. An ``Entry`` may be given wherever a field may."""
+    """Objects by name. An ``Entry`` can be used in place of a field."""
 
     add = _Method(LibraryCalls.add)
     entries = _Method(LibraryCalls.entries)
@@ -150,7 +150,7 @@ class Library(_Performing[_Driver]):
 
 
 class Recordings(_Performing[_Driver]):
-    """Depth images with their camera. What comes of them may be given as a scene."""
+    """Depth images with their camera. A recording can be used as a scene."""
 
     upload = _Method(RecordingCalls.upload)
     frame = _Method(RecordingCalls.frame)
@@ -202,13 +202,13 @@ class _Client(_Performing[_Driver]):
 
 
 class Client(_Client[SyncDriver]):
-    """A regnf service.
+    """A client of a regnf service.
 
     Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects. A
-    file is sent only if the service lacks it; a large one goes on where an earlier try stopped. What is asked too fast,
-    and what a broken connection stopped, is asked again. ``progress`` is called with a phase and the share of it done.
+    file is sent only if the service does not have it. An interrupted upload of a large file continues. Requests are
+    repeated after a rate limit or a lost connection. ``progress`` is called with a phase and its progress, 0..1.
 
-    Errors: see :mod:`regnf_client.answers`. Each has ``reason`` and ``hint``; ServiceError has ``status`` too.
+    Errors: see :mod:`regnf_client.answers`. Each error has ``reason`` and ``hint``; ServiceError also has ``status``.
     """
 
     def __init__(
@@ -239,9 +239,11 @@ class Client(_Client[SyncDriver]):
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
     ) -> Iterator[PairResult]:
-        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come.
+        """Run any number of registrations, each a ``Pair`` or the members of a request. Yields the results as they
+        become available.
 
-        A pair that fails stops no other. Called again with the same requests after an interruption, it goes on.
+        A pair that fails does not stop the others. After an interruption, call it again with the same requests to
+        continue.
         """
         asking = self._connection.asking(progress, timeout_s)
         reader = BatchReader(asking, requests, asking.deadline())
@@ -251,7 +253,7 @@ class Client(_Client[SyncDriver]):
                 found = self._driver.run(reader.read())
 
     def watch(self, job: JobLike) -> Iterator[Event]:
-        """A job's events as they come, until it has finished; a broken stream goes on where it stopped."""
+        """Yield the events of a job until it has finished. After a lost connection the stream continues."""
         reader, tries = EventReader(), Tries(self._connection.retries)
         while not reader.ended:
             try:
@@ -273,7 +275,7 @@ class Client(_Client[SyncDriver]):
 
 
 class AsyncClient(_Client[AsyncDriver]):
-    """The same as ``Client``, to be awaited. Files are read and hashed in threads."""
+    """``Client`` with asynchronous methods. Files are read and hashed in threads."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Fields: what names one, and how it gets to the service. Nothing is sent of what the service has."""
+"""Fields: the ways to give one, and the upload to the service. Files that the service has are not sent again."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from regnf_core.library_folder import digest_of
 
 Sendable = str | Path | FieldSource | HasVertices | HasPoints | HasGeometry
 FieldLike = Sendable | Field | Entry
-"""A file, a training run's folder or an archive of one; the SHA-256 of a field that the service has; or a Field or an
-Entry of its library; or a mesh or a cloud of trimesh or Open3D, or a mesh that regnf has opened."""
+"""A file, the folder of a training run or an archive of such a folder; the SHA-256 of a field on the service; a Field,
+or an Entry of the library; a mesh or point cloud of trimesh or Open3D; or a mesh that regnf has opened."""
 PIECE_BYTES = 8 << 20
 """A file that is larger is sent in pieces: a broken connection costs one of them."""
 _MOST_PIECES = 900
@@ -42,7 +42,7 @@ def source_of(
     settings: SettingsChoice = None,
     role: Role | None = None,
 ) -> FieldSource:
-    """What a path stands for, or a mesh or a cloud in memory, of which a file is made for as long as it is needed.
+    """The source of a path, or of a mesh or point cloud in memory, for which a temporary file is written.
 
     Raises what ``find_source`` does, InvalidInputError and FieldFormatError.
     """
@@ -65,7 +65,7 @@ def source_of(
 
 
 def known_sha256(field: FieldLike) -> str | None:
-    """The SHA-256 of a field that is named by it; None for a file."""
+    """The SHA-256 of a field that is given by it; None for a file."""
     if isinstance(field, Field):
         return field.sha256
     if isinstance(field, Entry):
@@ -75,12 +75,12 @@ def known_sha256(field: FieldLike) -> str | None:
 
 
 def named(field: FieldLike, role: Role | None = None) -> str | FieldSource:
-    """The SHA-256 of a field that is named by it, or the file to send. Raises what ``source_of`` does."""
+    """The SHA-256 of a field that is given by it, or the file to send. Raises what ``source_of`` does."""
     return known_sha256(field) or source_of(cast("Sendable", field), role=role)
 
 
 def smallest_first(given: Mapping[Role, FieldLike]) -> list[tuple[Role, str | FieldSource]]:
-    """What the service has, then the files, the smallest first: what is refused is refused soon.
+    """Fields that the service has, then the files, smallest first, so that refusals come early.
 
     Raises what ``source_of`` does.
     """
@@ -89,10 +89,10 @@ def smallest_first(given: Mapping[Role, FieldLike]) -> list[tuple[Role, str | Fi
 
 
 def upload(asking: Asking, field: FieldLike, role: Role | None = None, wait: bool = True) -> Flow[Field]:
-    """The field at the service, once its import has ended; its bytes are sent only if the service lacks them.
+    """Upload a field and wait for its import. Its bytes are sent only if the service does not have them.
 
-    wait: False leaves the import running. Raises ServiceError: of a refused field the gate's reason,
-    FIELD_DESCRIPTION_DIFFERS for bytes that are held as another function; both name the file.
+    wait: False leaves the import running. Raises ServiceError: the importer's reason for a refused field, or
+    FIELD_DESCRIPTION_DIFFERS if the file is stored with other import options. Both have the name of the file.
     """
     (found,) = yield from upload_all(asking, [field], role, wait)
     return found
@@ -101,7 +101,7 @@ def upload(asking: Asking, field: FieldLike, role: Role | None = None, wait: boo
 def upload_all(
     asking: Asking, given: Sequence[FieldLike], role: Role | None = None, wait: bool = True
 ) -> Flow[list[Field]]:
-    """The same of several: all are sent before the first import is waited for."""
+    """Upload several fields. All are sent before the first import is waited for."""
     sources = [named(one, role) for one in given]
     found = []
     for one in sources:
@@ -149,14 +149,15 @@ def _labeled(asking: Asking, known: Field, source: FieldSource) -> Flow[Field]:
 
 
 def find(asking: Asking, field: FieldLike) -> Flow[Field]:
-    """A field as the service has it now. Raises ServiceError (FIELD_NOT_FOUND)."""
+    """The current state of a field on the service. Raises ServiceError (FIELD_NOT_FOUND)."""
     source = named(field)
     sha256 = source if isinstance(source, str) else (yield from work(partial(digest_of, source.file)))
     return (yield from asking.document(Field, "GET", f"/fields/{sha256}"))
 
 
 def ready(asking: Asking, field: Field) -> Flow[Field]:
-    """The field once its import has ended. Raises ServiceError with the gate's reason when it was rejected."""
+    """Wait until the import of a field has ended. Raises ServiceError with the importer's reason if the field was
+    rejected."""
     deadline = asking.deadline()
     while field.state == "validating":
         asking.tell("importing", 0.0)
@@ -190,7 +191,7 @@ def _send(asking: Asking, source: FieldSource, sha256: str) -> Flow[Field]:
 
 
 def send_pieces(asking: Asking, file: Path, address: str, size: int) -> Flow[Field | None]:
-    """All pieces that have not arrived. The field, if the service has come to have it."""
+    """Send all pieces that have not arrived. Returns the field if the service has it."""
 
     def put(data: bytes, span: str) -> Flow[httpx.Response]:
         headers = {"Content-Range": f"bytes {span}/{size}", "Content-Type": _BYTES, "Upload-Complete": "?0"}
@@ -230,6 +231,6 @@ def _require_same(held: Field, source: FieldSource) -> None:
     wanted = {name: value for name, value in said.items() if name != "label"}
     found = {name: value for name, value in held.description.items() if name in wanted or name != "as"}
     if (wanted, digest) != (found, (held.settings or {}).get("sha256")):
-        message = "the service holds the same bytes with another description or other settings"
-        hint = f"Delete the field there first (DELETE /fields/{held.sha256}), or leave them out."
+        message = "the service has the same file with another `description` or `config`"
+        hint = f"Delete the field on the service first (DELETE /fields/{held.sha256}), or leave both out."
         raise ServiceError(message, reason="FIELD_DESCRIPTION_DIFFERS", hint=hint)

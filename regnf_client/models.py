@@ -42,7 +42,7 @@ Array = Annotated[Floats, BeforeValidator(_array), _PLAIN]
 
 
 class Document(BaseModel):
-    """Base of what the service sends."""
+    """Base of all documents of the service."""
 
     model_config = ConfigDict(extra="allow", frozen=True, arbitrary_types_allowed=True)
 
@@ -51,7 +51,7 @@ class Document(BaseModel):
 
 
 class Field(Document):
-    """A field that the service holds. Only a ``ready`` one can be registered; it may be given in place of a path."""
+    """A field on the service. Only a ``ready`` field can be registered. It can be used in place of a path."""
 
     sha256: str
     state: Literal["validating", "ready", "rejected"]
@@ -68,7 +68,7 @@ class Field(Document):
 
 
 class Entry(Document):
-    """An object of the library. It may be given in place of a path. field: the SHA-256 of its field."""
+    """An object of the library. It can be used in place of a path. field: the SHA-256 of its field."""
 
     name: str
     field: str
@@ -87,7 +87,7 @@ class Entry(Document):
 
 
 class Job(Document):
-    """A job as it was when the service was asked."""
+    """The state of a job at the time of the request."""
 
     id: str
     kind: Literal["registration", "render"]
@@ -103,11 +103,11 @@ class Job(Document):
     warnings: dict[str, list[str]] = {}
     links: dict[str, str] = {}
     sources: dict[str, str] = {}
-    """The objects as the caller named them, by the SHA-256s of their fields; of a job that this client submitted."""
+    """The objects as the caller gave them, by the SHA-256 of their fields, for a job that this client submitted."""
 
     @property
     def finished(self) -> bool:
-        """Whether nothing will change any more."""
+        """Whether the job has ended."""
         return self.status in FINISHED
 
     def __repr__(self) -> str:
@@ -124,18 +124,18 @@ class Event(Document):
 
 
 class Artifact(Document, ArtifactEntry):
-    """A file of a result. One that is ``pending`` has no bytes yet: downloading it waits for them."""
+    """A file of a result. A ``pending`` file is still being made: its download waits until it is finished."""
 
 
 class Alternative(Document, AlternativeDocument):
-    """Another pose that agrees with the data as well."""
+    """Another pose that matches the data equally well."""
 
     T_scene_object: Matrix  # type: ignore[assignment]
     T_object_scene: Matrix  # type: ignore[assignment]
 
 
 class Candidate(Document, CandidateDocument):
-    """What a search found out about one object. source: as the caller named it."""
+    """The result of a search for one object. source: the object as the caller gave it."""
 
     T_scene_object: Matrix | None = None  # type: ignore[assignment]
     T_object_scene: Matrix | None = None  # type: ignore[assignment]
@@ -143,10 +143,10 @@ class Candidate(Document, CandidateDocument):
 
 
 class Result(Document, ResultDocument):
-    """What a registration or a search found: the members of ``regnf_core.document.ResultDocument``, and those below.
+    """The result of a registration or a search: the members of ``regnf_core.document.ResultDocument``, and those below.
 
     Transforms are (4, 4) arrays, x -> s R x + t · center_scene: (3,) · covariance: (7, 7) · job: its id · source: the
-    object as the caller named it.
+    object as the caller gave it.
     """
 
     job: str
@@ -159,7 +159,7 @@ class Result(Document, ResultDocument):
     artifacts: list[Artifact] = []  # type: ignore[assignment]
     source: str | None = None
     document: dict[str, Any] = MemberField(default={}, exclude=True)
-    """The same as the service sends it, plain (JSON) values."""
+    """The document of the service, plain (JSON) values."""
 
     @property
     def scale(self) -> float:
@@ -167,7 +167,7 @@ class Result(Document, ResultDocument):
         return float(np.cbrt(np.linalg.det(self.T_object_scene[:3, :3])))
 
     def apply(self, points: ArrayLike) -> Floats:
-        """Points (N, 3) of the scene in the object's frame."""
+        """Transform points (N, 3) of the scene into the object's frame."""
         moved: Floats = (
             np.asarray(points, dtype=np.float64) @ self.T_object_scene[:3, :3].T + self.T_object_scene[:3, 3]
         )
@@ -179,7 +179,8 @@ class Result(Document, ResultDocument):
 
 
 class Rendering(Document):
-    """What a rendering has made. job: its id · field: SHA-256 of the edited scene's field, if it was asked for."""
+    """The result of a rendering. job: its id · field: SHA-256 of the edited scene's field, if the output `field` was
+    requested."""
 
     job: str
     frames: int
@@ -195,7 +196,7 @@ class Rendering(Document):
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
+    """The outcome of one pair of a batch: a result or an error. detection, object: their indices in the lists."""
 
     detection: int
     object: int
@@ -207,12 +208,13 @@ class BatchOutcome:
 
 
 class EventReader:
-    """Takes a stream's lines; of each blank line an event may come. Knows where a new connection would go on."""
+    """Parses the lines of an event stream. A blank line may complete an event. It knows the position at which a new
+    connection continues."""
 
     def __init__(self) -> None:
         self.last_id: str | None = None
         self.ended = False
-        """Whether the job's end has come."""
+        """Whether this event is the end of the job."""
         self._lines: dict[str, str] = {}
 
     def headers(self) -> dict[str, str]:
@@ -220,11 +222,11 @@ class EventReader:
         return {"Accept": "text/event-stream"} | ({} if self.last_id is None else {"Last-Event-ID": self.last_id})
 
     def connected(self) -> None:
-        """A new connection begins; half an event of the one before is forgotten."""
+        """A new connection begins. An incomplete event of the previous one is dropped."""
         self._lines = {}
 
     def take(self, line: str) -> Event | None:
-        """The event that ends with this line, if one does."""
+        """The event that this line completes, if any."""
         if line:
             name, _, value = line.partition(":")
             self._lines[name] = value.removeprefix(" ")

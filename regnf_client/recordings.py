@@ -1,4 +1,4 @@
-"""Recordings: files, folders and single frames of a depth camera, and how they get to the service."""
+"""Recordings: files, folders and single frames of a depth camera, and the upload to the service."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Image = Any
 def upload(
     asking: Asking, path: Path, label: str | None, description: Mapping[str, Any] | None, wait: bool
 ) -> Flow[Field]:
-    """The recording at the service; nothing is sent of one that it has. Raises ServiceError, FieldFormatError."""
+    """Upload a recording. It is not sent again if the service has it. Raises ServiceError, FieldFormatError."""
     params = {} if label is None else {"label": label}
     said = described(RecordingDescription, description).non_default()
     with _as_file(path) as file:
@@ -100,7 +100,7 @@ def _bytes(image: Image) -> bytes:
 
 
 def png_of(array: Any) -> bytes:
-    """A PNG of (H, W) or (H, W, 3), eight bits a channel; true is 255."""
+    """A PNG of (H, W) or (H, W, 3), eight bits per channel; true is 255."""
     pixels = np.asarray(array)
     pixels = (pixels * np.uint8(255) if pixels.dtype == np.bool_ else pixels).astype(np.uint8)
     height, width = pixels.shape[:2]
@@ -118,7 +118,7 @@ def png_of(array: Any) -> bytes:
 
 
 def detection_body(detection: Any) -> Any:
-    """A detection as it is sent: a box; or the thing in images, with masks as PNGs. Raises InvalidDetectionError."""
+    """The detection in a request: a box, or the object in images with masks as PNGs. Raises InvalidDetectionError."""
     folder = Path()
     if isinstance(detection, str | os.PathLike) and Path(detection).is_file():
         folder = Path(detection).parent

@@ -1,4 +1,4 @@
-"""What a client does, without saying how: flows are generators of steps, which a driver performs.
+"""The operations of a client as flows: generators of steps that a driver performs.
 
 ``Client`` performs them one after the other, ``AsyncClient`` awaits them; the flows are the same.
 """
@@ -34,7 +34,8 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 @dataclass(frozen=True)
 class Call:
-    """One request. The driver gives the answer, or the error of a connection. how: as ``httpx.Client.request``."""
+    """One request. The driver returns the response, or the error of the connection. how: as
+    ``httpx.Client.request``."""
 
     method: str
     path: str
@@ -43,32 +44,32 @@ class Call:
 
 @dataclass(frozen=True)
 class Pause:
-    """Wait for so many seconds."""
+    """Wait for this number of seconds."""
 
     seconds: float
 
 
 @dataclass(frozen=True)
 class Work:
-    """Something that takes time and no network, such as reading a file. The driver gives what it returns."""
+    """A step that takes time but no network, such as reading a file. The driver returns its return value."""
 
     do: Callable[[], Any]
 
 
 @dataclass(frozen=True)
 class Download:
-    """The bytes of an address, appended to a file. The driver gives the answer, or the error of a connection."""
+    """The bytes of an address, appended to a file. The driver returns the response, or the error of the connection."""
 
     path: str
     target: Path
 
     def headers(self) -> dict[str, str]:
-        """Of the request: it goes on behind what the file holds already."""
+        """Headers of the request. The download continues after the bytes that the file already has."""
         held = self.target.stat().st_size if self.target.exists() else 0
         return {"Accept-Encoding": "identity"} | ({"Range": f"bytes={held}-"} if held else {})
 
     def mode(self, answer: httpx.Response) -> str:
-        """How the file is opened for this answer."""
+        """The mode in which the file is opened for this response."""
         return "ab" if answer.status_code == httpx.codes.PARTIAL_CONTENT else "wb"
 
 
@@ -77,7 +78,7 @@ Flow = Generator[Step, Any, _T]
 
 
 def work(do: Callable[[], _T]) -> Flow[_T]:
-    """What ``do`` returns, done where it keeps nobody waiting."""
+    """The return value of ``do``, run without blocking others."""
     done: _T = yield Work(do)
     return done
 
@@ -85,7 +86,7 @@ def work(do: Callable[[], _T]) -> Flow[_T]:
 # When a request is sent again, and after how long.
 
 _PASSING = frozenset({"RATE_LIMITED", "TOO_MANY_REQUESTS_AT_ONCE", "ARTIFACT_NOT_READY"})
-"""Refusals that time mends by itself. Quotas are told at once: they may last for hours."""
+"""Refusals that end by themselves. Quotas are reported immediately: they may last for hours."""
 _PATIENCE_S = 120.0
 """The most that the service's own `Retry-After` may cost one request."""
 _FIRST_PAUSE_S = 0.25
@@ -95,8 +96,8 @@ _SPREAD = 2.0
 
 
 class Tries:
-    """What is left of the patience for one request, which is sent again ``retries`` times after a broken connection or
-    a 502, 503, 504."""
+    """The remaining retries of one request. It is repeated ``retries`` times after a lost connection or a 502, 503 or
+    504."""
 
     def __init__(self, retries: int) -> None:
         self._left_s = _PATIENCE_S
@@ -104,7 +105,7 @@ class Tries:
         self._next_s = _FIRST_PAUSE_S
 
     def wait_s(self, answer: httpx.Response | httpx.RequestError) -> float | None:
-        """How long to wait before the same is asked again; None if that is of no use any more."""
+        """How long to wait before the request is repeated; None if it must not be repeated."""
         after = None
         if isinstance(answer, httpx.Response):
             after = retry_after_s(answer)
@@ -130,7 +131,7 @@ class Tries:
 
 
 def retry_after_s(answer: httpx.Response) -> float | None:
-    """What the service asks to wait."""
+    """The waiting time that the service requests."""
     text = answer.headers.get("retry-after", "")
     return float(text) if text.isascii() and text.isdecimal() else None
 
@@ -142,8 +143,8 @@ _HOLD_S = 20
 
 
 class WorkerWatch:
-    """For how long a service has had no worker. While waiting, ask it whenever a look is ``due``, and say what you
-    ``saw``."""
+    """Measures how long a service has had no worker. While waiting, query the service when a query is ``due``, and pass
+    the answer to ``saw``."""
 
     def __init__(self, limit_s: float | None, clock: Callable[[], float] = time.monotonic) -> None:
         """limit_s: None waits for ever."""
@@ -154,11 +155,11 @@ class WorkerWatch:
 
     @property
     def due(self) -> bool:
-        """Whether to look again: every few seconds, and never without a limit."""
+        """Whether to query again: every few seconds, and never if there is no limit."""
         return self._limit_s is not None and self._clock() >= self._next_look
 
     def saw(self, lives: bool) -> None:
-        """Raises NoWorkerError once there has been no live worker for the limit, without a break."""
+        """Raises NoWorkerError if there was no live worker for the whole time limit."""
         now = self._clock()
         self._next_look = now + _LOOK_EVERY_S
         if lives or self._limit_s is None:
@@ -169,8 +170,8 @@ class WorkerWatch:
         if now - self._missing_since >= self._limit_s:
             raise NoWorkerError(
                 f"the service has had no live worker for {self._limit_s:g} s",
-                hint="Start one: `regnf worker`, or `regnf serve` with --workers 1. The job stays in the queue; the "
-                "same command finds it again.",
+                hint="Start one: `regnf worker`, or `regnf serve` with --workers 1. The job stays in the "
+                "queue. Run the same command to follow it again.",
             )
         self._next_look = min(self._next_look, self._missing_since + self._limit_s)
 
@@ -183,14 +184,14 @@ class Deadline:
         self._end = math.inf if timeout_s is None else time.monotonic() + timeout_s
 
     def hold_s(self) -> int:
-        """For how long the service may hold one answer."""
+        """How long the service may hold one response, seconds."""
         left_s = self._end - time.monotonic()
         return _HOLD_S if left_s >= _HOLD_S else max(0, math.ceil(left_s))
 
     def check(self, what: str) -> None:
-        """Raises WaitTimeoutError once the time is over. what: is waited for."""
+        """Raises WaitTimeoutError after the deadline. what: the thing that is waited for."""
         if time.monotonic() >= self._end:
-            hint = "It goes on: the same call finds it again. Give a larger timeout_s, or None."
+            hint = "It continues. The same call follows it again. Give a larger timeout_s, or None."
             raise WaitTimeoutError(f"{what} has not ended within {self._timeout_s:g} s", hint=hint)
 
 
@@ -202,12 +203,12 @@ _AROUND = "\ufeff \t\r\n"
 """What a shell keeps of a file that Windows wrote."""
 _TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 Report = Callable[[str, float], None]
-"""Called with a phase and the share of it that is done, 0..1."""
+"""Called with a phase and its progress, 0..1."""
 
 
 @dataclass(frozen=True)
 class Asking:
-    """How one call of a method asks. timeout_s: the most that a wait may take; None: any time."""
+    """The request behavior of one method call. timeout_s: longest wait; None: no limit."""
 
     retries: int
     watch: WorkerWatch
@@ -215,16 +216,16 @@ class Asking:
     timeout_s: float | None = None
 
     def tell(self, phase: str, share: float) -> None:
-        """Report to the caller, who may not want to know."""
+        """Report progress to the caller, if a callback is given."""
         if self.report is not None:
             self.report(phase, share)
 
     def deadline(self) -> Deadline:
-        """Of a wait that begins now."""
+        """The deadline of a wait that begins now."""
         return Deadline(self.timeout_s)
 
     def call(self, method: str, path: str, **how: Any) -> Flow[httpx.Response]:
-        """The answer to a request, which is sent again while that may help. Raises UnreachableError.
+        """The response to a request. The request is repeated while that may help. Raises UnreachableError.
 
         Every request of the interface may be sent again: the same upload is the same field, the same request the same
         job.
@@ -232,7 +233,8 @@ class Asking:
         return self.again(Call(method, path, how))
 
     def again(self, step: Call | Download, retries: int | None = None) -> Flow[httpx.Response]:
-        """The answer to a step that asks the service, done again while that may help. Raises UnreachableError."""
+        """The response to a step that queries the service. The step is repeated while that may help. Raises
+        UnreachableError."""
         tries = Tries(self.retries if retries is None else retries)
         while True:
             answer: httpx.Response | httpx.RequestError = yield step
@@ -245,7 +247,7 @@ class Asking:
                 return answer
 
     def document(self, model: type[_Model], method: str, path: str, **how: Any) -> Flow[_Model]:
-        """The model that a good answer is. Raises ServiceError too."""
+        """The model of a successful response. Raises ServiceError too."""
         return parsed(model, checked((yield from self.call(method, path, **how))))
 
     def look(self) -> Flow[None]:
@@ -260,7 +262,7 @@ class Asking:
 
 @dataclass(frozen=True)
 class Connection:
-    """Address, token and manners of a client."""
+    """Address, token and retry behavior of a client."""
 
     address: str
     token: str | None

@@ -1,4 +1,4 @@
-"""What users call: the engine's functions, with fields by their paths and options as dictionaries."""
+"""The public functions of the engine: they accept paths of fields, and options as dictionaries."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ if TYPE_CHECKING:
 # A field as a user names it.
 
 FieldLike = SdfField | str | os.PathLike[str] | HasVertices | HasPoints | HasGeometry
-"""An open field; the path of a file, a training run's folder or an archive of one; or a mesh or a cloud in memory, see
-:func:`regnf_core.in_memory.field_of`."""
+"""An open field; the path of a file, of the folder of a training run or of an archive of such a folder; or a mesh or a
+point cloud in memory, see :func:`regnf_core.in_memory.field_of`."""
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A field, its name, and what its import said; both None for a field that the caller has opened."""
+    """A field, its name and the notes of its import. Both are None for a field that the caller has opened."""
 
     field: SdfField
     name: str | None = None
@@ -76,7 +76,7 @@ class Opened:
 
 
 def opened(field: FieldLike, role: Role | None = None) -> Opened:
-    """The field that is meant; a path is opened, as what it will be used as. Raises what ``open_field`` does."""
+    """The field itself, or the field at a path, opened for its use. Raises the errors of ``open_field``."""
     if isinstance(field, str | os.PathLike):
         loaded = load_field(find_source(Path(field), role=role))
         for warning in loaded.notes.warnings:
@@ -86,7 +86,7 @@ def opened(field: FieldLike, role: Role | None = None) -> Opened:
 
 
 def opened_pair(scene: FieldLike, obj: FieldLike) -> tuple[Opened, Opened]:
-    """Both; what is refused is refused before a large file is imported. Raises what ``open_field`` does."""
+    """Both fields. Files are checked before a large one is imported. Raises the errors of ``open_field``."""
     given: dict[Role, FieldLike] = {"scene": scene, "object": obj}
     paths: dict[Role, Path] = {role: Path(one) for role, one in given.items() if isinstance(one, str | os.PathLike)}
     sources = [find_source(path, role=role) for role, path in paths.items()]
@@ -97,7 +97,7 @@ def opened_pair(scene: FieldLike, obj: FieldLike) -> tuple[Opened, Opened]:
 
 
 def notes_of(scene: Opened, obj: Opened) -> dict[str, FieldNotes] | None:
-    """What is known of the imports, by role; None where nothing is."""
+    """Notes of the imports, by role; None if there are none."""
     found = {"scene": scene.notes, "object": obj.notes}
     return {name: notes for name, notes in found.items() if notes is not None} or None
 
@@ -131,9 +131,9 @@ def _for_numpy(value: Any) -> Any:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Registered(RegistrationResult):
-    """The outcome of one registration, with what is needed to show it.
+    """The result of one registration, with the data to display it.
 
-    object_name: the object's path, if it was given by one · notes: what the imports of scene and object said ·
+    object_name: the object's path, if it was given as a path · notes: the notes of the imports of scene and object ·
     detection: the box, scene frame · overlay: of depth images, the object's outline on the image.
     """
 
@@ -161,38 +161,39 @@ class Registered(RegistrationResult):
 
     @property
     def uncertainty(self) -> dict[str, Any] | None:
-        """One standard deviation of where the object's center is (``center_scene``, along the scene's x, y, z, scene
-        units), of the rotation (``rotation_deg``, about the object's x, y, z) and of the scale (``scale_percent``).
-        None from the preset `paper`."""
+        """The standard deviations of the position of the object's center (``center_scene``, along the scene's x, y, z,
+        scene units), of the rotation (``rotation_deg``, about the object's x, y, z) and of the scale
+        (``scale_percent``). None with the preset `paper`."""
         if self.covariance is None:
             return None
         return uncertainty(self.covariance, self.T_object_scene, self.center_object)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result document: plain values, as result.json has them."""
+        """The result as plain values, as in result.json."""
         return result_document(self, object_name=self.object_name, fields=self.notes)
 
     def to_bop_csv(self, scene_id: int, image_id: int, object_id: int, seconds: float = -1.0) -> str:
-        """The line of BOP's results: scene_id, im_id, obj_id, score, R, t in millimeters, time.
+        """The result as a line of BOP's result format: scene_id, im_id, obj_id, score, R, t in millimeters, time.
 
-        The object's frame is its file's; poses are those in the camera's frame, so the scene is depth images.
+        The object's frame is that of its file. Poses are in the camera frame, so the scene must be depth images.
         Raises InvalidInputError (NO_CAMERA).
         """
         pose = self.T_camera_object
         if pose is None:
-            hint = "Register in a depth image: regnf.Frame, or the path of a recording."
-            raise InvalidInputError("the result is of a field, not of an image", reason="NO_CAMERA", hint=hint)
+            hint = "Register in a depth image (regnf.Frame, or the path of a recording)."
+            raise InvalidInputError("the scene of this result is a field, not an image", reason="NO_CAMERA", hint=hint)
         R, t = pose.rotation.flatten().tolist(), (1000.0 * pose.translation).tolist()
         score = self.probability if self.probability is not None else float(self.verdict == "registered")
         numbers = " ".join(f"{value:.8f}" for value in R), " ".join(f"{value:.6f}" for value in t)
         return f"{scene_id},{image_id},{object_id},{score:.6f},{numbers[0]},{numbers[1]},{seconds:.6f}"
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write result.json, the clouds, the pose and a picture into a folder, as ``regnf register --output`` does."""
+        """Write result.json, the point clouds, the pose and a picture into a folder, like ``regnf register
+        --output``."""
         self._require_clouds()
         target = Path(folder)
         if target.exists() and not target.is_dir():
-            hint = "Name a folder; it is made if need be."
+            hint = "Give a folder. It is created if it does not exist."
             raise InvalidInputError(f"{target}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
         with filled_folder(target) as folder:
             names = write_artifacts(self, folder, object_name=self.object_name, fields=self.notes)
@@ -202,10 +203,10 @@ class Registered(RegistrationResult):
         return [target / name for name in names]
 
     def plot(self, path: str | Path | None = None, window: bool | None = None) -> Image:
-        """The picture of the registration, written to ``path`` too if there is one.
+        """The picture of the registration. It is also written to ``path``, if a path is given.
 
-        window: whether a window of PyVista or Open3D is opened, where one of them and a display are there; None: only
-        if no ``path`` is given.
+        window: whether to open a window of PyVista or Open3D, if one of them and a display are available; None: only if
+        no ``path`` is given.
         """
         self._require_clouds()
         picture = registration_picture(self)
@@ -216,9 +217,9 @@ class Registered(RegistrationResult):
         return picture
 
     def save_recording(self, path: str | Path) -> Path:
-        """Write how the registration went as a recording (.rrd) for the viewer of rerun; the path.
+        """Write the course of the registration as a recording (.rrd) for the rerun viewer. Returns the path.
 
-        Needs the extra ``rerun``. See docs/how-to/recording.md for what it holds.
+        Needs the extra ``rerun``. docs/how-to/recording.md describes its content.
         Raises MissingExtraError, InvalidOptionsError, and InvalidInputError (NO_CLOUDS, FILE_IS_FOLDER,
         RECORDING_DISABLED).
         """
@@ -227,7 +228,7 @@ class Registered(RegistrationResult):
 
     def _require_clouds(self) -> None:
         if not self.residuals:
-            hint = "Register without clouds=False."
+            hint = "Register with clouds=True (the default)."
             raise InvalidInputError("the result has no point clouds to show", reason="NO_CLOUDS", hint=hint)
 
     def __repr__(self) -> str:
@@ -272,17 +273,16 @@ def register(
     object_model: ObjectModel | None = None,
     clouds: bool = True,
 ) -> Registered:
-    """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
+    """Find the pose of a known object in a scanned scene: rotation, position, scale and a verdict.
 
     scene, obj: fields, their paths, or meshes of trimesh or Open3D · detection: a box of regnf or Open3D, two corners,
     a detection's JSON, or the path of its file ·
-    options: RegistrationOptions, or a dictionary of those that are not to have their defaults · progress: called with
-    the phase and the overall share done, 0..1 · initial_transform: a T_object_scene to try first, a Sim3 or a 4x4
-    matrix · object_model: what ``model_object`` made of the object earlier · clouds: False saves time when nothing is
-    drawn or saved.
-    Deterministic for a seed, on one machine and with the same number of threads.
-    Raises InvalidOptionsError, InvalidDetectionError, FieldFormatError, InvalidInputError (NO_FIELD, FILE_NOT_FOUND,
-    FIELD_NOT_FINITE), NoSurfaceError, InitializationError.
+    options: RegistrationOptions, or a dictionary of the options that differ from their defaults · progress: called with
+    the phase and the overall progress, 0..1 · initial_transform: initial guess, a T_object_scene as a Sim3 or a 4x4
+    matrix; it is searched first · object_model: the object's model from an earlier ``model_object`` · clouds: False
+    makes no point clouds, which saves time if nothing is drawn or saved. Deterministic for a seed, on one machine and
+    with the same number of threads. Raises InvalidOptionsError, InvalidDetectionError, FieldFormatError,
+    InvalidInputError (NO_FIELD, FILE_NOT_FOUND, FIELD_NOT_FINITE), NoSurfaceError, InitializationError.
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
     if initial_transform is not None and not isinstance(initial_transform, Sim3):
@@ -303,13 +303,14 @@ def register_batch(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> list[BatchOutcome[Registered]]:
-    """Register pairs of detection and object, by their numbers (None: each with each), by the preset `robust`.
+    """Register pairs of detection and object, given by their indices (None: all combinations), with the preset
+    `robust`.
 
-    What they share is made once; a pair that fails does not stop the others. Arguments as of ``register``.
+    Shared data is computed once. A pair that fails does not stop the others. Arguments as in ``register``.
     Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN, NO_FIELD).
     """
     if isinstance(detections, OrientedBox | str | os.PathLike) or not isinstance(detections, Sequence):
-        raise InvalidDetectionError("the detections are one box, expected a list", hint="Write a list: [box].")
+        raise InvalidDetectionError("detections is a single box, expected a list", hint="Write a list: [box].")
     chosen, boxes, seed = options_of(options), [box_of(one) for one in detections], seed_of(seed)
     pairs_of(pairs, len(boxes), len(objects))  # before any field is opened
     place = opened(scene, "scene")
@@ -326,7 +327,8 @@ def register_batch(
 
 
 def box_of(detection: BoxLike) -> OrientedBox:
-    """The box that is meant. Raises InvalidDetectionError, and InvalidInputError (FILE_NOT_FOUND, MALFORMED_JSON)."""
+    """The box of a detection in any form. Raises InvalidDetectionError, and InvalidInputError (FILE_NOT_FOUND,
+    MALFORMED_JSON)."""
     if isinstance(detection, str | os.PathLike):
         require_file(Path(detection))
         return OrientedBox.from_dict(json_value(Path(detection).read_bytes(), f"detection {detection}: "))
@@ -341,8 +343,8 @@ Objects = str | Path | Sequence[FieldLike | LibraryObject] | Mapping[str, FieldL
 
 @dataclass(frozen=True)
 class Search:
-    """ranking: every object, the likeliest first · unusable: those without a surface, and why · result: the
-    registration of the first."""
+    """ranking: all objects, the most probable first · unusable: objects without a surface, with the reason · result:
+    the registration of the first."""
 
     ranking: list[Candidate]
     result: Registered
@@ -361,11 +363,11 @@ def search(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> Search:
-    """Which object stands in the box, and where, by the preset `robust`.
+    """Find which object is in the box, and its pose, with the preset `robust`.
 
-    An object's model is made once and kept in the user's cache, for objects that are given by their paths. Other
-    arguments as of ``register``. Raises InvalidInputError (LIBRARY_EMPTY), InvalidOptionsError
-    (PRESET_UNSUITABLE), NoSurfaceError, and what ``register`` raises.
+    The model of an object that is given by its path is computed once and stored in the user's cache. Other arguments as
+    in ``register``. Raises InvalidInputError (LIBRARY_EMPTY), InvalidOptionsError (PRESET_UNSUITABLE), NoSurfaceError,
+    and what ``register`` raises.
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
     chosen.require_robust("searches a library", reason="PRESET_UNSUITABLE")
@@ -383,7 +385,7 @@ def search(
         except NoSurfaceError as error:
             unusable[name] = error.reason
     if not library:
-        raise NoSurfaceError("none of the objects has a surface", reason="NO_SURFACE_IN_OBJECT")
+        raise NoSurfaceError("no object has a surface", reason="NO_SURFACE_IN_OBJECT")
     found = search_library(place.field, box, library, chosen, seed, progress, clouds)
     first = found.ranking[0].name
     notes = None if place.notes is None else {"scene": place.notes}
@@ -433,8 +435,8 @@ def render(
 ) -> Frame:
     """One frame of a field, or of the field at a path: color or shading, depth, normals, opacity.
 
-    options: RenderOptions, or a dictionary of those that are not to have their defaults. ``cancelled`` is asked before
-    each tile; CancelledError is raised once it says so.
+    options: RenderOptions, or a dictionary of the options that differ from their defaults. ``cancelled`` is called
+    before each tile; if it returns true, CancelledError is raised.
     Raises InvalidInputError: NO_FIELD, CAMERA_INVALID, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and
     NoSurfaceError (NO_SURFACE_IN_SCENE).
     """
@@ -445,7 +447,7 @@ def render(
 def compose(
     scene: FieldLike, edits: Sequence[Edit], seed: int = 0, progress: Callable[[float], None] | None = None
 ) -> EditedScene:
-    """The scene, or that at a path, with all edits done: a field as any other. See docs/editing.md.
+    """Apply edits to a scene (a field or its path). The result is a field. See docs/editing.md.
 
     Raises InvalidInputError: NO_FIELD, INVALID_TRANSFORM, EDIT_INVALID; and
     NoSurfaceError (NO_SURFACE_IN_OBJECT).

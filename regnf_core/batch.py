@@ -1,4 +1,4 @@
-"""Several detections of one scene and several objects in one call: what they share is made once.
+"""Several detections of one scene and several objects in one call. Shared data is computed once.
 
 outcomes = register_batch(scene, [box_1, box_2], [chair, table], pairs=[(0, 0), (1, 1)])
 """
@@ -28,7 +28,7 @@ Result = TypeVar("Result", bound=RegistrationResult)
 
 @dataclass(frozen=True, eq=False)
 class ModeledObject:
-    """An object's field with its model, made earlier by ``model_object``: saves making it again."""
+    """An object's field with its model from an earlier ``model_object``, so that it is not computed again."""
 
     field: SdfField
     model: ObjectModel
@@ -36,7 +36,7 @@ class ModeledObject:
 
 @dataclass(frozen=True)
 class BatchOutcome(Generic[Result]):
-    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
+    """The outcome of one pair of a batch: a result or an error. detection, object: their indices in the lists."""
 
     detection: int
     object: int
@@ -54,13 +54,13 @@ def register_batch(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> list[BatchOutcome[RegistrationResult]]:
-    """Register pairs of detection and object (by number; None: each with each) by the preset `robust`.
+    """Register pairs of detection and object (given by index; None: all combinations) with the preset `robust`.
 
     Each result is that of :func:`regnf_core.register` for this pair and seed; a pair that fails does not stop the
-    others. Without ``clouds`` the point clouds for viewers are left out, which take about half of the time.
-    ``progress`` gets the phases of one pair after the other, and the share done of all pairs.
-    Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the
-    lists, and CancelledError from ``progress``.
+    others. Without ``clouds`` no point clouds for viewers are made; they take about half of the time. ``progress`` gets
+    the phases of one pair after the other, and the overall progress of all pairs. Raises InvalidOptionsError for
+    options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the lists, and CancelledError from
+    ``progress``.
     """
     options = options or RegistrationOptions()
     options.require_robust("registers a batch")

@@ -1,4 +1,4 @@
-"""What a registration returns, and the document of it that the engine writes, the service answers and clients read.
+"""The result of a registration, and its document, which the engine writes, the service returns and clients read.
 
 A new member of the result is written here: in ``RegistrationResult``, in ``ResultDocument`` and in ``result_document``.
 Torch-free.
@@ -45,7 +45,7 @@ class _Posed:
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """One iteration of the optimizer: everything that trace.json shows.
+    """One iteration of the optimizer: the content of trace.json.
 
     residual_scene: mean |r| over the scene's samples, object units · residual_object: over the object's samples, scene
     units, as the paper has it.
@@ -74,7 +74,8 @@ class Alternative(_Posed):
 
 @dataclass(frozen=True)
 class ConsideredPose(_Posed):
-    """One pose that was refined and judged by itself, whatever rivals it has. reason, limit, level: as of a verdict."""
+    """One pose that was refined, with its own verdict, without regard to other poses. reason, limit, level: as of a
+    verdict."""
 
     T_object_scene: Sim3
     reason: str
@@ -85,12 +86,12 @@ class ConsideredPose(_Posed):
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """Poses that were judged, the likeliest first, and what the samples held out for that say of each of the K.
+    """Candidate poses, the most probable first, and the evidence of the verification samples for each of the K poses.
 
     scene_points (N, 3), object_points (M, 3): the samples, each in its field's frame · scene_signs (K, N) uint8: 0 the
-    object explains the scene's surface there, 1 it does not although it is near, 2 it is not near · object_signs (K, M)
-    uint8: 0 the scene confirms the object's surface there, 1 the scene is free there, 2 nothing was seen there, 3 the
-    surfaces differ by a little.
+    object matches the scene's surface there, 1 it does not match although it is near, 2 it is not near · object_signs
+    (K, M) uint8: 0 the scene confirms the object's surface there, 1 the scene has free space there, 2 nothing was
+    observed there, 3 the surfaces differ by a little.
     """
 
     poses: list[ConsideredPose]
@@ -102,7 +103,7 @@ class Considered:
 
 @dataclass(frozen=True)
 class ObjectSymmetry:
-    """The rotations that map the object onto itself. order: how many there are, the identity included.
+    """The rotations that map the object onto itself. order: their number, including the identity.
 
     axis: unit vector, object frame: the common axis of all of them; None where there is none, as for a box's three half
     turns. With ``continuous`` every rotation about the axis is a symmetry, and ``order`` is 2 where the two ends of the
@@ -116,8 +117,8 @@ class ObjectSymmetry:
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """The camera of the image that a detection was made in. frame: its name · T_world_camera: its pose in the scene's
-    frame, OpenCV's axes, scale 1 · object_unit: meters of the object's unit, where it is known."""
+    """The camera of the image in which the detection was made. frame: its name · T_world_camera: its pose in the
+    scene's frame, OpenCV's axes, scale 1 · object_unit: the object's unit in meters, if it is known."""
 
     frame: str
     T_world_camera: Sim3
@@ -125,13 +126,14 @@ class CameraView:
 
 
 SHOWN, ABSENT, UNKNOWN = range(3)
-"""What the scene says of a place of a candidate's surface: it is there, the scene is free there, or neither is clear:
-mostly since it was not seen."""
+"""Evidence of the scene for a place of a candidate's surface: the surface is there, the place is free space, or it is
+unclear, mostly because it was not observed."""
 
 
 @dataclass(frozen=True, eq=False)
 class DecidingSurface:
-    """The surface of a search's first two candidates that lies off the other one of them, where they stand.
+    """The surface of each of the first two candidates of a search that is not on the surface of the other one, at their
+    poses.
 
     samples: (N,), scene frame · of_other (N,) bool: whose: False of the first, True of the other candidate · states
     (N,) uint8: SHOWN, ABSENT or UNKNOWN · distinguishable: as of the two's :class:`Difference`.
@@ -145,18 +147,18 @@ class DecidingSurface:
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult(_Posed):
-    """The outcome of one registration. The object's pose in the scene is ``T_scene_object``.
+    """The result of one registration. The object's pose in the scene is ``T_scene_object``.
 
     verdict_reason: one stable UPPER_SNAKE word, e.g. SURFACES_AGREE, LOW_OVERLAP · metrics: of the manual's list, and
     seconds by phase as seconds_<phase> · residuals: per point of both clouds: scene_points, scene_residuals,
     object_points, object_residuals; object units · center_object: (3,) float64, object frame: the centroid of the
-    object's surface · verdict_limit: the limit that a rejected pose does not keep, in words, with both numbers; "" if
-    there is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
-    symmetry: the object's own, found by registering it with itself · considered: the poses that were judged, for
-    viewers · surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection
-    was made in, where the scene is a recording · deciding: what tells the first two candidates of a search apart,
-    where the first one is accepted and both were refined · level: the strictest named level of the option
-    ``acceptance`` that the probability reaches; None: none.
+    object's surface · verdict_limit: the limit that a rejected pose violates, as text, with both numbers; "" if there
+    is none · alternatives: every distinct pose that matches the data equally well; empty unless ``ambiguous`` ·
+    symmetry: the object's own, found by registering it with itself · considered: the candidate poses, for viewers ·
+    surroundings: the scene's surface around the detection, for viewers · camera: the image that the detection was made
+    in, where the scene is a recording · deciding: what tells the first two candidates of a search apart, where the
+    first one is accepted and both were refined · level: the strictest named level of the option ``acceptance`` that the
+    probability reaches; None: none.
     covariance: (7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t,
     becomes s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the
     place of the scene's origin: the farther that is from the object, the larger are the entries of t, however well the
@@ -193,24 +195,25 @@ class RegistrationResult(_Posed):
 
     @property
     def center_scene(self) -> Tensor:
-        """(3,) float64, scene frame: where the object's center is."""
+        """(3,) float64: the object's center in the scene frame."""
         return self.T_scene_object.apply(self.center_object[None])[0]
 
     @property
     def probability(self) -> float | None:
-        """That the answer is right, 0..1: that the pose or one of the alternatives is within 5 % of the object's
-        diameter, or equal to that by the object's symmetry. It decides the verdict: see the option ``acceptance``. None
-        from the preset `paper`."""
+        """Probability, 0..1, that the pose or one of the alternatives is within 5 % of the object's diameter of the
+        true pose or of a symmetry equivalent of it. It decides the verdict: see the option ``acceptance``. None with
+        the preset `paper`."""
         return self.metrics.get("probability")
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What tells the candidate that comes first and another one apart: the surface of either that lies off the other.
+    """Difference between the first candidate and another one: the part of each surface that is not on the other
+    surface.
 
-    differs: its share 0..1 of both surfaces · seen: share of both surfaces that does and was seen, or seen not to be
-    there · favor: -1..1, the share of what was seen that speaks for the first candidate less that which speaks for the
-    other · distinguishable: whether enough was seen of it.
+    differs: share of both surfaces that differs, 0..1 · seen: share of both surfaces that differs and was observed, as
+    surface or as free space · favor: -1..1, the observed share that supports the first candidate minus the share that
+    supports the other · distinguishable: whether enough of the difference was observed.
     """
 
     differs: float
@@ -221,9 +224,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Candidate:
-    """What a search tells about one object.
+    """The result of a search for one object.
 
-    stage: the last stage that it reached · score: 0..1, smaller is better, comparable only within a stage. Verdict,
+    stage: the last stage that it reached · score: cost, 0..1, lower is better, comparable only within a stage. Verdict,
     reason, transform, probability and level are those of a registration, for ``refined`` objects; None for the others.
     difference: from the candidate that comes first, for other ``refined`` ones.
     """
@@ -245,12 +248,12 @@ class Candidate:
 
 
 def level_in_words(level: Acceptance | None) -> str:
-    """Of an answer that has a probability."""
+    """The level as text, for a result with a probability."""
     return level or "below both levels"
 
 
 def sure_in_words(probability: float | None, level: Acceptance | None) -> str:
-    """To follow a verdict: `, probability 0.998 (strict)`; "" where there is no probability."""
+    """Text after a verdict: `, probability 0.998 (strict)`; "" if there is no probability."""
     return "" if probability is None else f", probability {probability:.3f} ({level_in_words(level)})"
 
 
@@ -262,7 +265,7 @@ Address = Annotated[str, WithJsonSchema({"type": "string", "format": "uri-refere
 
 
 class Outgoing(BaseModel):
-    """Base of what the service sends; it may gain members, so clients ignore those they do not know."""
+    """Base of all documents of the service. Documents may gain members, so clients ignore unknown ones."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -272,7 +275,7 @@ _Seven = Annotated[list[float | None], Field(min_length=7, max_length=7)]
 
 
 class TransformDocument(Outgoing):
-    """A similarity transform x -> s R x + t. `matrix` is row-major 4x4 and holds all of it."""
+    """A similarity transform x -> s R x + t. `matrix` is the complete transform, row-major 4x4."""
 
     matrix: list[list[float]]
     scale: float
@@ -281,167 +284,206 @@ class TransformDocument(Outgoing):
 
 
 class AlternativeDocument(Outgoing):
-    """Another pose that explains the data as well, such as a table's twin."""
+    """Another pose that fits the data equally well, for example of a symmetric table."""
 
     T_scene_object: TransformDocument
     T_object_scene: TransformDocument
-    score: float = Field(description="0..1, smaller is better; the result's own is the metric `score`.")
-    relation: str = Field(description="How it differs from the result, such as `180 degrees about z`: object axes.")
+    score: float = Field(description="Cost, 0..1, lower is better. The result's own cost is the metric `score`.")
+    relation: str = Field(
+        description="How it differs from the result, for example `180 degrees about z`. Axes are those of the object."
+    )
 
 
 class ConsideredDocument(Outgoing):
-    """A pose that was refined and judged by itself. `considered.npz` has what each sample says of it."""
+    """A pose that was refined and has its own verdict. `considered.npz` has the evidence of each sample."""
 
     T_scene_object: TransformDocument
     T_object_scene: TransformDocument
-    reason: str = Field(description="As of a verdict: SURFACES_AGREE, or what speaks against it.")
-    detail: str = Field(default="", description="The same in words.")
-    level: Acceptance | None = Field(default=None, description="That of `metrics.probability`, as the result's.")
+    reason: str = Field(description="Reason of the verdict: SURFACES_AGREE, or the reason against the pose.")
+    detail: str = Field(default="", description="The reason as a sentence.")
+    level: Acceptance | None = Field(
+        default=None, description="The named level of `metrics.probability`, as in the result."
+    )
     metrics: dict[str, float | None] = Field(default={})
 
 
 class UncertaintyDocument(Outgoing):
-    """One standard deviation each, from the covariance. They do not depend on where the scene's origin is."""
+    """Standard deviations from the covariance. They do not depend on the position of the scene's origin."""
 
-    center_scene: _Three = Field(description="Of `center_scene`, along the scene's x, y, z, scene units.")
-    rotation_deg: _Three = Field(description="Degrees about the object frame's x, y, z.")
-    scale_percent: float | None = Field(description="Of the scale.")
+    center_scene: _Three = Field(description="Of `center_scene` along the scene's x, y and z, scene units.")
+    rotation_deg: _Three = Field(description="Of the rotation about the object frame's x, y and z, degrees.")
+    scale_percent: float | None = Field(description="Of the scale, percent.")
 
 
 class SymmetryDocument(Outgoing):
-    """The turns that carry the object onto itself, found by registering it with itself."""
+    """The rotations that map the object onto itself, found by registering it with itself."""
 
-    order: int = Field(ge=1, description="The identity included; with `continuous`, how many ends look alike: 1 or 2.")
-    axis: list[float] | None = Field(description="Unit vector, object frame, that all of them turn about; or null.")
-    continuous: bool = Field(description="Whether every turn about the axis is one.")
+    order: int = Field(
+        ge=1,
+        description="Number of rotations, including the identity. With `continuous`: 1, or 2 if both ends of the "
+        "axis look alike.",
+    )
+    axis: list[float] | None = Field(
+        description="The axis of all rotations, a unit vector in the object frame; or null."
+    )
+    continuous: bool = Field(description="Whether every rotation about the axis is a symmetry.")
 
 
 class DifferenceDocument(Outgoing):
-    """What tells a candidate from the one that comes first: the surface of either that lies off the other."""
+    """Difference between a candidate and the first one: the part of each surface that is not on the other surface."""
 
-    differs: float = Field(description="Its share of both surfaces, 0..1.")
-    seen: float = Field(description="The share of both surfaces that differs and was seen, or seen not to be there.")
-    favor: float = Field(description="-1..1: how much more of what was seen speaks for the first than for this one.")
-    distinguishable: bool = Field(description="Whether enough of it was seen to tell the two apart.")
+    differs: float = Field(description="Share of both surfaces that differs between the two candidates, 0..1.")
+    seen: float = Field(
+        description="Share of both surfaces that differs and was observed, as surface or as free space."
+    )
+    favor: float = Field(
+        description="-1..1: how much more observed surface supports the first candidate than this one."
+    )
+    distinguishable: bool = Field(description="Whether enough of the difference was observed to distinguish the two.")
 
 
 class CandidateDocument(Outgoing):
-    """What a search found out about one object of a library."""
+    """The result of a search for one object of the library."""
 
     object: str = Field(description="SHA-256 of its field.")
     stage: Literal["refined", "coarse", "signature", "unusable"] = Field(
-        description="How far it came: refined on its field and judged, searched coarsely, compared by signature alone; "
-        "or unusable as an object."
+        description="The last stage that the candidate reached: refined on its field with a verdict, coarse "
+        "search, comparison of signatures only; or unusable as an object."
     )
-    score: float | None = Field(description="0..1, smaller is better; to be compared within one stage.")
-    verdict: Verdict | None = Field(default=None, description="Of refined ones.")
-    verdict_reason: str | None = Field(default=None, description="Of refined and unusable ones.")
-    probability: float | None = Field(default=None, description="Of refined ones, as the result's.")
-    level: Acceptance | None = Field(default=None, description="Of refined ones, as the result's.")
+    score: float | None = Field(description="Cost, 0..1, lower is better. Compare it only within one stage.")
+    verdict: Verdict | None = Field(default=None, description="Only for refined candidates.")
+    verdict_reason: str | None = Field(default=None, description="Only for refined and unusable candidates.")
+    probability: float | None = Field(
+        default=None, description="Only for refined candidates. Same meaning as in the result."
+    )
+    level: Acceptance | None = Field(
+        default=None, description="Only for refined candidates. Same meaning as in the result."
+    )
     difference: DifferenceDocument | None = Field(
-        default=None, description="Of refined ones but the first: what tells it from that."
+        default=None, description="Only for refined candidates after the first: the difference from the first."
     )
-    T_scene_object: TransformDocument | None = Field(default=None, description="Of refined ones.")
+    T_scene_object: TransformDocument | None = Field(default=None, description="Only for refined candidates.")
     T_object_scene: TransformDocument | None = Field(default=None, description="Its inverse.")
 
 
 class SettingsUsedDocument(Outgoing):
-    """Which of a trainer's settings an import has used."""
+    """The trainer's settings that an import has used."""
 
     trainer: str | None = None
     files: list[str] = Field(default=[], description="Their names.")
-    used: dict[str, Any] = Field(
-        default={}, description="Entries of a description, such as `hash.levels`, with values."
-    )
+    used: dict[str, Any] = Field(default={}, description="Import options, such as `hash.levels`, with their values.")
 
 
 class FieldNotesDocument(Outgoing):
-    """What the import of a field said that a result repeats."""
+    """Notes of a field's import that are copied into a result."""
 
     family: str | None = Field(default=None, description="The format that was recognized.")
-    settings: SettingsUsedDocument | None = Field(default=None, description="The trainer's settings that counted.")
-    warnings: list[str] = Field(default=[], description="Each begins with a stable word: docs/import-gate.md.")
+    settings: SettingsUsedDocument | None = Field(
+        default=None, description="The trainer's settings that the import used."
+    )
+    warnings: list[str] = Field(
+        default=[], description="Warnings of the import. Each begins with a stable word (docs/import-gate.md)."
+    )
 
 
 class ArtifactEntry(Outgoing):
-    """One file that the job wrote, or is about to write."""
+    """One file that the job has written or is writing."""
 
     name: str
     state: Literal["ready", "pending"] = Field(
-        default="ready", description="`pending`: it is still being made; a request for it is held until it is there."
+        default="ready",
+        description="`pending`: the file is still being made. A request for it waits until it is finished.",
     )
     bytes: int | None = Field(
-        description="Null while it is pending, as the digest, and for a picture that is drawn when it is asked for."
+        description="Size of the file. `bytes` and `sha256` are null while the file is pending, and for a picture "
+        "before its first request."
     )
     sha256: Sha256 | None
     url: Address
 
 
 class CameraDocument(Outgoing):
-    """The object in the frame of the camera whose image the detection was made in: x right, y down, z forward."""
+    """The object in the frame of the camera in whose image the detection was made: x right, y down, z forward."""
 
     frame: str = Field(description="The image's name.")
-    T_camera_object: TransformDocument = Field(description="Object to camera coordinates, in meters if the scene is.")
+    T_camera_object: TransformDocument = Field(
+        description="Object to camera coordinates. In meters if the scene is in meters."
+    )
     T_scene_camera: TransformDocument = Field(description="Camera to scene coordinates; the scene is the recording.")
-    center_camera: list[float] = Field(description="Where `center_object` is, camera frame, meters.")
-    object_unit_m: float | None = Field(default=None, description="Meters of the object's unit, where it is known.")
+    center_camera: list[float] = Field(description="`center_object` in the camera frame, meters.")
+    object_unit_m: float | None = Field(default=None, description="The object's unit in meters, if it is known.")
 
 
 class ResultDocument(Outgoing):
-    """What a registration found. Transforms carry their direction in their name."""
+    """The result of a registration. The name of a transform gives its direction."""
 
     verdict: Verdict
-    verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
-    verdict_detail: str = Field(default="", description="The reason in words, with the numbers behind it.")
-    verdict_hint: str = Field(default="", description="What to do next, for people; empty for a registered result.")
+    verdict_reason: str = Field(description="Reason of the verdict: one stable word, for example SURFACES_AGREE.")
+    verdict_detail: str = Field(default="", description="The reason as a sentence, with numbers.")
+    verdict_hint: str = Field(default="", description="What the user can do next. Empty for a registered result.")
     probability: float | None = Field(
         default=None,
-        description="0..1: that the pose or one of the alternatives is right, within 5 % of the object's diameter. It "
-        "decides the verdict: see `options.robust.acceptance`. Null from the preset `paper`.",
+        description="Probability, 0..1, that the pose or one of the alternatives is within 5 % of the object's "
+        "diameter of the true pose. It decides the verdict: see `options.robust.acceptance`. Null "
+        "with the preset `paper`.",
     )
     level: Acceptance | None = Field(
         default=None,
-        description="The strictest named level of `options.robust.acceptance` that the probability reaches, whichever "
-        "was asked for; null: none.",
+        description="The strictest named level of `options.robust.acceptance` that the probability reaches. It "
+        "does not depend on the level in the request. Null: none.",
     )
     T_scene_object: TransformDocument = Field(
         description="The object's pose in the scene: object to scene coordinates."
     )
     T_object_scene: TransformDocument = Field(description="Its inverse: scene coordinates to object coordinates.")
-    center_scene: list[float] = Field(default=[], description="T_scene_object of `center_object`, scene frame.")
+    center_scene: list[float] = Field(default=[], description="`center_object` in the scene frame.")
     center_object: list[float] = Field(default=[], description="The centroid of the object's surface, object frame.")
-    T_object_scene_initial: TransformDocument | None = Field(default=None, description="Where the refinement began.")
+    T_object_scene_initial: TransformDocument | None = Field(
+        default=None, description="The pose at the start of the refinement."
+    )
     alternatives: list[AlternativeDocument] = Field(
-        default=[], description="Every other pose that explains the data as well; empty unless `ambiguous`."
+        default=[],
+        description="All other poses that fit the data equally well. Empty unless the verdict is `ambiguous`.",
     )
     considered: list[ConsideredDocument] | None = Field(
-        default=None, description="Up to six poses that were judged, the likeliest first; null from the preset `paper`."
+        default=None,
+        description="Up to six candidate poses, each with its own verdict, the most probable first. Null with the "
+        "preset `paper`.",
     )
     covariance: Annotated[list[_Seven], Field(min_length=7, max_length=7)] | None = Field(
         default=None,
-        description="7x7 in the order of `covariance_ordering`, in radians and object units. T_object_scene, "
-        "x -> s R x + t, becomes s exp(log_s), exp([omega]) R, t + dt, so turn and growth are about t, where the "
-        "scene's origin lies; it is not exp(xi) T_object_scene. The object's point c lies in the scene at "
-        "p = R^T (c - t) / s and moves by J (omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s: its "
-        "covariance is J C J^T. docs/api.md has an example in numbers. Null from the preset `paper`.",
+        description="7x7 in the order of `covariance_ordering`, in radians and object units. A perturbation "
+        "changes T_object_scene, x -> s R x + t, to s exp(log_s), exp([omega]) R, t + dt. Rotation "
+        "and scaling are therefore about t, the image of the scene's origin; this is not exp(xi) "
+        "T_object_scene. The object's point c is in the scene at p = R^T (c - t) / s. It moves by J "
+        "(omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s, so its covariance is J C J^T. "
+        "docs/api.md has an example with numbers. Null with the preset `paper`.",
     )
-    covariance_ordering: list[str] | None = Field(default=None, description="omega (3), t (3), log_s.")
+    covariance_ordering: list[str] | None = Field(
+        default=None, description="Order of rows and columns: omega (3), t (3), log_s."
+    )
     uncertainty: UncertaintyDocument | None = None
-    camera: CameraDocument | None = Field(default=None, description="Of a scene that is a recording.")
+    camera: CameraDocument | None = Field(
+        default=None, description="The object in the camera frame, if the scene is a recording."
+    )
     symmetry: SymmetryDocument | None = Field(
-        default=None, description="The object's own; null from the preset `paper`."
+        default=None, description="The object's symmetry. Null with the preset `paper`."
     )
     metrics: dict[str, float | None] = Field(default={})
-    object: str | None = Field(default=None, description="SHA-256 of the object's field; of a search, the likeliest's.")
-    candidates: list[CandidateDocument] | None = Field(default=None, description="Of a search, the likeliest first.")
+    object: str | None = Field(
+        default=None, description="SHA-256 of the object's field. For a search, that of the most probable object."
+    )
+    candidates: list[CandidateDocument] | None = Field(
+        default=None, description="The candidates of a search, the most probable first."
+    )
     fields: dict[Literal["scene", "object"], FieldNotesDocument] | None = Field(
-        default=None, description="Their imports."
+        default=None, description="Notes of the imports of scene and object."
     )
     seed: int = 0
-    options: dict[str, Any] = Field(default={}, description="Every option that was used, defaults included.")
+    options: dict[str, Any] = Field(default={}, description="All options that were used, including defaults.")
     engine: dict[str, Any] = Field(default={}, description="Name, version, device.")
     artifacts: list[ArtifactEntry] = Field(default=[])
-    missing_artifacts: list[str] = Field(default=[], description="Names of those that could not be made afterwards.")
+    missing_artifacts: list[str] = Field(default=[], description="Names of artifacts that could not be made.")
 
 
 COVARIANCE_ORDERING = ("omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s")
@@ -457,11 +499,11 @@ def result_document(
     candidates: list[dict[str, Any]] | None = None,
     fields: Mapping[str, FieldNotes] | None = None,
 ) -> dict[str, Any]:
-    """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
+    """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics have the errors relative to it.
 
     ``device``: of the computation.
     ``object_name``: the object that was registered. ``candidates``: of :func:`ranking_document`, after a search.
-    ``fields``: what is known of the imports of scene and object, by these names.
+    ``fields``: notes of the imports of scene and object, by these names.
     """
     import torch
 

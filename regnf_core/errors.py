@@ -1,7 +1,7 @@
-"""Every error regnf raises on purpose, each with a stable ``reason`` that programs may switch on.
+"""All errors of regnf, each with a stable ``reason`` for programs.
 
     RegnfError
-    ├── InvalidInputError            the caller can mend it
+    ├── InvalidInputError            the caller can correct it
     │   ├── InvalidOptionsError      INVALID_OPTIONS, PRESET_UNSUITABLE
     │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
     │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
@@ -32,26 +32,26 @@ from typing import Any
 # One of several functions that a file may stand for, where nothing in it tells which: what a person is asked.
 
 MOST_CANDIDATES = 6
-"""So many are shown at most, the likeliest first."""
+"""So many are shown at most, the most probable first."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """name: what distinguishes it, a few words · description: the entries of a description that choose it, to be added
-    to what was said · picture: a PNG, two views of its surface and a section, where one could be made."""
+    """name: a few words that distinguish it · description: the import options that select it, to be added to the given
+    ones · picture: a PNG with two views of its surface and a section, if it could be made."""
 
     name: str
     description: Mapping[str, Any]
     picture: bytes | None = None
 
     def added_to(self, said: Mapping[str, Any]) -> dict[str, Any]:
-        """The whole description that chooses it, where ``said`` was said before."""
+        """The complete import options that select this reading, with the options that were given."""
         return _merged(said, self.description)
 
 
 @dataclass(frozen=True)
 class Said:
-    """What a user said of a field. use: what it was named as on a command line, scene or object, where that is known ·
+    """The options of a user for a field. use: its role on a command line, scene or object, if it is known ·
     description: its entries, see UploadDescription."""
 
     use: str | None
@@ -77,29 +77,29 @@ _MIN_SIMILARITY = 0.6
 
 
 def hint_of(reason: str) -> str | None:
-    """What to do next about an error of this reason; None where it says all by itself."""
+    """What the user can do next after an error with this reason; None if the message is sufficient."""
     family = next((hint for beginning, hint in _FAMILIES.items() if reason.startswith(beginning)), None)
     return HINTS.get(reason, family)
 
 
 def verdict_hint(reason: str, options: Mapping[str, Any]) -> str:
-    """What to do next about a verdict, under these options of the registration; "" where nothing needs to be done."""
+    """What the user can do next after a verdict, with these options of the registration; "" if nothing is needed."""
     if reason == "SEVERAL_POSES_AGREE" and options.get("up_axis") is not None:
         return (
-            "Choose a pose among the alternatives: all of them stand upright. A box that shows what tells the sides "
-            "apart, or more views of it, may decide."
+            "Choose one of the alternatives. All of them are upright. A box that includes the parts that distinguish "
+            "the sides, or more views of the object, may decide."
         )
     return HINTS.get(reason, "")
 
 
 def suggestion(name: str, known: Iterable[str]) -> str | None:
-    """ "Did you mean `center`?" for a name that is not known; None where nothing is near."""
+    """A hint for an unknown name: Did you mean `center`? None if no known name is similar."""
     near = nearest_name(name, known)
     return f"Did you mean `{near}`?" if near else None
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str | None:
-    """The known name that is meant by one that is not known: its new name, or the most similar one."""
+    """The known name for an unknown one: its replacement, or the most similar name."""
     names = sorted(known)
     renamed = RENAMED.get(name)
     if renamed in names:
@@ -132,7 +132,7 @@ class RegnfError(Exception):
 
 
 class InvalidInputError(RegnfError):
-    """Something the caller gave cannot be used."""
+    """An input of the caller is invalid."""
 
     reason = "INVALID_INPUT"
 
@@ -144,7 +144,7 @@ class InvalidOptionsError(InvalidInputError):
 
 
 class InvalidDetectionError(InvalidInputError):
-    """A detection box is malformed, or lies outside the scene's bounds.
+    """A detection box is malformed, or is outside the scene's bounds.
 
     ``place`` leads to the faulty member from the detection on: ("center", 0).
     """
@@ -159,7 +159,7 @@ class InvalidDetectionError(InvalidInputError):
 
 
 class FieldFormatError(InvalidInputError):
-    """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault.
+    """The bytes are not a field that regnf supports. ``reason`` identifies the stage and the error.
 
     candidates: the functions that a file may stand for, where that is why (LAYOUT_AMBIGUOUS). said: what the user
     said of the field, where that is known.
@@ -175,7 +175,7 @@ class FieldFormatError(InvalidInputError):
         self.candidates = tuple(candidates)
 
     def told(self, message: str, hint: str | None = None) -> FieldFormatError:
-        """The same error in other words."""
+        """The same error with another message."""
         error = FieldFormatError(message, reason=self.reason, hint=hint or self.hint, candidates=self.candidates)
         error.said = self.said
         return error
@@ -200,38 +200,38 @@ class InitializationError(RegnfError):
 
 
 class FitDivergedError(RegnfError):
-    """A field that is being fitted is no longer made of numbers; its last checkpoint is kept."""
+    """The fit of a field has diverged to NaN or infinity. Its last checkpoint is kept."""
 
     reason = "FIT_DIVERGED"
 
 
 class CancelledError(RegnfError):
-    """The caller asked for the work to stop."""
+    """The caller requested the work to stop."""
 
     reason = "CANCELLED"
 
 
 class MissingExtraError(RegnfError):
-    """An extra of the package that is needed is not installed, or only in part."""
+    """A required extra of the package is not installed, or only in part."""
 
     unavailable = True
     reason = "EXTRA_MISSING"
 
     @classmethod
     def of(cls, modules: Sequence[str], extras: Sequence[str]) -> MissingExtraError:
-        """Names the modules that are not there, and the extras that bring them."""
+        """Lists the missing modules, and the extras that install them."""
         return cls(f"not installed: {', '.join(modules)}; pip install 'regnf[{','.join(extras)}]'")
 
 
 # Files that appear complete or not at all, and the names that they may have.
 
 RECORDING_SUFFIX = ".rrd"
-"""Of recordings for the viewer of rerun."""
+"""Suffix of recordings for the rerun viewer."""
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], durable: bool = False) -> Iterator[Path]:
-    """A path beside ``path`` to write to. It is renamed to ``path`` at the end, or removed after an error.
+    """A temporary path next to ``path`` to write to. It is renamed to ``path`` at the end, or removed after an error.
 
     durable: the content is on the disk before the rename, so that a power failure leaves no incomplete file either.
     """
@@ -249,7 +249,8 @@ def atomic_path(path: str | os.PathLike[str], durable: bool = False) -> Iterator
 
 @contextmanager
 def made_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """The folder, made with those above it if need be. After an error the made ones go again, if they are empty."""
+    """Creates the folder and its parents, if they do not exist. After an error the new folders are removed again, if
+    they are empty."""
     folder = Path(path)
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
@@ -264,7 +265,8 @@ def made_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def filled_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A folder to write files into, which lie in the folder ``path`` at the end. After an error none of them does."""
+    """A temporary folder for new files. They are moved into the folder ``path`` at the end. After an error none of them
+    is moved."""
     with made_folder(path) as target, tempfile.TemporaryDirectory(dir=target) as work:
         yield Path(work)
         for made in sorted(Path(work).iterdir()):
@@ -285,7 +287,7 @@ def new_file(path: str | os.PathLike[str], suffix: str) -> Path:
     """
     target = Path(path)
     if target.is_dir():
-        hint = f"Name a file in it: {target / 'result'}{suffix}"
+        hint = f"Give a file in it: {target / 'result'}{suffix}"
         raise InvalidInputError(f"{target}: a folder, expected a file to write", reason="FILE_IS_FOLDER", hint=hint)
     if target.suffix != suffix:
         raise InvalidOptionsError(f"{target}: expected a name that ends in {suffix}")
@@ -293,6 +295,6 @@ def new_file(path: str | os.PathLike[str], suffix: str) -> Path:
 
 
 def verdict_in_words(reason: str, limit: str = "") -> str:
-    """The reason's sentence and, where a limit was not kept, both of its numbers."""
+    """The sentence of the reason and, if a limit was violated, the value and the limit."""
     said = VERDICT_REASONS.get(reason, "")
     return f"{said} {limit[:1].upper()}{limit[1:]}.".strip() if limit else said

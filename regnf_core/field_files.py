@@ -29,8 +29,8 @@ def require_field_file(path: Path) -> None:
     require_file(path)
     if path.suffix.lower() in _TEXT_SUFFIXES:
         found = checkpoint_below(path.parent)
-        hint = f"Did you mean {found}?" if found else "Give the checkpoint that it belongs to."
-        message = f"{path}: a text file ({path.suffix}), expected a field: safe field, checkpoint or mesh"
+        hint = f"Did you mean {found}?" if found else "Give the checkpoint to which it belongs."
+        message = f"{path}: a text file ({path.suffix}), expected a field: regnf field file, checkpoint or mesh"
         raise FieldFormatError(message, reason="FORMAT_NOT_RECOGNIZED", hint=hint)
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
@@ -51,7 +51,7 @@ def require_file(path: Path) -> None:
 
 
 def stored_bounds(path: Path) -> Bounds | None:
-    """The lowest and the highest corner in a safe field's header; None where there is none to be read.
+    """The lowest and the highest corner in a regnf field file's header; None where there is none to be read.
 
     It needs no library beyond Python's, and promises nothing: opening the file says what is wrong with it.
     """
@@ -93,16 +93,16 @@ def _files(folder: Path) -> Iterator[Path]:
 def _near(path: Path) -> str:
     """What to do about a file that is not there: the name that is almost the same, or where to look."""
     if str(path).lstrip()[:1] in ("{", "["):
-        return "A file is expected: write the JSON into a file, and give its name."
+        return "Write the JSON into a file, and give the path of the file."
     if re.match(r"[a-z][a-z0-9]+:/", str(path), re.IGNORECASE):
-        return "An address is not read: download the file, and give its name."
+        return "URLs are not supported. Download the file, and give its path."
     folder = path.parent
     if not folder.is_dir():
         return f"There is no folder {str(folder)[:_MAX_NAME]} either. Check the path."
     names = [entry.name for entry in folder.iterdir()]
     same_stem = [name for name in names if Path(name).stem == path.stem]
     near = same_stem or difflib.get_close_matches(path.name, names, n=1)
-    return f"Did you mean {folder / near[0]}?" if near else f"Check the path, and what is in {folder.resolve()}."
+    return f"Did you mean {folder / near[0]}?" if near else f"Check the path and the content of {folder.resolve()}."
 
 
 # The files of a library of objects, from the files and folders that a user names. Torch-free.
@@ -124,11 +124,11 @@ def library_files(named: list[Path]) -> list[Path]:
         for file in found:
             files.setdefault(file.resolve(), file)
     if not files:
-        message = f"{', '.join(map(str, named))}: no fields in it, expected safe fields, checkpoints or meshes"
-        hint = "Give the folder that holds the objects' files; folders inside it are not searched."
+        message = f"{', '.join(map(str, named))}: it has no fields; expected regnf field files, checkpoints or meshes"
+        hint = "Give the folder with the objects' files. Its subfolders are not searched."
         raise InvalidInputError(message, reason="LIBRARY_EMPTY", hint=hint)
     if len(files) > _MOST:
-        raise InvalidInputError(f"{len(files)} objects; at most {_MOST} are searched", reason="LIBRARY_TOO_LARGE")
+        raise InvalidInputError(f"{len(files)} objects; a search can have at most {_MOST}", reason="LIBRARY_TOO_LARGE")
     return list(files.values())
 
 

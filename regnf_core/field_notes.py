@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 WARNINGS = "warnings"
-"""The entry of a safe field's ``source`` that has the warnings of its import."""
+"""The entry of a regnf field file's ``source`` that has the warnings of its import."""
 _WARNING = re.compile(r"[A-Z][A-Z0-9_]{2,63}: ")
 _MOST, _LONGEST = 16, 400
 
@@ -31,7 +31,7 @@ class FieldNotes:
 
     @classmethod
     def of_source(cls, source: Mapping[str, Any]) -> FieldNotes:
-        """From what a safe field says of its origin: the warnings of its import."""
+        """From what a regnf field file says of its origin: the warnings of its import."""
         return cls(warnings=kept_warnings(source.get(WARNINGS)))
 
     def to_dict(self) -> dict[str, Any]:

@@ -26,16 +26,16 @@ A file of the dataset (meta_data.json, dataparser_transforms.json ...) joins tho
 """
 _WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, *RUN_ARCHIVES, "safetensors"})
 """Formats that no trainer's settings say anything about, and archives, which have their own."""
-_FOUND_BESIDE = "They were found beside the checkpoint: --no-config (in Python config=False) leaves them unread."
+_FOUND_BESIDE = "They were found next to the checkpoint. --no-config (in Python config=False) ignores them."
 _WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "sqlite", "onnx"})
 """Formats whose files say which side of the surface is free; of the others the use decides."""
 
 
 @dataclass(frozen=True)
 class FieldSource:
-    """named: the path as the user gave it · file: what the gate reads · run: the settings found beside it · config: the
-    file of settings that the user named · said: what the user says of it, see UploadDescription · role: what it will be
-    used as, where that decides something and the user has not said it · use: the same, whatever it decides."""
+    """named: the path as the user gave it · file: what the importer reads · run: the settings found beside it · config:
+    the file of settings that the user named · said: what the user says of it, see UploadDescription · role: what it
+    will be used as, where that decides something and the user has not said it · use: the same, whatever it decides."""
 
     named: Path
     file: Path
@@ -47,7 +47,7 @@ class FieldSource:
 
     @property
     def description(self) -> dict[str, Any]:
-        """What the gate is told."""
+        """The input of the importer."""
         return dict(self.said) if self.role is None else {**self.said, "as": self.role}
 
     @property
@@ -58,7 +58,7 @@ class FieldSource:
 
     @property
     def description_to_send(self) -> dict[str, Any]:
-        """What a service is told: the same, and what to call it."""
+        """The input of a service: the same, and a name."""
         return {**self.description, **({"label": self.label} if self.label else {})}
 
     @property

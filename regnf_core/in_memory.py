@@ -1,4 +1,4 @@
-"""Fields of what lies in memory: arrays of a mesh, points or a grid, functions, and meshes of trimesh and Open3D.
+"""Fields from data in memory: arrays of a mesh, points or a grid, functions, and meshes of trimesh and Open3D.
 
 They are made by the import's own converters, so a mesh in memory is the same field as the same mesh in a file. Nothing
 runs in a sandbox: the numbers are the caller's own. Objects of other libraries are told by their attributes.
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array
 
 HINT = (
-    'Give a path such as "chair.glb", a mesh or a cloud of trimesh or Open3D, what open_field returns, an object with'
-    " SdfField's members, or what from_mesh, from_points, from_grid or from_function make."
+    'Give a path such as "chair.glb", a mesh or point cloud of trimesh or Open3D, a field from open_field, from_mesh,'
+    " from_points, from_grid or from_function, or an object with SdfField's members."
 )
-_NUMBERS = "Give an array, a tensor or a list of real numbers, all rows of one length."
+_NUMBERS = "Give an array, a tensor or a list of real numbers whose rows have the same length."
 _SIGN = (
     "Values are distances, positive in free space. If they are negative there, say sign=-1 (from_grid:"
-    ' description={"sign": -1}). Do the bounds hold the surface, and a little free space round it?'
+    ' description={"sign": -1}). Check also that the bounds contain the surface and some free space around it.'
 )
 Said = Mapping[str, Any] | None
 """What ``open_field`` takes as a description: up_axis, world_scale, sign, as ..."""
@@ -57,7 +57,7 @@ class HasGeometry(Protocol):
 
 
 class FieldWarning(UserWarning):
-    """A field was opened, and its import has warned of something."""
+    """The import of an opened field has a warning."""
 
 
 def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said = None) -> SdfField:
@@ -75,11 +75,11 @@ def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said =
 
 
 def from_points(points: Any, normals: Any = None, description: Said = None, sensor: Any = None) -> SdfField:
-    """The field of a cloud of points: the distance to its screened Poisson surface.
+    """The field of a point cloud: the distance to its screened Poisson surface.
 
     points, normals: (N, 3), as ``from_mesh`` takes vertices; rows that are not finite, or of no normal, are left out.
-    Normals point to free space. Without them, or where they contradict each other, they are estimated: they look to the
-    ``sensor`` (3,), where all points were measured from; else to where the points can be seen from.
+    Normals point to free space. Missing or contradicting normals are estimated: they point to the ``sensor`` (3,), the
+    position from which all points were measured, or without it to positions from which the points are visible.
     Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_TOO_SMALL, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
     """
     from regnf_core.importing.families.cloud import convert_cloud
@@ -110,7 +110,7 @@ def from_grid(values: Any, origin: Any, spacing: Any, description: Said = None) 
 
     array = _array("values", values, "TENSOR_DTYPE")
     if array.ndim != 3 or min(array.shape) < 2:
-        message = f"values has shape {array.shape}, expected (X, Y, Z) with two nodes an axis at least"
+        message = f"values has shape {array.shape}, expected (X, Y, Z) with at least two nodes per axis"
         raise FieldFormatError(message, reason="TENSOR_SHAPE")
     place, step = (_array(name, one, "BOUNDS_INVALID") for name, one in (("origin", origin), ("spacing", spacing)))
     step = np.full(3, float(step.reshape(()))) if step.size == 1 else step
@@ -146,7 +146,7 @@ def from_function(f: PointFunction, bounds: Any, sign: int = 1, device: str | No
 
 
 def field_of(thing: Any, role: Role | None = None, description: Said = None) -> SdfField:
-    """The field that an object stands for, whatever library it is of. role: what it will be used as.
+    """The field of a mesh or point cloud of any supported library. role: its use.
 
     Raises InvalidInputError (NO_FIELD) for what is none, and what the functions above raise.
     """
@@ -168,7 +168,7 @@ def field_of(thing: Any, role: Role | None = None, description: Said = None) -> 
 
 
 def geometry_of(thing: Any, role: Role | None = None) -> Geometry:
-    """The triangles or the points of an object of another library, or of a mesh that was opened here. Torch-free.
+    """The triangles or points of a mesh of another library, or of a mesh that regnf has opened. Torch-free.
 
     Raises InvalidInputError (NO_FIELD) for what has none, FieldFormatError (MESH_INVALID).
     """
@@ -261,12 +261,12 @@ def _array(name: str, values: Any, reason: str) -> npt.NDArray[Any]:
     try:
         array = np.asarray(values)
     except Exception as error:  # rows of several lengths, or an object of another library
-        raise FieldFormatError(f"{name} is no array of numbers: {error}", reason=reason, hint=_NUMBERS) from error
+        raise FieldFormatError(f"{name} is not an array of numbers: {error}", reason=reason, hint=_NUMBERS) from error
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise FieldFormatError(f"{name} has masked entries", reason=reason, hint="Leave them out, or fill them.")
     if array.dtype.kind not in "fiu":
         what = "nothing" if values is None else array.dtype.name
-        raise FieldFormatError(f"{name} holds {what}; real numbers are needed", reason=reason, hint=_NUMBERS)
+        raise FieldFormatError(f"{name} holds {what}; real numbers are required", reason=reason, hint=_NUMBERS)
     return array
 
 
@@ -275,7 +275,9 @@ def _rows(name: str, values: Any, reason: str) -> Float64Array:
     array = _array(name, values, reason)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         hint = (
-            f"Give {name}.T: a row for each." if array.ndim == 2 and array.shape[0] == 3 else "A row for each: x, y, z."
+            f"Give {name}.T: one row per point."
+            if array.ndim == 2 and array.shape[0] == 3
+            else "Write one row per point: x, y, z."
         )
         raise FieldFormatError(f"{name} has shape {array.shape}, expected (N, 3)", reason=reason, hint=hint)
     return np.ascontiguousarray(array, dtype=np.float64)
@@ -291,19 +293,19 @@ def _faces(faces: Any, vertices: int) -> Int64Array:
     else:
         array = _indices(faces)
         if array.ndim != 2 or len(array) == 0 or not 3 <= array.shape[1] <= 255:
-            hint = "Give (F, 3) indices of three vertices each."
+            hint = "Give (F, 3) vertex indices, one row per triangle."
             if array.ndim == 1 and len(array) > 3 and array[0] in (3, 4):
                 hint = "In PyVista: mesh.triangulate().regular_faces."
             elif array.ndim == 2 and array.shape[0] == 3:
-                hint = "Give faces.T: a row for each."
+                hint = "Give faces.T: one row per face."
             raise FieldFormatError(f"faces has shape {array.shape}, expected (F, 3)", reason="MESH_INVALID", hint=hint)
         corners = fans(array)
     if len(corners) == 0:
         raise FieldFormatError("there are no triangles", reason="MESH_INVALID")
     if corners.min() < 0 or corners.max() >= vertices:
         from_one = corners.min() == 1 and corners.max() == vertices
-        hint = "They seem to be counted from 1: subtract 1." if from_one else "Indices are counted from 0."
-        message = f"faces name the vertices {corners.min()} to {corners.max()}, there are 0 to {vertices - 1}"
+        hint = "They seem to start at 1: subtract 1." if from_one else "Indices start at 0."
+        message = f"faces refer to the vertices {corners.min()} to {corners.max()}, there are 0 to {vertices - 1}"
         raise FieldFormatError(message, reason="MESH_INVALID", hint=hint)
     return corners
 
@@ -311,7 +313,7 @@ def _faces(faces: Any, vertices: int) -> Int64Array:
 def _indices(values: Any) -> Int64Array:
     array = _array("faces", values, "MESH_INVALID")
     if array.dtype.kind == "f" and not (np.isfinite(array) & (array == np.round(array))).all():
-        raise FieldFormatError("faces holds numbers that are not whole", reason="MESH_INVALID")
+        raise FieldFormatError("faces has numbers that are not whole", reason="MESH_INVALID")
     return array.astype(np.int64)
 
 

@@ -1,4 +1,4 @@
-"""Registration of two fields, and which object of a library a detection shows, and where it stands.
+"""Registration of two fields, and search for the object of a detection in a library.
 
 library = [LibraryObject(path.stem, partial(open_field, path), read_object_model(path.with_suffix(".model")))
            for path in paths]
@@ -57,7 +57,7 @@ _MAX_SQUARED_DISTANCE = 4.0  # of two signatures without a common bin
 
 @dataclass(frozen=True, eq=False)
 class LibraryObject:
-    """An object to look for. field: opens its field; called only for the few objects that may be the right one."""
+    """An object of a search. field: opens its field; it is called only for the most probable objects."""
 
     name: str
     field: Callable[[], SdfField]
@@ -66,7 +66,7 @@ class LibraryObject:
 
 @dataclass(frozen=True)
 class LibrarySearch:
-    """ranking: every object of the library, the likeliest first · result: the registration of the first."""
+    """ranking: every object of the library, the most probable first · result: the registration of the first."""
 
     ranking: list[Candidate]
     result: RegistrationResult
@@ -81,7 +81,7 @@ def search_library(
     progress: ProgressCallback | None = None,
     clouds: bool = True,
 ) -> LibrarySearch:
-    """Rank the library's objects for one detection, and register the likeliest, by the preset `robust`.
+    """Rank the library's objects for one detection, and register the most probable, by the preset `robust`.
 
     All are compared by signature, the nearest 12 searched coarsely on samples, at most 4 refined on their fields and
     evaluated: the time hardly grows with the library. Deterministic for a seed. ``progress`` and ``clouds`` as in
@@ -143,7 +143,7 @@ _Refined = tuple[Evaluation, int, RegistrationProblem, int]
 
 
 def _decided(refined: list[_Refined]) -> list[Comparison]:
-    """Move the candidate that the surface speaks for by which it differs from the likeliest one to the first place,
+    """Move the candidate that the surface speaks for by which it differs from the most probable one to the first place,
     but no rejected one before an accepted one. Returns what tells each of the others from the first."""
     placed = {found[1]: found[0].placed(found[2]) for found in refined}
     for found in refined[1:]:
@@ -186,7 +186,7 @@ def register(
     object_model: ObjectModel | None = None,
     clouds: bool = True,
 ) -> RegistrationResult:
-    """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
+    """Find the pose of a known object in a scanned scene: rotation, position, scale and a verdict.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimizing; it may
     raise CancelledError. For the preset `robust` alone: ``initial_transform``, a T_object_scene to try first, and
@@ -199,7 +199,7 @@ def register(
     """
     options = options or RegistrationOptions()
     if initial_transform is not None:
-        options.require_robust("starts from a given transform", reason="PRESET_UNSUITABLE")
+        options.require_robust("can use an initial transform", reason="PRESET_UNSUITABLE")
     if object_model is not None:
         options.require_robust("uses an object model")
     run = Run(progress)
@@ -218,7 +218,7 @@ def register(
 def with_late_clouds(
     result: RegistrationResult, scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions
 ) -> RegistrationResult:
-    """The result of ``register`` without clouds as it returns it with them, but for the seconds of this phase."""
+    """Adds the point clouds to a result of ``register`` without clouds. Only the time of this phase differs."""
     if options.preset == "robust":
         return with_clouds(result, scene, obj, detection, cloud_region(detection))
     from regnf_core.paper import pipeline as paper

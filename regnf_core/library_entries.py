@@ -53,7 +53,7 @@ def checked_tags(tags: Sequence[str]) -> list[str]:
     """Tags, each once, sorted. Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
     several = sorted({_checked(_TAG, tag, "tag", MAX_TAG) for tag in tags})
     if len(several) > MAX_TAGS:
-        raise _invalid(f"{len(several)} tags, at most {MAX_TAGS} are taken")
+        raise _invalid(f"{len(several)} tags; at most {MAX_TAGS} are allowed")
     return several
 
 
@@ -67,9 +67,9 @@ def checked_symmetry(said: Any) -> dict[str, Any] | None:
     match said:
         case {"order": int() as order, "axis": axis, "continuous": bool() as continuous} if len(said) == 3:
             if isinstance(order, bool) or not 1 <= order <= MAX_ORDER:
-                raise _invalid(f"symmetry: the order is a whole number from 1 to {MAX_ORDER}")
+                raise _invalid(f"symmetry: the order must be a whole number from 1 to {MAX_ORDER}")
             if continuous and (axis is None or order > 2):
-                raise _invalid("symmetry: a continuous one has an axis, and the order 1 or 2")
+                raise _invalid("symmetry: a continuous symmetry needs an axis and the order 1 or 2")
             return {"order": order, "axis": None if axis is None else _unit(axis), "continuous": continuous}
     raise _invalid("symmetry: expected order, axis and continuous")
 
@@ -92,7 +92,7 @@ class EntryNotes:
         if unit is not None and unit not in UNITS:
             raise _invalid(f"no such unit, expected one of {', '.join(UNITS)}")
         if note is not None and (len(note) > MAX_NOTE or re.search(f"[{UNSHOWN}]", note)):
-            raise _invalid(f"a note has one line of at most {MAX_NOTE} characters that can be shown")
+            raise _invalid(f"a note must be one line of at most {MAX_NOTE} printable characters")
         return cls(checked_name(name), tuple(checked_tags(tags)), unit, note, checked_symmetry(symmetry))
 
     @classmethod
@@ -103,7 +103,7 @@ class EntryNotes:
                 unit, note = values.get("unit"), values.get("note")
                 if all(text is None or isinstance(text, str) for text in (unit, note)):
                     return cls.checked(name, tags, unit, note, values.get("symmetry"))
-        raise _invalid("expected a name, tags, and texts as unit and note")
+        raise _invalid("expected a name, tags, a unit and a note as texts")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain (JSON) values."""
@@ -112,18 +112,18 @@ class EntryNotes:
 
 def _checked(pattern: re.Pattern[str], text: str, what: str, most: int) -> str:
     if pattern.fullmatch(text) is None:
-        rule = "without / \\ ? # %, spaces at the ends, a dot at the beginning or characters that are not shown"
-        raise _invalid(f"a {what} has 1 to {most} characters, {rule}")
+        rule = "without / \\ ? # %, spaces at the ends, a dot at the beginning, or characters that are not printable"
+        raise _invalid(f"a {what} must have 1 to {most} characters, {rule}")
     return text
 
 
 def _unit(axis: Any) -> list[float]:
     numbers = axis if isinstance(axis, list | tuple) and len(axis) == 3 else ()
     if not numbers or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers):
-        raise _invalid("symmetry: the axis is three numbers")
+        raise _invalid("symmetry: the axis needs three numbers")
     length = math.hypot(*numbers)
     if not math.isfinite(length) or length < 1e-9:
-        raise _invalid("symmetry: the axis has no direction")
+        raise _invalid("symmetry: the axis must not be zero")
     return [float(x) / length for x in numbers]
 
 

@@ -1,7 +1,7 @@
-"""A library in a folder: safe fields, their pictures, and an index. Torch-free but for adding.
+"""A library in a folder: regnf field files, their pictures, and an index. Torch-free but for adding.
 
 library.json              names, tags, units, notes, symmetries
-{sha256}.safetensors      a safe field, by the digest of its bytes
+{sha256}.safetensors      a regnf field file, by the digest of its bytes
 {sha256}.png              its picture, where there is one
 """
 
@@ -33,7 +33,7 @@ _DIGITS = 64
 
 @dataclass(frozen=True)
 class FolderEntry:
-    """field: SHA-256 of the safe field · detected: the symmetry that was found; None: there is no surface."""
+    """field: SHA-256 of the regnf field file · detected: the symmetry that was found; None: there is no surface."""
 
     notes: EntryNotes
     field: str
@@ -54,7 +54,7 @@ class FolderEntry:
         notes = EntryNotes.from_dict(values)
         field = values.get("field")
         if not (isinstance(field, str) and len(field) == _DIGITS and set(field) <= set("0123456789abcdef")):
-            raise InvalidInputError("a field is named by its SHA-256", reason="LIBRARY_ENTRY_INVALID")
+            raise InvalidInputError("a field must be identified by its SHA-256", reason="LIBRARY_ENTRY_INVALID")
         return cls(notes, field, checked_symmetry(values.get("detected_symmetry")))
 
 
@@ -71,10 +71,10 @@ def index_of(text: bytes, named: str) -> list[FolderEntry]:
             raise ValueError(f"expected an index of format {FORMAT}")
         entries = [FolderEntry.from_dict(values) for values in document["entries"]]
     except (ValueError, KeyError, TypeError, RecursionError, InvalidInputError) as error:
-        raise _invalid(f"{named}: no index of a library: {error}") from error
+        raise _invalid(f"{named}: not an index of a library: {error}") from error
     for what in ({one.notes.name for one in entries}, {one.field for one in entries}):
         if len(what) < len(entries):
-            raise _invalid(f"{named}: two entries share a name or a field")
+            raise _invalid(f"{named}: two entries have the same name or the same field")
     return entries
 
 
@@ -109,18 +109,18 @@ class LibraryFolder:
         for one in self.entries():
             if one.notes.name == name:
                 return one
-        hint = "`regnf library list` shows all names."
+        hint = "`regnf library list` lists all names."
         raise InvalidInputError(f"{self.folder}: no entry {name!r}", reason="LIBRARY_ENTRY_NOT_FOUND", hint=hint)
 
     def file(self, entry: FolderEntry) -> Path:
-        """The safe field."""
+        """The regnf field file."""
         return self.folder / f"{entry.field}.safetensors"
 
     def picture(self, entry: FolderEntry) -> Path:
         return self.folder / f"{entry.field}.png"
 
     def add(self, source: FieldSource, notes: EntryNotes) -> FolderEntry:
-        """Import the field through the gate, find its symmetry, and keep it.
+        """Import the field through the importer, find its symmetry, and keep it.
 
         Raises FieldFormatError naming the file, InvalidInputError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY).
         """
@@ -175,11 +175,11 @@ class LibraryFolder:
     def _require_free(self, held: list[FolderEntry], entry: FolderEntry) -> None:
         for one in held:
             if one.notes.name == entry.notes.name:
-                message = f"{self.folder}: there is an entry {one.notes.name!r}"
+                message = f"{self.folder}: the entry {one.notes.name!r} exists already"
                 hint = "Choose another name, or remove that entry first."
                 raise InvalidInputError(message, reason="LIBRARY_NAME_TAKEN", hint=hint)
             if one.field == entry.field:
-                message = f"the field is the entry {one.notes.name!r}"
+                message = f"the field is already the entry {one.notes.name!r}"
                 hint = "Change that entry: `regnf library edit`."
                 raise InvalidInputError(message, reason="FIELD_IN_LIBRARY", hint=hint)
 
@@ -191,7 +191,7 @@ def digest_of(path: Path) -> str:
 
 
 def _symmetry_of(field: Path) -> dict[str, Any] | None:
-    """Of the object in a safe field; its model is kept for searches. None for what has no surface."""
+    """Of the object in a regnf field file; its model is kept for searches. None for what has no surface."""
     from regnf_core.object_models import object_model
     from regnf_core.options import RobustOptions
 
@@ -217,7 +217,7 @@ _WRITTEN = (1980, 1, 1, 0, 0, 0)
 
 
 def write_archive(path: Path, entries: list[tuple[FolderEntry, Path]]) -> None:
-    """Entries and their safe fields. The file is there once it is whole."""
+    """Entries and their regnf field files. The file is there once it is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(INDEX, _WRITTEN), index_text([entry for entry, _ in entries]))
@@ -231,7 +231,7 @@ def write_archive(path: Path, entries: list[tuple[FolderEntry, Path]]) -> None:
 
 @dataclass(frozen=True)
 class Archive:
-    """An archive whose structure was checked; its fields still have to pass the import gate."""
+    """An archive whose structure was checked; its fields still have to pass the importer."""
 
     entries: list[FolderEntry]
     _data: memoryview
@@ -247,7 +247,7 @@ class Archive:
                 digest.update(block)
                 file.write(block)
         if digest.hexdigest() != entry.field:
-            raise _refused(f"the field of {entry.notes.name!r} is not the one that the index names", "HASH_MISMATCH")
+            raise _refused(f"the field of {entry.notes.name!r} differs from the one in the index", "HASH_MISMATCH")
 
 
 @contextmanager  # what is mapped ends with its last reader
@@ -268,7 +268,7 @@ def _checked(data: memoryview, path: Path) -> Archive:
     index = members.get(INDEX)
     if index is None or index.size > _INDEX_BYTES:
         hint = "Give a file that `regnf library export` wrote."
-        raise InvalidInputError(f"{path}: no library: it has no {INDEX}", reason="LIBRARY_INDEX_INVALID", hint=hint)
+        raise InvalidInputError(f"{path}: not a library: it has no {INDEX}", reason="LIBRARY_INDEX_INVALID", hint=hint)
     entries = index_of(bytes(data[index.offset : index.offset + index.size]), f"{path}: {INDEX}")
     expected = {INDEX, *map(_name, entries)}
     if members.keys() != expected:

@@ -1,4 +1,4 @@
-"""Open whatever a user has as a field: a safe field, or anything that the import gate takes, with its settings."""
+"""Open whatever a user has as a field: a regnf field file, or anything that the importer takes, with its settings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SafeField:
-    """A safe field's file, and what its import said."""
+    """A regnf field file, and what its import said."""
 
     path: Path
     notes: FieldNotes
@@ -48,14 +48,14 @@ def open_field(
 ) -> SdfField:
     """The field in a file, a training run's folder or an archive of one, on ``device``.
 
-    A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``.
-    In place of a path, a mesh or a cloud of trimesh or Open3D is taken as a file of it would be. ``description`` says
-    what the file does not carry, see UploadDescription. ``config`` names the trainer's settings: a file, or an
-    archive of several; None takes those beside the checkpoint, False none. A warning of the import is issued as a
-    FieldWarning.
+    A regnf field file is opened as it is. Anything else goes through the importer, whose outcome is kept in
+    ``cache_dir``. In place of a path, a mesh or a cloud of trimesh or Open3D is taken as a file of it would be.
+    ``description`` says what the file does not carry, see UploadDescription. ``config`` names the trainer's settings: a
+    file, or an archive of several; None takes those beside the checkpoint, False none. A warning of the import is
+    issued as a FieldWarning.
 
-    Raises FieldFormatError (with the gate's reason) and InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER), which name
-    the file, and InvalidInputError (NO_FIELD) for what is neither a path nor a mesh.
+    Raises FieldFormatError (with the importer's reason) and InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER), which
+    name the file, and InvalidInputError (NO_FIELD) for what is neither a path nor a mesh.
     """
     if not isinstance(path, str | os.PathLike):
         from regnf_core.fields.build import usable_device
@@ -77,7 +77,7 @@ def load_field(source: FieldSource, device: str = "cpu", cache_dir: Path | None 
 
 
 def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
-    """The safe field for a source: the file itself when it is one already, else what the import gate made of it.
+    """The regnf field file for a source: the file itself when it is one already, else what the importer made of it.
 
     Raises FieldFormatError and InvalidInputError naming the file.
     """

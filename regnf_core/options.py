@@ -1,4 +1,4 @@
-"""Options of a registration, grouped by the stage they steer. Torch-free: the HTTP contract is derived from them.
+"""Options of a registration, grouped by stage. Torch-free: the HTTP contract is derived from them.
 
 Every length is in normalized field units unless its name says otherwise, as in the paper.
 """
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 Unit = Literal["auto", "m", "cm", "mm", "in", "free"]
 METERS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-"""Of the units that are known."""
+"""The units with a known length."""
 _UNIT_TOLERANCE = 0.01
-"""How far a scale that follows from a unit may be off: sensors' errors of scale are within."""
+"""Largest relative error of a scale that follows from a unit. It covers the scale errors of sensors."""
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
 Acceptance = Literal["default", "strict"]
@@ -32,7 +32,7 @@ _Scale = Annotated[float, Ge(1e-6), Le(1e6)] | None
 
 
 class _Group:
-    """Base of a group of options: no others are taken, and the texts below them are their descriptions."""
+    """Base of a group of options. Unknown options are refused. The docstring below an option is its description."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "use_attribute_docstrings": True}
 
@@ -42,7 +42,7 @@ class SamplingOptions(_Group):
     """Multi-view surface sampling (paper, section III-C.1)."""
 
     views: Annotated[int, Ge(1), Le(64)] = 5
-    """Cameras round the box, all looking at its center. More views cover hollow shapes better."""
+    """Number of cameras around the box, all looking at its center. More views cover hollow shapes better."""
     scene_camera_distance: Annotated[float, Gt(0), Le(100)] = 0.9
     """Distance of the scene's cameras from the box's center, scene units."""
     object_camera_distance: Annotated[float, Gt(0), Le(100)] = 0.7
@@ -50,9 +50,9 @@ class SamplingOptions(_Group):
     image_size: Annotated[int, Ge(8), Le(4096)] = 512
     """Edge of the virtual image, pixels."""
     pixel_stride: Annotated[int, Ge(1), Le(512)] = 8
-    """Every how many pixels a ray is cast, along both axes."""
+    """Distance between rays along both image axes, pixels."""
     ground_fraction: Annotated[float, Ge(0), Le(0.5)] = 0.025
-    """Lowest share of the box's height, along the option ``up_axis``, whose points are dropped as ground."""
+    """Points in this lowest share of the box's height, along ``up_axis``, are removed as ground."""
 
 
 @dataclass(frozen=True)
@@ -60,17 +60,17 @@ class InitializationOptions(_Group):
     """FPFH features, RANSAC and ICP (paper, section III-C.2)."""
 
     voxel_size: Annotated[float, Gt(0), Le(10)] = 0.025
-    """Voxel edge of the downsampling before the features, field units."""
+    """Voxel size for downsampling before the features are computed, field units."""
     ransac_distance_voxels: Annotated[float, Gt(0), Le(100)] = 1.5
     """Largest distance of a RANSAC inlier, in voxels."""
     edge_length_ratio: _Ratio = 0.9
-    """RANSAC drops a draw of correspondences whose edge lengths differ by more than this ratio."""
+    """Minimum ratio of corresponding edge lengths. RANSAC drops a draw of correspondences with a smaller ratio."""
     ransac_iterations: Annotated[int, Ge(1), Le(10_000_000)] = 100_000
     icp_distance_voxels: Annotated[float, Gt(0), Le(100)] = 0.4
     """Largest distance of an ICP correspondence, in voxels."""
     draws: Annotated[int, Ge(1), Le(256)] = 1
-    """Independent RANSAC draws; the one that both fields agree with best is kept. 1 is the published method; 8 cost
-    about a second more and avoid the chance draw that turns the object the wrong way round."""
+    """Number of independent RANSAC runs. The one that fits both fields best is kept. 1 is the published method. 8 take
+    about a second more and reduce the risk of a wrong orientation."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,12 @@ class OptimizationOptions(_Group):
     scale_rate: Annotated[float, Gt(0), Le(1)] = 0.01
     kernel_rate: Annotated[float, Gt(0), Le(1)] = 0.005
     regularizer_weight: Annotated[float, Ge(0), Le(1000)] = 1.0
-    """w, the weight of the nearest-neighbor regularizer. The paper gives no value."""
+    """Weight w of the nearest-neighbor regularizer. The paper gives no value."""
     stop_residual: Annotated[float, Ge(0), Le(1)] = 0.0005
-    """Stop once the mean residuals of both directions are at most this."""
+    """Stop when the mean residuals of both directions are at most this."""
     samples_per_iteration: Annotated[int, Ge(16), Le(1_000_000)] = 2000
-    """Samples of each set, drawn anew in every iteration, over which the loss's expectations are taken. The
-    paper does not say how many; fewer are faster, field evaluations being the cost."""
+    """Number of samples of each set for the expectations of the loss. They are drawn again in every iteration. The
+    paper gives no number. Fewer are faster, because field evaluations take most of the time."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class ResamplingOptions(_Group):
     residual: Annotated[float, Gt(0), Le(10)] = 0.02
     """xi: largest residual."""
     radius_fraction: Annotated[float, Gt(0), Le(1)] = 0.05
-    """rho as a share of the scene's radius."""
+    """rho, as a share of the scene's radius."""
     max_samples: Annotated[int, Ge(16), Le(1_000_000)] = 5000
 
 
@@ -112,49 +112,50 @@ class ResamplingOptions(_Group):
 class RobustOptions(_Group):
     """The preset `robust`: a search over all of Sim(3), refinement on the fields, and a verdict.
 
-    Lengths are in object diameters, shares within 0 and 1: nothing depends on the fields' units.
+    Lengths are in object diameters, shares are from 0 to 1. Nothing depends on the units of the fields.
     """
 
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600
-    """Rotations that the search starts from, evenly spread over all orientations; with ``up_axis`` a tenth of them,
-    about it. Increase it when an obvious pose was missed; the search takes longer in proportion."""
+    """Number of start rotations of the search, evenly spread over all orientations. With ``up_axis`` the search uses a
+    tenth of them, about this axis. Increase it if an obvious pose was missed; the search time grows in proportion."""
     feature_draws: Annotated[int, Ge(0), Le(64)] = 4
-    """Feature matches (FPFH and RANSAC, at any scale) that a second search starts from, when the first one ends in a
-    rejection or in an answer that is less likely than 0.95. Each takes about a tenth of a second. More help in heavy
-    clutter; 0 turns the second search off."""
+    """Number of feature matches (FPFH and RANSAC, at any scale) from which a second search starts. The second search
+    runs if the result of the first one is rejected or its probability is below 0.95. Each match takes about 0.1 s.
+    Increase it for heavy clutter; 0 turns the second search off."""
     scene_samples: Annotated[int, Ge(200), Le(100_000)] = 4000
     """Maximum number of samples of the scene's surface in the detection box. Increase it for an object that is small in
     its box."""
     object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500
     """Maximum number of samples of the object's surface. Increase it for thin parts."""
     box_tolerance: Annotated[float, Ge(0), Le(10)] = 1.0
-    """How far the object may reach beyond each face of the detection box, as a share of the box's edge (of a fifth
-    of its diagonal, where the edge is shorter). Increase it for boxes around a part of the object only."""
+    """How far the object may extend beyond each face of the detection box, as a share of the box's edge. For an edge
+    shorter than a fifth of the box's diagonal, it is a share of that fifth. Increase it if the box contains only a part
+    of the object."""
     min_scale: _Scale = None
-    """Minimum scale factor of T_object_scene: object units for each scene unit. Give it, and ``max_scale``, where
-    something is known of the scale, for instance 0.97 and 1.03 where both fields are metric: more is found of what was
-    seen from one side only. null: unknown."""
+    """Minimum scale factor of T_object_scene: object units per scene unit. Give it and ``max_scale`` if the scale is
+    approximately known, for example 0.97 and 1.03 if both fields are metric. More objects that were observed from one
+    side only are then found. null: unknown."""
     max_scale: _Scale = None
-    """Maximum scale factor of T_object_scene; see ``min_scale``. Where both are the same number, the scale is fixed."""
+    """Maximum scale factor of T_object_scene; see ``min_scale``. If both are the same number, the scale is fixed."""
     object_unit: Unit = "auto"
-    """The unit of the object's file. Where the scene is metric, a recording or a field in meters, it tells the scale
-    within 1 %. `auto`: for recordings, the unit in which the object is as large as what was seen, else unknown.
-    `free`: unknown."""
+    """The unit of the object's file. If the scene is metric (a recording or a field in meters), it determines the scale
+    within 1 %. `auto`: for a recording, the unit in which the object's size matches the observed surface, otherwise
+    unknown. `free`: unknown."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.5
-    """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
-    reliable and the pose less accurate."""
+    """Share (0..1) of the samples that the refinement does not use: the verification samples, on which the verdict is
+    based. A larger share makes the verdict more reliable and the pose less accurate."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
     """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
     acceptance: Acceptance = "default"
-    """Which answers are accepted: those whose ``probability`` reaches this named level. `strict` is for those to whom a
-    wrong pose costs more than a missed one."""
+    """Named level that the ``probability`` of an accepted result must reach. Use `strict` if a wrong pose costs more
+    than a missed one."""
     min_probability: _Share | None = None
-    """Minimum ``probability`` (0..1) of an answer, in place of a named level of ``acceptance``; below it: `rejected`.
-    null: what the level says."""
+    """Minimum ``probability`` (0..1) of an accepted result, instead of the level of ``acceptance``. Results below it
+    are `rejected`. null: the value of the level."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
-    """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
-    times the best score, and they are at most 20 times less likely. Increase it to list less exact symmetry equivalents
-    too."""
+    """Margin for alternatives. Another pose is listed as an alternative if its score (0..1, lower is better) exceeds
+    the best score by at most this plus 0.15 times the best score, and if it is at most 20 times less probable. Increase
+    it to list less exact symmetry equivalents too."""
 
     def __post_init__(self) -> None:
         if self.min_scale is not None and self.max_scale is not None and self.min_scale > self.max_scale:
@@ -162,7 +163,7 @@ class RobustOptions(_Group):
 
     @property
     def scale_range(self) -> tuple[float | None, float | None]:
-        """The scale's range: as it is given, else as the object's unit tells it, for a scene in meters."""
+        """The scale's range: the given one, else the one that follows from the object's unit, for a scene in meters."""
         if (self.min_scale, self.max_scale) != (None, None) or self.object_unit not in METERS:
             return self.min_scale, self.max_scale
         scale = 1.0 / METERS[self.object_unit]
@@ -178,11 +179,11 @@ class RegistrationOptions(_Group):
     """
 
     preset: Preset = "robust"
-    """The engine: `robust` needs no initial guess, `paper` is the published method."""
+    """The method. `robust` needs no initial guess. `paper` is the published method."""
     up_axis: Axis | None = None
-    """The vertical axis of scene and object. `robust`: only rotations about it are tried, which is faster and lists no
-    toppled pose; null tries every orientation. `paper`: where the ground is and which side the cameras look from;
-    null means z."""
+    """The vertical axis of scene and object. `robust`: only rotations about this axis are searched, which is faster and
+    excludes poses that are not upright; null searches all orientations. `paper`: it defines the ground and the side
+    from which the cameras look; null means z."""
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
     initialization: InitializationOptions = field(default_factory=InitializationOptions)
     optimization: OptimizationOptions = field(default_factory=OptimizationOptions)
@@ -191,9 +192,9 @@ class RegistrationOptions(_Group):
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RegistrationOptions:
-        """Options from plain (JSON) values; what is left out keeps its default.
+        """Options from plain (JSON) values. Options that are left out keep their defaults.
 
-        Raises InvalidOptionsError naming the first faulty option.
+        Raises InvalidOptionsError for the first invalid option.
         """
         if not values:
             return cls()
@@ -217,7 +218,7 @@ class RegistrationOptions(_Group):
     def require_robust(self, feature: str, reason: str = InvalidOptionsError.reason) -> None:
         """Raises InvalidOptionsError with ``reason`` under another preset. feature: what only `robust` can do."""
         if self.preset != "robust":
-            message = f"only the preset `robust` {feature}; the options name `{self.preset}`"
+            message = f"only the preset `robust` {feature}; the options have `{self.preset}`"
             raise InvalidOptionsError(message, reason=reason)
 
 
@@ -236,11 +237,11 @@ def _refuse_other_types(given: Mapping[str, Any], read: Any, place: str = "optio
 
 
 OptionsLike = RegistrationOptions | Mapping[str, Any] | None
-"""Options, or a dictionary of those that are not to have their defaults."""
+"""Options, or a dictionary of the options that differ from their defaults."""
 
 
 def options_of(options: OptionsLike) -> RegistrationOptions:
-    """The options that a caller means. Raises InvalidOptionsError naming the first faulty one."""
+    """The options of a caller. Raises InvalidOptionsError for the first invalid one."""
     if options is None:
         return RegistrationOptions()
     if isinstance(options, RegistrationOptions):
@@ -252,13 +253,13 @@ def options_of(options: OptionsLike) -> RegistrationOptions:
 
 
 def seed_of(seed: Any) -> int:
-    """A seed as every interface takes it. Raises InvalidOptionsError."""
+    """A seed in the form that every interface accepts. Raises InvalidOptionsError."""
     try:
         found = -1 if isinstance(seed, bool) else operator.index(seed)
     except TypeError:
         found = -1
     if not 0 <= found < 2**32:
-        raise InvalidOptionsError(f"the seed is {seed!r:.40}, expected a whole number of 0 to {2**32 - 1}")
+        raise InvalidOptionsError(f"the seed is {seed!r:.40}, expected a whole number from 0 to {2**32 - 1}")
     return found
 
 
@@ -270,13 +271,13 @@ _LIMITS_OF_SHARES = {
 
 
 def did_you_mean(location: Sequence[str | int]) -> str:
-    """A hint for an unknown option: "; did you mean `up_axis`?", what does its work, or nothing where no name is near.
+    """A hint for an unknown option: "; did you mean `up_axis`?", the option that replaces it, or an empty text.
 
     location: the option's path below ``options``, as pydantic gives it.
     """
     *group, name = (str(part) for part in location)
     if name in _LIMITS_OF_SHARES:
-        return "; the probability alone decides: see `robust.acceptance`"
+        return "; only the probability decides: see `robust.acceptance`"
     names = _names()
     elsewhere = [other for other, known in names.items() if name in known]
     if elsewhere:
@@ -300,7 +301,7 @@ UNKNOWN_OPTION = "unexpected_keyword_argument"
 
 @cache
 def _adapter() -> TypeAdapter[RegistrationOptions]:
-    """Made when options are read: that takes .04 s, and the defaults need none."""
+    """Made when options are read. Making it takes 0.04 s, and the defaults do not need it."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(RegistrationOptions)

@@ -39,7 +39,7 @@ _MALLOPT = (-1, 1 << 26), (-3, 1 << 24)
 def keep_freed_memory() -> None:
     """Have the C library keep some freed memory for what is allocated next (glibc; nothing elsewhere).
 
-    Else each larger array is given back to the system, and the next one's pages are made anew, one by one.
+    Else each larger array is given back to the system, and the next one's pages are made again, one by one.
     """
     with suppress(OSError, AttributeError):
         for parameter, size in _MALLOPT:
@@ -125,7 +125,7 @@ class _Copy:
         try:
             done, value = self.connection.recv()
         except (EOFError, OSError) as error:
-            raise ProcessLostError("a process was ended from outside", hint="Is there enough memory?") from error
+            raise ProcessLostError("a process was killed from outside", hint="Is there enough memory?") from error
         if not done:
             raise value
         return value

@@ -107,9 +107,9 @@ def similarity_fault(rows: Any) -> str | None:
     lengths = sum((dot(axis, axis) / squared - 1) ** 2 for axis in (x, y, z))
     angles = sum((dot(a, b) / squared) ** 2 for a, b in ((x, y), (y, z), (z, x)))
     if not math.sqrt(lengths + 2 * angles) <= TOLERANCE:
-        return "the axes are sheared or stretched differently"
+        return "the axes are sheared, or have different lengths"
     if dot(cross(x, y), z) < 0:
-        return "it mirrors space"
+        return "it is a reflection"
     return None
 
 
@@ -128,7 +128,7 @@ def transform_rows(value: Any) -> Rows:
     if isinstance(value, Mapping):
         value = value["T_scene_object"] if inverse else value.get("T_object_scene", value)
     rows: Any = value.get("matrix") if isinstance(value, Mapping) else value
-    fault = "no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
+    fault = "there is no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
     if fault:
         raise ValueError(fault)
     plain = [[float(number) for number in row] for row in rows]

@@ -46,7 +46,7 @@ def decode_text(data: bytes | bytearray | memoryview) -> str:
         text = _windows(raw, error)
     # without a mark, zeros have told the encoding: files of numbers have some, too
     if encoding.endswith(("-le", "-be")) and (odd := _BINARY.search(text)):
-        raise TextError(f"no text in UTF-8 or {encoding.upper()}: it has the control character {ord(odd[0]):#04x}")
+        raise TextError(f"not a text in UTF-8 or {encoding.upper()}: it has the control character {ord(odd[0]):#04x}")
     # files that were joined by `cat` or `type` have a mark in the middle, at the start of a line
     return _MARKS.sub("", _LINE_ENDS.sub("\n", text))
 
@@ -56,14 +56,14 @@ def _windows(raw: bytes, error: UnicodeDecodeError) -> str:
     name, start = error.encoding.upper(), error.start
     place = f"byte {start + len(raw) - len(error.object) + 1} ({error.object[start]:#04x})"
     if name != "UTF-8" or not raw[:start].isascii() or raw.startswith(codecs.BOM_UTF8):
-        raise TextError(f"no text in {name} from {place} on") from error
+        raise TextError(f"not a text in {name}, from {place} on") from error
     if _BINARY.search(raw.decode("latin-1")):
-        raise TextError(f"no text in UTF-8 from {place} on, and has control characters") from error
+        raise TextError(f"not a text in UTF-8 from {place} on, and it has control characters") from error
     try:
         return raw.decode("cp1252")
     except UnicodeDecodeError as other:
         worse = f"byte {other.start + 1} ({raw[other.start]:#04x})"
-        raise TextError(f"no text in UTF-8 from {place} on, nor in Windows-1252, which lacks {worse}") from error
+        raise TextError(f"not a text in UTF-8 from {place} on, and not in Windows-1252, which lacks {worse}") from error
 
 
 class TextStream:
@@ -91,7 +91,7 @@ class TextStream:
         try:
             return self._decoder.decode(data, final).encode(self._target)
         except UnicodeError as error:
-            raise TextError(f"no text in {self._source.upper()}") from error
+            raise TextError(f"not a text in {self._source.upper()}") from error
 
 
 def json_value(data: bytes | str, what: str = "", **how: Any) -> Any:
@@ -106,7 +106,7 @@ def json_value(data: bytes | str, what: str = "", **how: Any) -> Any:
     except TextError as error:
         message, hint = str(error), "Is it a field or a picture? JSON is expected here, saved as UTF-8."
     except RecursionError:
-        message, hint = "too deep: its lists nest without end", "A box has two levels of lists at most."
+        message, hint = "too deeply nested lists", "A box has at most two levels of lists."
     except ValueError:
         message, hint = "a number of too many digits", "Write fewer digits."
     raise InvalidInputError(f"{what}{message}", reason="MALFORMED_JSON", hint=hint)
@@ -120,20 +120,20 @@ def _hint(error: json.JSONDecodeError) -> str:
     if before.endswith(",") and _TRAILING_COMMA.match(text, len(before) - 1):
         return "Remove the comma before the closing bracket."
     if text[at : at + 1] == "'":
-        return 'JSON takes double quotes: "center", with no single ones.'
+        return 'JSON needs double quotes: "center". Replace the single quotes.'
     if text[at : at + 1] and text[at] in _CURLED:
-        return 'JSON takes straight quotes: "center". A program for letters has made these.'
+        return 'JSON needs straight quotes: "center". A word processor has replaced them.'
     for word, meant in _LITERALS.items():
         if text.startswith(word, at):
             return f"Write {meant}: JSON has no {word}."
     if text[at : at + 1] in ("#", "/"):
         return "JSON has no comments. Remove them."
     if text.lstrip()[:1] == "<":
-        return "It begins like HTML or XML: a download of a web page instead of the file?"
+        return "It begins like HTML or XML. Check whether a web page was downloaded instead of the file."
     if re.match(r"\s*[A-Za-z_]\w*\s*:", text):
         return 'It looks like YAML. Write it as JSON: {"center": [x, y, z], ...}.'
     if at >= len(text.rstrip()):
         return "It ends too early: a closing bracket or quotation mark is missing."
     if not text[at].isascii():
-        return f"The character there is U+{ord(text[at]):04X}, which JSON has in texts alone. Write it anew."
+        return f"The character there is U+{ord(text[at]):04X}, which JSON allows only within texts. Replace it."
     return "Check the brackets, commas and quotation marks there."

@@ -100,9 +100,9 @@ class Agreement:
 
     def said(self) -> str:
         if self.places == 0:
-            return "no two images see the same place"
+            return "no two images show the same place"
         share = 100.0 * self.contradicting / self.places
-        return f"of {self.places} surface points in view of two images, {share:.2g} % are free space in the other image"
+        return f"of {self.places} surface points that two images show, {share:.2g} % are free space in the other image"
 
     @property
     def score(self) -> float:
@@ -155,7 +155,7 @@ def _checked(stated: _Views) -> str | None:
         )
     if found.places < _FEWEST or found.contradicting < _WARNED * found.places:
         return None
-    return f"FRAMES_DISAGREE: {found.said()}: poses, intrinsics or depths are wrong, or things moved"
+    return f"FRAMES_DISAGREE: {found.said()}: poses, intrinsics or depths are wrong, or objects moved"
 
 
 def _clearly_better(other: Agreement, found: Agreement, images: int) -> bool:
@@ -224,7 +224,7 @@ class _Sample:
 
 
 def _search(stated: _Views, sample: _Sample) -> tuple[_Views, Agreement]:
-    """The convention by which the images agree best, of those that differ from the stated one in up to two things."""
+    """The convention by which the images agree best, of those that differ from the stated one in up to two objects."""
     rough = sample.part(_ROUGH_PAIRS, _ROUGH_PIXELS)
     best, found = stated, sample.agreement(stated)
     for _ in range(_ROUNDS):
@@ -259,9 +259,9 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
             if inverted or not np.array_equal(axes, np.eye(3)):
                 changed = replace(views, poses=(inverse if inverted else views.poses) @ turn)
                 yield changed.because(*_of_axes(axes, inverted, views.terms))
-    for step, wrong in ((-1, "quaternions written w first"), (1, "quaternions x y z w that were read w first")):
+    for step, wrong in ((-1, "quaternions with w first"), (1, "quaternions x y z w that were read with w first")):
         rolled = replace(views, poses=rolled_quaternions(views.poses, step))
-        yield rolled.because(wrong, f"write the quaternions of {views.terms.poses} anew, in the order that is expected")
+        yield rolled.because(wrong, f"write the quaternions of {views.terms.poses} in the expected order")
     count = len(views.poses)
     by_name = np.argsort([str(number) for number in range(count)], kind="stable")
     orders = {
@@ -272,7 +272,7 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
     orders |= {f"poses {step:+d} images off": np.roll(np.arange(count), -step) for step in (-3, -2, -1, 1, 2, 3)}
     for name, order_of in orders.items():
         yield replace(views, poses=views.poses[order_of]).because(
-            name, f"give each image its own pose in {views.terms.poses}"
+            name, f"give each image its correct pose in {views.terms.poses}"
         )
 
 
@@ -282,20 +282,21 @@ def _of_axes(axes: Pixels, inverted: bool, terms: Terms) -> tuple[str, str]:
     if inverted:
         ways = ["from the camera to the world", "from the world to the camera"]
         wrong.append(f"poses {ways[not terms.to_camera]}")
-        mend.append(f"invert the matrices: {terms.poses} must lead {ways[terms.to_camera]}")
+        mend.append(f"invert the matrices: {terms.poses} must map {ways[terms.to_camera]}")
     rows = tuple(tuple(int(number) for number in row) for row in axes)
     if rows == _OPENGL:
         other = "opengl" if terms.axes == "opencv" else "opencv"
         wrong.append(
             "cameras that look " + ("against z (OpenGL's axes)" if other == "opengl" else "along z (OpenCV's axes)")
         )
-        mend.append(f"say --camera-axes {other}, or negate columns two and three of each pose, to the world")
+        mend.append(f"give --camera-axes {other}, or negate columns two and three of each camera-to-world pose")
     elif not np.array_equal(axes, np.eye(3)):
         named = ["+-"[int(column.sum() < 0)] + "xyz"[int(np.abs(column).argmax())] for column in axes.T]
-        body = " (x forward, as of a robot's body)" if rows == np.array(_BODY).T.tolist() else ""
+        body = " (x forward, the body frame of a robot)" if rows == np.array(_BODY).T.tolist() else ""
         wrong.append(f"cameras whose right is {named[0]}, down {named[1]} and forward {named[2]}{body}")
         mend.append(
-            f"turn the axes of {terms.poses}: columns of a pose to the world are the camera's right, down and forward"
+            f"rotate the axes of {terms.poses}: the columns of a camera-to-world pose are the camera's right, down "
+            f"and forward"
         )
     return " and ".join(wrong), "; ".join(mend)
 
@@ -312,7 +313,7 @@ def _other_depths(views: _Views) -> Iterator[_Views]:
     )
     for flipped, name in ((views.depths[:, :, ::-1], "left and right"), (views.depths[:, ::-1], "top and bottom")):
         mirrored = replace(views, depths=flipped)
-        yield mirrored.because(f"depth images with {name} exchanged", f"mirror the depth images: {name}")
+        yield mirrored.because(f"depth images with {name} swapped", f"mirror the depth images: {name}")
     for factor in _FACTORS:
         yield replace(views, factor=views.factor * float(factor))
     with np.errstate(divide="ignore"):
@@ -339,7 +340,7 @@ def _other_intrinsics(views: _Views) -> Iterator[_Views]:
     K = views.intrinsics
     swapped = K[:, [1, 0, 2]][:, :, [1, 0, 2]]
     mend = f"write {views.terms.intrinsics} in pixels of these images"
-    yield replace(views, intrinsics=swapped).because("intrinsics whose width and height are exchanged", mend)
+    yield replace(views, intrinsics=swapped).because("intrinsics with width and height swapped", mend)
     middle = np.median(K[:, :2, 2], axis=0)
     fitting = {round(float(side / (2.0 * at)), 3) for side, at in zip((width, height), middle, strict=True) if at > 0.0}
     for factor in sorted(fitting | {0.25, 1.0 / 3.0, 0.5, 2.0, 3.0, 4.0}):

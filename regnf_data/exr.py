@@ -43,7 +43,7 @@ def exr_size(path: Path) -> tuple[int, int]:
     """Height and width. Raises ValueError."""
     left, top, right, bottom = struct.unpack("<4i", exr_header(path)[0].get("dataWindow", b""))
     if not (left <= right and top <= bottom):
-        raise ValueError("its window is empty")
+        raise ValueError("its data window is empty")
     return bottom - top + 1, right - left + 1
 
 
@@ -52,7 +52,7 @@ def read_exr(path: Path) -> NDArray[Any]:
     attributes, at = exr_header(path)
     (height, width), compression = exr_size(path), attributes["compression"][0]
     if compression not in _LINES:
-        raise ValueError("it is compressed by another way than zip: write it with ZIP or without compression")
+        raise ValueError("its compression is not supported: write it with ZIP or without compression")
     channels, rest = [], attributes["channels"]
     while rest[:1] not in (b"\0", b""):
         name, _, rest = rest.partition(b"\0")

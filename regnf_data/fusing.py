@@ -47,10 +47,10 @@ def fuse_blocks(
     colors: NDArray[np.uint8] | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Write the safe field of the fused images to ``path``.
+    """Write the regnf field file of the fused images to ``path``.
 
     depths: (N, H, W) along the camera's axis, world units, 0 where nothing was read · intrinsics: (N, 3, 3), a pixel's
-    center at (column + .5, row + .5) · T_world_camera: (N, 4, 4), OpenCV's axes · colors: (N, H, W, 3).
+    center at (column + 0.5, row + 0.5) · T_world_camera: (N, 4, 4), OpenCV's axes · colors: (N, H, W, 3).
     Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image shows surface within reach.
     """
     o3d = open3d()
@@ -83,7 +83,7 @@ def fuse_blocks(
             color = image_of(core.Tensor((colors[number] / np.float32(255.0)).astype(np.float32)))
             blocks.integrate(near, image, color, K, K, camera, *reach)
     if fused == 0:
-        raise DatasetError("no depth image shows surface within reach", reason="DATASET_NOTHING_IN_BOUNDS")
+        raise DatasetError("no depth image shows a surface within the depth limit", reason="DATASET_NOTHING_IN_BOUNDS")
     source = path.with_suffix(".npz")
     try:
         blocks.save(str(source))

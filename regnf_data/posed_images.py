@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Instance:
-    """A thing in the scene, as a detector would name it.
+    """An instance in the scene, as a detector would name it.
 
     box: in the world frame · label: its class or name · T_object_world: (4, 4) float64 from world to the library
-    object, the truth if the dataset has it · world_pose, gt_pose: (4, 4), the thing's own frame to the world and to
+    object, the truth if the dataset has it · world_pose, gt_pose: (4, 4), the instance's own frame to the world and to
     the metric frame, as the dataset has them; nothing is computed from these.
     """
 
@@ -30,7 +30,7 @@ class Instance:
 
 @dataclass(frozen=True)
 class Terms:
-    """What the files of a layout call the things that a convention is about.
+    """What the files of a layout call the objects that a convention is about.
 
     poses, intrinsics, unit: where they are stated · to_camera: whether poses lead from the world to the camera ·
     axes: of the cameras, by --camera-axes.
@@ -51,7 +51,7 @@ class PosedImages:
     """N images of H x W pixels of one scene that stands still.
 
     The world frame is the one the field is fitted in; its unit is the field's. Cameras look along +z, x to the right, y
-    down (OpenCV). A pixel's center lies at (column + .5, row + .5).
+    down (OpenCV). A pixel's center lies at (column + 0.5, row + 0.5).
     """
 
     colors: NDArray[np.uint8]
@@ -65,7 +65,7 @@ class PosedImages:
     depths: NDArray[np.float32] | None = None
     """(N, H, W): distance along the camera's z axis, world units; 0 where the sensor saw nothing."""
     masks: NDArray[np.bool_] | None = None
-    """(N, H, W): true on the thing, false on background that the field shall keep free."""
+    """(N, H, W): true on the object, false on background that the field shall keep free."""
     instances: tuple[Instance, ...] = ()
     T_metric_world: NDArray[np.float64] | None = None
     """(4, 4): world to the metric frame (sdfstudio's ``worldtogt``), if known."""
@@ -87,7 +87,7 @@ class PosedImages:
 
     @property
     def T_world_pixel(self) -> NDArray[np.float64]:
-        """(N, 3, 3): from (column + .5, row + .5, 1) to its ray in the world, whose part along the camera's axis is
+        """(N, 3, 3): from (column + 0.5, row + 0.5, 1) to its ray in the world, whose part along the camera's axis is
         1."""
         return self.T_world_camera[:, :3, :3] @ np.linalg.inv(self.intrinsics)
 

@@ -106,11 +106,11 @@ def resolve(folder: Path, name: Any, what: str) -> Path:
         inside = path.is_relative_to(folder.resolve())
         exists = inside and path.is_file()
     except (OSError, RuntimeError, ValueError) as error:  # too long, links in a circle, half a character
-        raise DatasetError(f"{what} cannot be followed: {name!r:.200}", reason="DATASET_METADATA_INVALID") from error
+        raise DatasetError(f"{what} cannot be resolved: {name!r:.200}", reason="DATASET_METADATA_INVALID") from error
     if not inside:
         raise DatasetError(f"{what} leaves the dataset's folder: {name!r:.200}", reason="DATASET_PATH_OUTSIDE")
     if not exists:
-        raise DatasetError(f"{what} names no file of the dataset: {name!r:.200}", reason="DATASET_IMAGE_MISSING")
+        raise DatasetError(f"{what} is not a file of the dataset: {name!r:.200}", reason="DATASET_IMAGE_MISSING")
     return path
 
 
@@ -161,7 +161,7 @@ def array_file(path: Path) -> NDArray[Any]:
             with stored:
                 named = [name for name in stored.files if name.startswith("depth")] or stored.files
                 if len(named) != 1:
-                    raise ValueError(f"which of its arrays is the depth: {', '.join(stored.files)[:80]}?")
+                    raise ValueError(f"it is not clear which array is the depth: {', '.join(stored.files)[:80]}")
                 stored = stored[named[0]]
         kind = stored.dtype.kind
     except (*_FAULTS_OF_CONTENT, LookupError, zipfile.BadZipFile) as error:
@@ -181,7 +181,7 @@ def decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
     if pixels.shape[:2] != size or (mode is None and pixels.ndim != 2):
         raise DatasetError(f"{path.name} has more than one channel", reason="DATASET_IMAGE_INVALID")
     if mode is None and (kind == "P" or pixels.dtype.kind not in "fiu"):
-        what = "a palette of colors" if kind == "P" else "one bit a pixel, as masks have"
+        what = "a palette of colors" if kind == "P" else "one bit per pixel, as in masks"
         raise DatasetError(f"{path.name} holds no depths: it has {what}", reason="DATASET_IMAGE_INVALID")
     return pixels
 
@@ -275,7 +275,7 @@ def frames_of(metadata: dict[str, Any]) -> list[dict[str, Any]]:
         message = f"camera model {model!r:.80}: only {', '.join(_CAMERAS)}"
         raise DatasetError(message, reason="DATASET_CAMERA_UNSUPPORTED")
     if any(metadata.get(name) not in (None, 0, 0.0) for name in _DISTORTION):
-        raise DatasetError("lenses that distort: undistort the images", reason="DATASET_CAMERA_UNSUPPORTED")
+        raise DatasetError("the images have lens distortion: undistort them", reason="DATASET_CAMERA_UNSUPPORTED")
     frames = metadata.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DatasetError("the metadata lists no frames", reason="DATASET_NO_FRAMES")
@@ -351,11 +351,11 @@ def _paths(
         what = f"{key} of frame"
         return [None if n is None else resolve(folder, n, f"{what} {i}") for i, n in enumerate(named)]
     if metadata.get(promise):
-        raise DatasetError(f"the metadata promises files that no frame names: {key}", reason="DATASET_IMAGE_MISSING")
+        raise DatasetError(f"the metadata mentions files that no frame has: {key}", reason="DATASET_IMAGE_MISSING")
     return None
 
 
-# The things that a dataset names: their boxes and poses, in JSON and out of it.
+# The objects that a dataset names: their boxes and poses, in JSON and out of it.
 
 _REASON = "DATASET_INSTANCE_INVALID"
 _LABELS = ("label", "name", "id", "class", "class_name")

@@ -1,4 +1,4 @@
-"""What all fits have in common: the size of the network, its training, and how progress is told."""
+"""Options of all fits: the size of the network, its training, and the progress callback."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Literal
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 FitProgress = Callable[[int, float, float], None]
-"""Called from time to time with the iteration, its loss and an estimate of the seconds left. May raise to stop."""
+"""Called regularly with the iteration, its loss and an estimate of the remaining seconds. It may raise an error to stop
+the fit."""
 
 
 def grid_of_levels(levels: int, nodes: int = 512, log2_table_size: int = 15) -> HashGridConfig:
-    """Return a hash grid of so many levels, from 16 to ``nodes`` along an edge, with at most 2^log2_table_size entries
-    a level."""
+    """Return a hash grid with this number of levels, from 16 to ``nodes`` nodes along an edge, with at most
+    2^log2_table_size entries per level."""
     return HashGridConfig.from_top_resolution(
         nodes, levels=levels, features_per_level=2, log2_table_size=log2_table_size, base_resolution=16
     )
@@ -23,19 +24,19 @@ def grid_of_levels(levels: int, nodes: int = 512, log2_table_size: int = 15) -> 
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Size and training of the network of a field that is fitted."""
+    """Size and training of the network of a fitted field."""
 
     grid: HashGridConfig = field(default_factory=lambda: grid_of_levels(10))
-    """The hash grid over [-2, 2]^3: more entries and a finer top level keep thinner parts, in a larger file."""
+    """The hash grid over [-2, 2]^3. More entries and a finer top level keep thinner parts, but give a larger file."""
     hidden_layers: int = 2
     hidden_width: int = 128
     iterations: int = 3000
     table_rate: float = 1e-2
     network_rate: float = 2e-3
     final_rate: float = 0.01
-    """The share of the learning rates that is left at the end of their cosine decay."""
+    """The share of the initial learning rates at the end of their cosine decay."""
     half_table: bool = True
-    """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
+    """Store the hash table in half precision. The file has half the size, and distances change by less than 1e-4."""
 
     def rate_share(self, iteration: int) -> float:
         """The share of the learning rates that is left at ``iteration``: a cosine from 1 down to ``final_rate``."""
@@ -48,43 +49,46 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class FitOptions(NetworkOptions):
-    """How a field is fitted. Lengths are shares of the target's diagonal, so that they suit a cup and a room alike."""
+    """Options of a fit to a mesh. Lengths are relative to the target's diagonal, so they apply to a cup and to a
+    room."""
 
     hidden_width: int = 128
-    """neus-facto itself has 256; half of that halves the cost of a registration and loses little."""
+    """neus-facto has 256. Half the width halves the time of a registration and loses little accuracy."""
     batch: int = 6144
-    """Points an iteration, for the distances."""
+    """Number of points per iteration for the distances."""
     gradient_batch: int = 2048
-    """Points an iteration, near the surface, for distance and gradient."""
+    """Number of points per iteration near the surface, for distance and gradient."""
     gradient_weight: float = 0.02
-    """Weight of the gradient's squared error against the distance's absolute error over the diagonal."""
+    """Weight of the squared error of the gradient, relative to the absolute error of the distance divided by the
+    diagonal."""
     near_points: int = 600_000
-    """Points near the surface in the pool of exact distances."""
+    """Number of points near the surface in the pool of exact distances."""
     volume_points: int = 200_000
-    """Points anywhere in the padded bounds in the pool."""
+    """Number of points anywhere in the padded bounds in the pool."""
     noise: tuple[float, ...] = (0.002, 0.01, 0.04)
-    """Standard deviations of the near points' distance from the surface; an equal share of the points for each."""
+    """Standard deviations of the distance of the near points from the surface. Each one has an equal share of the
+    points."""
     padding: float = 0.25
-    """How far beyond the target's bounds the field is fitted."""
+    """Width of the region around the target's bounds in which the field is fitted."""
     margin: float = 0.05
-    """How far beyond the target's bounds the written field's own bounds lie."""
+    """Distance of the bounds of the written field from the target's bounds."""
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well a field agrees with the exact one, on fresh points near the surface; errors in diagonals."""
+    """Errors of a fitted field, on new points near the surface, relative to the diagonal."""
 
     mean_error: float
     p95_error: float
     max_error: float
     volume_mean_error: float
-    """The same anywhere in the padded bounds."""
+    """The mean error anywhere in the padded bounds."""
     mean_gradient_norm: float
     mean_normal_cosine: float
-    """Mean cosine between the field's gradient and the exact one. Both means are over points in free space: a mesh of
-    overlapping parts has creases inside that no field should reproduce."""
+    """Mean cosine between the field's gradient and the exact one. Both means are over points in free space, because a
+    mesh of overlapping parts has internal surfaces that a field should not reproduce."""
     diagonal: float
-    """The target's diagonal, own units: what the errors are shares of."""
+    """The target's diagonal in its own unit. The errors are relative to it."""
     iterations: int
     seconds: float
 
@@ -92,51 +96,51 @@ class FitReport:
 # Options of a fit to images, and what it reports.
 
 Start = Literal["auto", "object", "room"]
-"""The shape a field starts from: a ball in free space, a hollow ball in matter, or what the images
-suggest (`images/preparation.py`)."""
+"""The initial shape of a field: a ball in free space, a hollow ball in solid matter, or a choice from the images
+(`images/preparation.py`)."""
 
 OF_IMAGES = grid_of_levels(8)
-"""Stands for the grid that the images ask for (`images/fit.py`), where no other one is given."""
+"""Default: the grid is chosen from the images (`images/fit.py`)."""
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """What each term counts; docs/fitting.md says what it does and where it comes from.
+    """Weights of the loss terms. docs/fitting.md describes the terms and their sources.
 
-    Lengths are measured in diagonals of the bounds, so that a cup and a room are weighted alike.
+    Lengths are relative to the diagonal of the bounds, so the weights apply to a cup and to a room.
     """
 
     color: float = 1.0
     eikonal: float = 0.4
     """The paper's lambda, against a color term of weight 1."""
     surface: float = 200.0
-    """|signed distance| where a depth was measured, and the distance along the ray near it."""
+    """|signed distance| at measured depths, and the distance along the ray near them."""
     surface_with_poses: float = 20.0
-    """The same where poses are corrected: what depths of wrong poses say must not hold the shape."""
+    """The same weight if poses are refined. It is lower, because depths of wrong poses must not fix the shape."""
     map: float = 200.0
     """In rooms, instead: |signed distance - that of the map of all depths| near surfaces."""
     free_space: float = 10.0
     rendered_depth: float = 2.0
     opacity: float = 0.1
-    """Rays of the mask's background let through, the others not; without depth alone."""
+    """Rays in the background of the mask are transparent, the others opaque. Only without depth."""
     poses: float = 0.001
-    """Mean square of the poses' corrections, in the deviations that are expected of them."""
+    """Mean square of the pose corrections, in units of their expected deviations."""
 
 
 @dataclass(frozen=True)
 class ReconstructionOptions(NetworkOptions):
-    """How a field is fitted to images. Lengths are shares of the bounds' diagonal."""
+    """Options of a fit to images. Lengths are relative to the diagonal of the bounds."""
 
     grid: HashGridConfig = OF_IMAGES
-    """Over [-2, 2]^3. As it stands here: from 512 to 1024 nodes along an edge and 2^15 to 2^18 entries a level, by what
-    the images show."""
+    """The hash grid over [-2, 2]^3. Default: 512 to 1024 nodes along an edge and 2^15 to 2^18 entries per level,
+    depending on the images."""
     table_log2: int | None = None
-    """log2 of that grid's entries a level; None: by what the images show."""
+    """log2 of the number of entries per level; None: chosen from the images."""
     hidden_width: int = 64
     feature_width: int = 16
-    """What the geometry's network hands to the color's."""
+    """Number of features from the geometry network to the color network."""
     map_points: int = 4096
-    """Points near surfaces an iteration, where the map of all depths tells their distances."""
+    """Number of points near surfaces per iteration. Their distances are from the map of all depths."""
     surface_rays: int = 1024
     """Rays with depth an iteration; each gives one point at the surface, within the noise, and ``band_samples`` beside
     it."""
@@ -165,20 +169,22 @@ class ReconstructionOptions(NetworkOptions):
     within these boxes."""
     weights: LossWeights = field(default_factory=LossWeights)
     levels_at_start: int = 4
-    """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""
+    """Number of grid levels that learn from the first iteration. The finer levels follow one by one."""
     level_interval: float = 0.03
-    """The share of the iterations from one level to the next."""
+    """Share of the iterations from one level to the next."""
     averaging: float = 0.99
-    """Decay of the moving average of the parameters, which is what is written; 0 for none."""
+    """Decay of the moving average of the parameters. The average is written to the file. 0: no average."""
     start: Start = "auto"
     refine_poses: bool = False
-    """Correct the cameras' poses with the field, where there are depths: by a rotation and a shift an image."""
+    """Refine the camera poses together with the field, if there are depths: one rotation and one translation per
+    image."""
     pose_rate: float = 0.1
-    """Learning rate of the corrections, in the deviations that are expected of the poses."""
+    """Learning rate of the corrections, in units of the expected deviations of the poses."""
     poses_from: float = 0.15
-    """The share of the iterations from which on poses are corrected: before it, the shape is too coarse."""
+    """Share of the iterations after which poses are refined. Earlier, the shape is too coarse."""
     observation_voxels: int = 192
-    """Voxels along the longest side of the grid of what was observed, where there are depths; 0: none is kept."""
+    """Number of voxels along the longest side of the observation grid, if there are depths; 0: no observation is
+    stored."""
 
     def learning_levels(self, iteration: int) -> int:
         """How many of the grid's levels learn at ``iteration``, coarsest first."""
@@ -197,18 +203,19 @@ class ReconstructionReport:
     loss: float
     """Mean over the last iterations."""
     psnr: float | None
-    """Of the field's pictures to whole images held out, decibels, where they show the thing; None: none was."""
+    """PSNR between pictures of the field and images that the fit did not use, decibels, at pixels of the object. None:
+    no such image."""
     ssim: float | None
     """Their mean structural similarity, up to 1."""
     depth_error: float | None
-    """Mean |rendered - measured depth|, field units, where both are and nothing before the bounds hides what is in
-    them; None without depth. Sensor noise is part of it."""
+    """Mean |rendered - measured depth|, field units, at pixels that have both and whose view of the bounds is free.
+    None without depth. It includes sensor noise."""
     depth_error_median: float | None
     eikonal_error: float
     """Mean ||gradient| - 1| near the surface."""
     pose_shift: float | None
-    """Median shift of the corrected cameras, field units; None: poses were not corrected."""
+    """Median translation of the corrected cameras, field units. None: poses were not refined."""
     iterations: int
     seconds: float
     warnings: tuple[str, ...]
-    """Each begins with a stable word."""
+    """Warnings. Each begins with a stable word."""

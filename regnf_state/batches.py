@@ -83,11 +83,11 @@ class Batches:
         try:
             pairs = tuple(Pair(*json.loads(line)) for line in lines)
         except (ValueError, TypeError) as error:
-            raise UnreadableRecordError(batch_id, "a pair is damaged") from error
+            raise UnreadableRecordError(batch_id, "the record of a pair is damaged") from error
         return Batch(batch_id, owner, _summary(batch_id, head).created, pairs)
 
     def delete(self, owner: str, batch_id: str) -> None:
-        """Forget a batch; its jobs stay."""
+        """Delete a batch; its jobs stay."""
         self._blobs.delete(_key(owner, batch_id))
 
     def kept(self, owner: str) -> list[BlobEntry]:

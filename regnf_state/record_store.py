@@ -59,7 +59,7 @@ more than the records that it shows."""
 class Page(Generic[_Record]):
     """Records of a list, and the position after which the next page begins; None when this is the last.
 
-    A page may hold fewer records than were asked for, or none, and not be the last.
+    A page may hold fewer records than were requested, or none, and not be the last.
     """
 
     records: list[_Record]

@@ -103,7 +103,7 @@ class JobRecord(Closed):
     engine: dict[str, Any] = field(default_factory=dict)
     error: dict[str, Any] | None = None
     requeues: int = 0
-    """How often this request was handed out again because its worker vanished, since it was last asked for."""
+    """How often this request was handed out again because its worker vanished, since it was last requested."""
     worker: str | None = None
     """Who claimed the attempt."""
     phase_since: float | None = None
@@ -118,7 +118,7 @@ class JobRecord(Closed):
 
     @property
     def webhooks(self) -> list[str]:
-        """Every address that is told of the job's end, in the order of asking."""
+        """All addresses that get the message about the job's end, in the order of the requests."""
         own = [self.request["webhook"]["url"]] if "webhook" in self.request else []
         return own + self.more_webhooks
 
@@ -175,7 +175,7 @@ class FieldRecord(Closed):
     """What the import found: family, bounds, parameters, plausibility, warnings."""
     error: dict[str, Any] | None = None
     attempt: int = 1
-    """Grows each time the import starts anew; fences off the writer of an older one."""
+    """Grows each time the import starts again; fences off the writer of an older one."""
     requeues: int = 0
     """How often this upload was handed out again because its worker vanished."""
     symmetry: dict[str, Any] | None = None
@@ -329,9 +329,9 @@ def check_json_format(name: str, document: object) -> dict[str, Any]:
 def _check_format(name: str, value: object) -> None:
     text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise UnreadableRecordError(name, "its format is no number")
+        raise UnreadableRecordError(name, "its format is not a number")
     if int(text) != FORMAT:
-        message = f"it has format {text}, this release reads {FORMAT}"
+        message = f"it has format {text}; this release reads {FORMAT}"
         raise UnreadableRecordError(name, message, newer=int(text) > FORMAT)
 
 
@@ -343,7 +343,7 @@ def _refuse(constant: str) -> None:
 def _check(record: JobRecord | FieldRecord, name: str) -> None:
     """What the types do not say and every reader relies on."""
     if (record.id if isinstance(record, JobRecord) else record.sha256) != name:
-        raise UnreadableRecordError(name, "it is the record of something else")
+        raise UnreadableRecordError(name, "it is the record of another object")
     times = [getattr(record, time, None) for time in _TIMES]
     if not all(time is None or (math.isfinite(time) and 0 <= time < LAST_TIME) for time in times):
         raise UnreadableRecordError(name, "a time is out of range")
@@ -372,7 +372,7 @@ def _check_request(request: dict[str, Any], name: str) -> None:
         listed = request.get(several) or []
         named += listed if isinstance(listed, list) else [0]
     if not all(isinstance(one, str) for one in named):
-        raise UnreadableRecordError(name, "request: a field is named by something else than a text")
+        raise UnreadableRecordError(name, "request: the name of a field is not a text")
     webhook = request.get("webhook", {"url": ""})
     if not (isinstance(webhook, dict) and isinstance(webhook.get("url"), str)):
         raise UnreadableRecordError(name, "request.webhook: no address")

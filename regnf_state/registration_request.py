@@ -38,7 +38,7 @@ class RegistrationRequest:
     object: str | None
     candidates: tuple[str, ...] | None
     detection: AnyDetection
-    """A box in the scene, or one thing in images of a scene that is a recording."""
+    """A box in the scene, or one object in images of a scene that is a recording."""
     options: RegistrationOptions
     seed: int = 0
     initial_transform: Rows | None = None

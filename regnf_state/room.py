@@ -130,7 +130,7 @@ class Originals:
         if now is None or (now.attempt == field.attempt and now.state != "validating"):
             delete_upload(self._blobs, field)
             self._blobs.delete_prefix(candidates_prefix(field.sha256))
-            logger.info("the upload of field %s is no longer kept", field.sha256)
+            logger.info("the upload of field %s is not kept", field.sha256)
         return True
 
 
@@ -179,7 +179,7 @@ class Room:
         if memory.is_below(self._reserve / 2) or (
             memory.is_below(self._reserve) and owner == self._owners.greediest(self._owners.held)
         ):
-            raise RecordsFullError("Redis has less than its reserve of memory left")
+            raise RecordsFullError("Redis has less free memory than its reserve")
 
     @property
     def is_full(self) -> bool:
@@ -220,13 +220,13 @@ class Room:
             try:
                 self._records.delete_job(job_id)
             except (StaleAttemptError, UnreadableRecordError):
-                continue  # it was asked for anew, or is of a later release
+                continue  # it was requested again, or is of a later release
             self._blobs.delete_prefix(f"jobs/{job_id}")
             self._owners.note_evicted(owner, job_id)
             counters.count(self._redis, "jobs_evicted")
             gone += 1
         if gone:
-            logger.info("%d finished jobs of %s are evicted to make room", gone, owner)
+            logger.info("%d finished jobs of %s are deleted to free space", gone, owner)
         return gone
 
     def _drop_rejected(self, owner: str) -> None:

@@ -97,7 +97,7 @@ def _entries(given: object) -> object:
         try:
             return json.loads(given or "[]")
         except ValueError:
-            raise ValueError("no JSON list, and no @ with the path of a file") from None
+            raise ValueError("it is neither a JSON list nor @ with the path of a file") from None
     lines = [line.strip() for line in str(_secret(given)).splitlines()]
     entries = [line for line in lines if line and not line.startswith("#")]
     if not entries:
@@ -253,9 +253,9 @@ def _refuse_old_names(environment: Mapping[str, str]) -> None:
     """Raises SettingsError for a variable of an earlier version: what it says would be passed over in silence."""
     for name in environment:
         if name in _RENAMED:
-            raise SettingsError(f"{name} has another name: did you mean {_RENAMED[name]}?")
+            raise SettingsError(f"{name} is not a setting: did you mean {_RENAMED[name]}?")
         if name.startswith(_PREFIX) and name.removeprefix(_PREFIX).lower() in Fixed.model_fields:
-            raise SettingsError(f"{name} is gone: the value is fixed")
+            raise SettingsError(f"{name} does not exist: the value is fixed")
 
 
 _HINT = "Correct the environment variable, or unset it to use the default."
@@ -284,5 +284,5 @@ def read_settings(**given: Any) -> Settings:
 def check_redis_url(url: str, name: str) -> None:
     """Raises InvalidInputError (INVALID_SETTINGS) naming the setting, never its value: it may hold a password."""
     if urlsplit(url).scheme not in _REDIS_SCHEMES:
-        message = f"{name}: no address of a Redis, expected redis://, rediss:// or unix://"
+        message = f"{name}: not an address of a Redis, expected redis://, rediss:// or unix://"
         raise InvalidInputError(message, reason="INVALID_SETTINGS", hint="Write for example redis://127.0.0.1:6379/0.")

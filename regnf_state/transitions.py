@@ -107,7 +107,7 @@ def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
 
 
 def requeued_job(record: JobRecord, attempt: int, now: float, lost: bool) -> JobRecord:
-    """The running job handed out anew. Raises StaleAttemptError."""
+    """The running job handed out again. Raises StaleAttemptError."""
     _require_attempt(record, attempt)
     if record.status != "running":
         raise StaleAttemptError(f"a job that is {record.status} is not requeued")
@@ -115,7 +115,7 @@ def requeued_job(record: JobRecord, attempt: int, now: float, lost: bool) -> Job
 
 
 def restarted_job(record: JobRecord, new: JobRecord, now: float) -> JobRecord | None:
-    """A failed or dismissed job, asked for again by ``new``, as its next attempt; None for any other job.
+    """A failed or dismissed job, requested again by ``new``, as its next attempt; None for any other job.
 
     Both requests have the same result; the record holds the later one. Raises QuotaError as ``joined_job`` does.
     """
@@ -127,7 +127,7 @@ def restarted_job(record: JobRecord, new: JobRecord, now: float) -> JobRecord | 
 
 
 def joined_job(record: JobRecord, new: JobRecord) -> JobRecord:
-    """A job that is not started anew, after ``new`` has asked for the same: it gets that webhook too.
+    """A job that is not started again, after ``new`` has requested the same: it gets that webhook too.
 
     The job itself is returned when it has that webhook, or none was named. Its times stay: they are of its progress.
     Raises QuotaError (QUOTA_WEBHOOKS).
@@ -167,7 +167,7 @@ def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldR
 def reimported_field(
     record: FieldRecord, known: FieldRecord, description: dict[str, Any], label: str | None, now: float
 ) -> FieldRecord:
-    """The field to be imported anew. Raises StaleAttemptError when it is no longer as it was ``known``."""
+    """The field to be imported again. Raises StaleAttemptError when it is no longer as it was ``known``."""
     _require_attempt(record, known.attempt)
     if record.state == "validating" or record.description != known.description:
         raise StaleAttemptError("the field has changed")
@@ -194,7 +194,7 @@ def restored_field(record: FieldRecord, before: FieldRecord, attempt: int, now: 
 
 
 def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> FieldRecord:
-    """The field with its import started anew. Raises StaleAttemptError."""
+    """The field with its import started again. Raises StaleAttemptError."""
     _require_attempt(record, attempt)
     if record.state != "validating":
         raise StaleAttemptError(f"a field that is {record.state} is not imported again")

@@ -3,7 +3,7 @@
     python -m scripts.engine_revision            # about half a minute
     python -m scripts.engine_revision --raise    # the results change where no golden registration looks
 
-Same results: the digest of the engine's code is recorded anew, and nothing else changes. Other results: they are
+Same results: the digest of the engine's code is recorded again, and nothing else changes. Other results: they are
 recorded, and the revision is raised in regnf_core/version.py, so that no service returns a result of the older
 engine. What changed is printed, for the changelog. Both files belong into the commit that changes the engine.
 """

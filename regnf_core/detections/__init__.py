@@ -1,4 +1,4 @@
-"""Detections: the box in which an object was found, read from every form that detectors and datasets write.
+"""Detections: the box in which an object was found, in the forms that detectors and datasets write.
 
 Torch-free: the command line and the HTTP interface check a box before any field is opened.
 """

@@ -1,4 +1,4 @@
-"""Whether a box meets the scene at all, how far away it is, and what may be wrong with its units."""
+"""Whether a box overlaps the scene, its distance from the scene, and possible errors of its units."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _MIN_AXIS_SQUARED = 1e-12
 
 
 def require_in_scene(box: Detection, scene: Bounds, obj: Bounds | None = None) -> None:
-    """Raises InvalidDetectionError for a box that does not meet the scene's bounds (DETECTION_OUTSIDE_SCENE).
+    """Raises InvalidDetectionError for a box that does not overlap the scene's bounds (DETECTION_OUTSIDE_SCENE).
 
     A box many times larger than the whole scene is INVALID_DETECTION. ``obj``, the object's bounds, tells whether
     scene and object may be swapped.
@@ -103,7 +103,7 @@ def _separating_axes(columns: tuple[Vector, Vector, Vector]) -> Iterator[Vector]
 
 def _hint(box: Detection, scene: Bounds, obj: Bounds | None) -> str:
     if obj is not None and _fits(box, obj):
-        return "The box lies within the object's bounds: are scene and object swapped?"
+        return "The box is within the object's bounds. Check whether scene and object are swapped."
     for inverse, said in (
         (True, "Is the box in {}? Divided by {} it fits. Write it in the scene's units."),
         (False, "Is the scene in {}? Times {} the box fits. Write it in the scene's units."),
@@ -183,11 +183,11 @@ def number(value: Any, place: Place, limit: float = MAX_COORDINATE) -> float:
         hint = "Remove the quotation marks." if isinstance(value, str) else None
         raise fault(place, f"is {shown(value)}, expected a number", hint)
     if isinstance(value, float) and not math.isfinite(value):
-        hint = "A detector writes this for a box that it could not place: leave such boxes out."
+        hint = "Detectors write this for a box without a position. Leave such boxes out."
         raise fault(place, f"is {shown(value)}, expected a finite number", hint)
     if abs(value) > limit:
-        message = f"is {shown(value)}, expected at most {limit:g} either way"
-        raise fault(place, message, "Move the origin of scene and box nearer.")
+        message = f"is {shown(value)}, expected an absolute value of at most {limit:g}"
+        raise fault(place, message, "Move the origin of the scene and the box nearer.")
     return float(value)
 
 
@@ -218,8 +218,11 @@ def edges(value: Any, place: Place) -> Vector:
     for i, edge in enumerate((x, y, z)):
         if edge <= 0:
             part: str | int = "xyz"[i] if isinstance(value, Mapping) else i
-            hint = "Sizes are full edge lengths. If these are corners, write `min` and `max`."
+            hint = "Sizes are full edge lengths. For corners, write `min` and `max`."
             if edge == 0:
-                hint = "A box needs an extent along every axis; make a flat one as thick as the surface is noisy."
+                hint = (
+                    "A box needs an extent along every axis. Make a flat box at least as thick as the noise of "
+                    "the surface."
+                )
             raise fault((*place, part), f"is {edge:g}, expected an edge length above 0", hint)
     return x, y, z

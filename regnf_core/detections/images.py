@@ -35,10 +35,10 @@ _MOST_DETECTIONS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class ImageDetection:
-    """A thing in one image. One of mask, box_2d and point_2d is given; in pixels of the color image, of the depth image
-    where a frame has no color.
+    """An object in one image. Exactly one of mask, box_2d and point_2d is given, in pixels of the color image, or of
+    the depth image if a frame has no color.
 
-    frame: its name or number · mask: as it was written, or an array (H, W), true on the thing · size: height and width
+    frame: its name or number · mask: as it was written, or an array (H, W), true on the object · size: height and width
     of the image, for polygons · box_2d: left, top, right, bottom · point_2d: u, v.
     """
 
@@ -52,10 +52,12 @@ class ImageDetection:
 
     def __post_init__(self) -> None:
         if sum(value is not None for value in (self.mask, self.box_2d, self.point_2d)) != 1:
-            raise InvalidDetectionError("a detection in an image has one of mask, box_2d and point_2d", hint=HINT)
+            raise InvalidDetectionError(
+                "a detection in an image needs exactly one of mask, box_2d and point_2d", hint=HINT
+            )
 
     def values(self) -> dict[str, Any]:
-        """Plain (JSON) values; what was not given is left out."""
+        """Plain (JSON) values, without members that were not given."""
         found: dict[str, Any] = {"frame": self.frame}
         for name in ("mask", "box_2d", "point_2d", "size", "label", "score"):
             value = getattr(self, name)
@@ -89,11 +91,11 @@ def is_image_detection(values: Any) -> bool:
 
 
 AnyDetection = Detection | tuple[ImageDetection, ...]
-"""A box in the scene's frame; or one thing in one image, or in several."""
+"""A box in the scene's frame; or one object in one image, or in several."""
 
 
 def read_detection(values: Any, index: int | None = None, folder: Path | None = None) -> AnyDetection:
-    """A detection of either kind. index: which one, of a list · folder: of masks that are named as files, which are
+    """A detection of either kind. index: its position in a list · folder: the folder of mask files; their content is
     put into the detection.
 
     Raises InvalidDetectionError.
@@ -122,7 +124,7 @@ def place_of_frame(names: Sequence[str], wanted: str) -> int | None:
 def image_detection_in_field(scene: object = "the scene") -> InvalidDetectionError:
     """The error for a mask, a box in pixels or a point where the scene has no images."""
     return InvalidDetectionError(
-        f"the detection is about an image, and {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
+        f"the detection is in an image, but {scene} is a field", reason="IMAGE_DETECTION_WITHOUT_RECORDING"
     )
 
 
@@ -132,8 +134,8 @@ def plain_values(detection: AnyDetection) -> Any:
 
 
 def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageDetection, ...]:
-    """The detections of one thing in a document: regnf's own form, COCO's annotations or results, ultralytics' export,
-    BOP's results. index: of a detector's list, which one; None: the only one, of ours all, which are of one thing in
+    """The detections of one object in a document: regnf's own form, COCO's annotations or results, ultralytics' export,
+    BOP's results. index: of a detector's list, which one; None: the only one, of ours all, which are of one object in
     several frames.
 
     Raises InvalidDetectionError.
@@ -143,16 +145,16 @@ def read_image_detections(values: Any, index: int | None = None) -> tuple[ImageD
     if entries and all(isinstance(entry, ImageDetection) for entry in entries):
         return tuple(entries)
     if not entries or len(entries) > _MOST_DETECTIONS or not all(isinstance(entry, Mapping) for entry in entries):
-        raise InvalidDetectionError("no detection is listed", hint=HINT)
+        raise InvalidDetectionError("the list of detections is empty", hint=HINT)
     ours = all(any(key in entry for key in ("mask", "box_2d", "point_2d")) for entry in entries)
     if index is not None:
         if not 0 <= index < len(entries):
-            raise InvalidDetectionError(f"there is no detection {index}: {len(entries)} are listed")
+            raise InvalidDetectionError(f"there is no detection {index}: the list has {len(entries)}")
         entries = [entries[index]]
     elif not ours and len(entries) > 1:
         known = ", ".join(f"{n}: {_name(entry)}" for n, entry in enumerate(entries[:8]))
         raise InvalidDetectionError(
-            f"{len(entries)} detections are listed: say which ({known})", hint="Give --detection-index."
+            f"there are {len(entries)} detections; choose one ({known})", hint="Give --detection-index."
         )
     images, categories = (_listed(values, name) for name in ("images", "categories"))
     return tuple(_read(entry, images, categories) for entry in entries)
@@ -206,10 +208,10 @@ def _read(
         left, top, width, height = _numbers(entry["bbox"], 4, "bbox")
         corners = [left, top, left + width, top + height]
     else:
-        raise InvalidDetectionError("a detection in an image has a mask, a box_2d or a point_2d", hint=HINT)
+        raise InvalidDetectionError("a detection in an image needs a mask, a box_2d or a point_2d", hint=HINT)
     if not (corners[0] < corners[2] and corners[1] < corners[3]):
         raise InvalidDetectionError(
-            f"the box {corners} has no area: it is left, top, right, bottom in pixels", hint=HINT
+            f"the box {corners} has no area; the order is left, top, right, bottom, in pixels", hint=HINT
         )
     return ImageDetection(box_2d=(corners[0], corners[1], corners[2], corners[3]), **common)
 

@@ -7,8 +7,8 @@
     {"center": .., "extent": .., "R": ..}                    Open3D's OrientedBoundingBox
     {"min_bound": .., "max_bound": ..}                       Open3D's AxisAlignedBoundingBox
 
-Points and sizes may be objects {"x":, "y":, "z":}, as ROS has them. What does not say enough is refused: a bare list of
-four numbers as `rotation` may have either order. Other names are refused with what to write.
+Points and sizes may be objects {"x":, "y":, "z":}, as ROS has them. Ambiguous forms are refused: a list of four numbers
+as `rotation` may have either order. Other names are refused with a hint.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ MEMBERS = ("center", "size", "rotation", "rotation_quaternion_xyzw", "rotation_q
 OPEN3D = {"extent": "size", "R": "rotation", "min_bound": "min", "max_bound": "max"}
 """Open3D's names for them."""
 _OPEN3D_EXTRA = frozenset({"class_name", "color", "version_major", "version_minor"})
-"""Members of Open3D's documents that say nothing about the box."""
+"""Members of Open3D's documents that do not describe the box."""
 
 _ORDER = (
-    "Say the order of the quaternion: `rotation_quaternion_xyzw` (ROS, SciPy) or `rotation_quaternion_wxyz` (Eigen's "
+    "Give the order of the quaternion in its name: `rotation_quaternion_xyzw` (ROS, SciPy) or "
+    "`rotation_quaternion_wxyz` (Eigen's "
     "constructor, nuScenes, COLMAP)."
 )
 _TURN = "A rotation by the angle a about z is `rotation_quaternion_xyzw`: [0, 0, sin(a/2), cos(a/2)]."
@@ -42,9 +43,9 @@ _CORNERS = "Write the lowest and the highest corner: `min`: [x, y, z] and `max`:
 INSTEAD = {
     **dict.fromkeys(("quaternion", "rotation_quaternion", "orientation", "quat", "qvec"), _ORDER),
     **dict.fromkeys(("yaw", "heading", "rotation_y", "rotation_z", "angle"), _TURN),
-    "euler": "Write `rotation` as a 3x3 matrix: Euler angles do not say their order.",
+    "euler": "Write `rotation` as a 3x3 matrix: the order of Euler angles is not known.",
     **dict.fromkeys(("half_extents", "half_extent", "half_size"), _HALF),
-    "dimensions": "Datasets order dimensions differently. Write `size`: [x, y, z], the full edge lengths.",
+    "dimensions": "The order of dimensions differs between datasets. Write `size`: [x, y, z], the full edge lengths.",
     "wlh": "Write `size`: [x, y, z], the full edge lengths; for nuScenes' boxes that is [length, width, height].",
     **dict.fromkeys(("lwh", "hwl"), _ALONG),
     **dict.fromkeys(("bounds", "bbox", "box", "aabb", "corners", "vertices"), _CORNERS),
@@ -64,7 +65,7 @@ INSTEAD = {
         for name in names
     },
 }
-"""What to write for names that are not taken: most of them do not say enough."""
+"""The correct form for member names that are refused. Most of them are ambiguous."""
 FORMS = (
     'Write {"min": [x, y, z], "max": [x, y, z]} or {"center": [x, y, z], "size": [x, y, z], "rotation": [[3], [3], '
     "[3]]}, in the scene's frame and units. docs/api.md lists every form."
@@ -85,7 +86,7 @@ Named = dict[str, tuple[str, Any]]
 
 
 def parse_detection(values: Any, index: int | None = None) -> Detection:
-    """The detection that plain (JSON) values say. ``index`` chooses one where a document holds several.
+    """The detection from plain (JSON) values. ``index`` selects one if a document has several.
 
     Raises InvalidDetectionError; its ``place`` tells where in ``values`` the fault is, its ``hint`` what to write.
     """
@@ -130,7 +131,7 @@ def _members(values: Mapping[Any, Any]) -> Named:
     for name, value in values.items():
         member = OPEN3D.get(name, name)
         if member in found:
-            raise fault((name,), f"says the same as `{found[member][0]}`", _LEAVE_OUT)
+            raise fault((name,), f"is given twice, also as `{found[member][0]}`", _LEAVE_OUT)
         if member in MEMBERS:
             found[member] = name, value
     return found
@@ -141,7 +142,7 @@ def _by_corners(low: Any, high: Any, low_place: Place, high_place: Place, found:
     for i, (a, b) in enumerate(zip(lower, upper, strict=True)):
         if a >= b:
             swapped = all(p > q for p, q in zip(lower, upper, strict=True))
-            hint = "min and max look swapped." if swapped else "min is the lowest corner, max the highest."
+            hint = "Check whether min and max are swapped." if swapped else "min is the lowest corner, max the highest."
             raise fault((*high_place, i), f"is {b:g}, expected more than min[{i}], which is {a:g}", hint)
     center = tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
     size = tuple(b - a for a, b in zip(lower, upper, strict=True))
@@ -165,7 +166,7 @@ def _rotation(found: Named) -> Quaternion:
         return IDENTITY
     written, value = found[given[0]]
     if len(given) > 1:
-        raise fault((found[given[1]][0],), f"says the same as `{written}`", _LEAVE_OUT)
+        raise fault((found[given[1]][0],), f"is given twice, also as `{written}`", _LEAVE_OUT)
     if given[0] != "rotation":
         return _read_quaternion(value, (written,), given[0].removeprefix("rotation_quaternion_"))
     if isinstance(value, Mapping):
@@ -177,7 +178,7 @@ def _read_quaternion(value: Any, place: Place, order: str) -> Quaternion:
     """A quaternion whose components come in ``order``, as x, y, z, w."""
     components = dict(zip(order, numbers(value, place, order, _MAX_COMPONENT), strict=True))
     if math.hypot(*components.values()) < _MIN_NORM:
-        raise fault(place, "is zero, expected a quaternion with a direction", "Leave it out for an upright box.")
+        raise fault(place, "is zero, expected a quaternion with a direction", "Leave it out for an axis-aligned box.")
     return components["x"], components["y"], components["z"], components["w"]
 
 
@@ -189,16 +190,16 @@ def _read_matrix(value: Any, place: Place) -> Quaternion:
             f"Write `rotation_quaternion_xyzw`: [{listed}] if the last number is w, "
             f"`rotation_quaternion_wxyz`: [{listed}] if the first one is."
         )
-        raise fault(place, f"is four numbers, [{listed}]: a quaternion of unknown order", hint)
+        raise fault(place, f"is a quaternion of unknown order, [{listed}]", hint)
     if len(parts) != 3 or not all(isinstance(row, Sequence) and len(row) == 3 for row in parts):
         raise fault(place, f"is {shown(value)}, expected a 3x3 matrix", _ROWS)
     rows = [[number(part, (*place, i, j), _MAX_COMPONENT) for j, part in enumerate(row)] for i, row in enumerate(parts)]
     error = orthonormality_error(rows)
     if error > _MAX_ORTHONORMALITY_ERROR:
-        hint = "Its rows must be perpendicular and of length 1: keep the scale in `size`, and write more digits."
-        raise fault(place, f"is no rotation: R R^T differs from the identity by {error:.2g}", hint)
+        hint = "Its rows must be perpendicular and have length 1. Put the scale into `size`, and write more digits."
+        raise fault(place, f"is not a rotation: R R^T differs from the identity by {error:.2g}", hint)
     if determinant(rows) < 0:
-        hint = "Negate one column: a box looks the same, and its axes are right-handed then."
+        hint = "Negate one column. The box stays the same, and its axes become right-handed."
         raise fault(place, "is a reflection, of determinant -1, expected a rotation, of determinant 1", hint)
     identity = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     return IDENTITY if rows == identity else quaternion_of(rows)
@@ -218,7 +219,7 @@ def _chosen(values: Any, index: int | None) -> Any:
             place, entries = (name,), values[name]
     if entries is None:
         if index is not None:
-            raise fault((), f"is a single box, and the entry {index} was asked for", "Leave the index out.")
+            raise fault((), f"is a single box, but the index {index} is given", "Leave the index out.")
         return values
     if not entries:
         raise fault(place, "is an empty list, expected a box", FORMS)
@@ -226,7 +227,7 @@ def _chosen(values: Any, index: int | None) -> Any:
         listed = ", ".join(f"{number}: {_summary(entry)}" for number, entry in enumerate(entries[:_MAX_LISTED]))
         more = f" and {len(entries) - _MAX_LISTED} more" if len(entries) > _MAX_LISTED else ""
         count = "1 detection" if len(entries) == 1 else f"{len(entries)} detections"
-        hint = "Give the entry alone, without the list; at the command line --detection-index chooses it."
+        hint = "Give the entry without the list. At the command line, --detection-index selects it."
         raise fault(place, f"is a list of {count}, expected one box", f"{hint} {listed}{more}")
     if not 0 <= index < len(entries):
         raise fault(place, f"has no entry {index}", f"Choose one of 0 to {len(entries) - 1}.")

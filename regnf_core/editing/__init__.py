@@ -1,1 +1,1 @@
-"""Scenes in which objects are substituted, replaced, removed or inserted (docs/editing.md)."""
+"""Edited scenes: objects are substituted, replaced, removed or inserted (docs/editing.md)."""

@@ -19,7 +19,7 @@ from regnf_core.fields.observation import SdfField, observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.schema.description import SURFACE
 
-# The surface of a support, as heights above its plane: as the scene has it, and continued where a thing stood.
+# The surface of a support, as heights above its plane: as the scene has it, and continued where an object stood.
 
 Heights = NDArray[np.float64]
 _ALONG = 64
@@ -30,7 +30,7 @@ _TOLERANCE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Heights over a plane in a rectangle round a box's footprint.
+    """Heights over a plane in a rectangle around a box's footprint.
 
     origin: (3,), the middle of the first cell, on the plane · axes: (2, 3) unit, within it · cell: edge · heights:
     (A, B) float32 · missing: (A, B) distance to where the support goes on, 0 or less there; scene units.
@@ -60,9 +60,9 @@ def ground_of(
 ) -> Ground | None:
     """The support in and round ``box``; None where the scene has nothing of it there.
 
-    belongs: tells of points (N, 3) whether they are of the thing, or so near to it that the surface there may be its
+    belongs: tells of points (N, 3) whether they are of the object, or so near to it that the surface there may be its
     own; None: that is not known. Heights are known where the scene's surface is near the plane, nothing stands on it,
-    and it is not the thing's; between, they solve Laplace's equation: a membrane fixed at what is known. A place that
+    and it is not the object's; between, they solve Laplace's equation: a membrane fixed at what is known. A place that
     is free at the plane, and not enclosed by known ones, has no support: a table's top ends.
     """
     origin, axes, cell, counts = _rectangle(plane, box)
@@ -141,7 +141,7 @@ def _sampled(values: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
     return value, slope
 
 
-# What reaches into a thing's box without being of it: a table's top over a chair, a wall, a thing beside it.
+# What reaches into an object's box without being of it: a table's top over a chair, a wall, an object beside it.
 
 _ALONG_THE_SURFACE, _AROUND = 72, 1.3
 """Cells along the longest edge, and how much larger than the box their region is."""
@@ -149,7 +149,7 @@ _LEAST_CELLS = 24
 _LEAST_OUTSIDE = 0.3
 """Share of a component outside of the box from which on it is a neighbor, where the box alone says what is removed."""
 _KEPT_AROUND = 2
-"""Cells round a neighbor's surface that are kept with it."""
+"""Cells around a neighbor's surface that are kept with it."""
 
 
 def kept_neighbors(
@@ -157,10 +157,10 @@ def kept_neighbors(
 ) -> GridDistance | None:
     """The signed distance to what is kept in ``box``, negative there; None where nothing is.
 
-    of_thing: tells of points (N, 3) whether they are near the thing's known surface; None: it is not known.
-    The scene's matter is divided into connected components, without supports and without what is the thing's. Those
-    that go on outside of the box are neighbors; the rest is taken for the thing's, or for noise. Where the scene knows
-    what was observed, only what was measured counts: unobserved matter behind a thing is not kept.
+    of_thing: tells of points (N, 3) whether they are near the object's known surface; None: it is not known.
+    The scene's matter is divided into connected components, without supports and without what is the object's. Those
+    that go on outside of the box are neighbors; the rest is taken for the object's, or for noise. Where the scene knows
+    what was observed, only what was measured counts: unobserved matter behind an object is not kept.
     """
     around = OrientedBox(box.center, box.size * _AROUND, box.rotation)
     grid = RegionGrid.over(around, _ALONG_THE_SURFACE)
@@ -196,11 +196,11 @@ def _mask(grid: RegionGrid, values: Tensor) -> Mask:
 
 
 _BOX_MARGIN = 0.05
-"""How far beyond a thing's box its copy in the scene may reach, as a share of the box's diagonal."""
+"""How far beyond an object's box its copy in the scene may reach, as a share of the box's diagonal."""
 _OWN_MARGIN = 0.015
-"""The same of the thing's surface, and 3 times the registration's residual."""
+"""The same of the object's surface, and 3 times the registration's residual."""
 _OVERLAP = 0.004
-"""Of the box's diagonal: the continued ground reaches so far into the matter round it, and leaves no gap."""
+"""Of the box's diagonal: the continued ground reaches so far into the matter around it, and leaves no gap."""
 
 
 Solid = tuple[Tensor, Tensor]
@@ -280,9 +280,9 @@ class Unseen:
 
 
 def clear(scene: SdfField, removed: Place, residual: float, generator: torch.Generator) -> Clearing:
-    """Clear the scene's copy of a thing, or a box in which nobody knows the thing's surface.
+    """Clear the scene's copy of an object, or a box in which nobody knows the object's surface.
 
-    residual: of the thing's registration, scene units.
+    residual: of the object's registration, scene units.
     """
     of_thing = removed.box if isinstance(removed, PlacedObject) else removed
     margin = _BOX_MARGIN * of_thing.diagonal + residual
@@ -313,7 +313,7 @@ def _smaller(one: Solid, other: Solid) -> Solid:
     return torch.where(first, one[0], other[0]), torch.where(first[:, None], one[1], other[1])
 
 
-# A grid of points in and round a box, in the box's own axes.
+# A grid of points in and around a box, in the box's own axes.
 
 Mask = NDArray[np.bool_]
 

@@ -77,7 +77,7 @@ def _middles(known: Observation, index: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class _Planned:
-    """What an edit comes to. removed: the known thing that goes, or a box · placed: what comes."""
+    """What an edit comes to. removed: the known object that goes, or a box · placed: what comes."""
 
     removed: Place | None
     placed: PlacedObject | None
@@ -100,11 +100,11 @@ _POINTS = 12
 _MOST_COMMON = 0.05
 """Share of the smaller of two objects' matter that may lie in the other: things touch, and poses are not exact."""
 _MOST_OF_BOX = 0.5
-"""Share of a thing's matter that may lie in a box that another edit clears."""
+"""Share of an object's matter that may lie in a box that another edit clears."""
 
 
 def _require_apart(edits: Sequence[_Planned]) -> None:
-    """Raises InvalidInputError (EDIT_INVALID): two edits take away the same thing, or put matter in one place."""
+    """Raises InvalidInputError (EDIT_INVALID): two edits take away the same object, or put matter in one place."""
     for (first, one), (second, other) in combinations(enumerate(edits), 2):
         for a, b in ((one.removed, other.removed), (one.placed, other.placed)):
             if a is None or b is None:
@@ -112,7 +112,7 @@ def _require_apart(edits: Sequence[_Planned]) -> None:
             most = _MOST_COMMON if isinstance(a, PlacedObject) and isinstance(b, PlacedObject) else _MOST_OF_BOX
             if _common(a, b) > most:
                 message = f"edits {first} and {second} change the same place"
-                hint = "Leave one of them out, or make one after the other: an edited scene can be edited again."
+                hint = "Leave one of them out, or apply one after the other: an edited scene can be edited again."
                 raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)
 
 
@@ -169,7 +169,7 @@ def standing_alike(
 def _upright(up: str) -> Tensor:
     """(3, 3), columns: two level axes and the vertical, right-handed."""
     if up.removeprefix("-") not in ("x", "y", "z"):
-        raise invalid_edit(f"the vertical is x, y or z, also with -, not {up[:20]!r}")
+        raise invalid_edit(f"the up axis must be x, y, z, -x, -y or -z, not {up[:20]!r}")
     sign = -1.0 if up.startswith("-") else 1.0
     first = axis_vector("xyz"[("xyz".index(up[-1]) + 1) % 3])
     vertical = sign * axis_vector(up[-1])
@@ -179,10 +179,11 @@ def _upright(up: str) -> Tensor:
 def compose(
     scene: SdfField, edits: Sequence[Edit], seed: int = 0, progress: Callable[[float], None] | None = None
 ) -> EditedScene:
-    """The scene with all edits done, a field as any other: it can be registered against, rendered and edited again.
+    """Apply all edits to a scene. The result is a field: it can be the scene of a registration, be rendered and be
+    edited again.
 
-    Distances are in scene units. Deterministic for a seed. ``progress`` is called with the share done, 0..1, before
-    each edit; it may raise CancelledError to stop the work.
+    Distances are in scene units. Deterministic for a seed. ``progress`` is called with the progress, 0..1, before each
+    edit. It may raise CancelledError to stop the work.
     Raises InvalidInputError: INVALID_TRANSFORM, EDIT_INVALID (also for two edits of one place, and beyond the scene),
     FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
@@ -253,13 +254,13 @@ def _planned(edit: Edit, number: int, surfaces: dict[int, OrientedBox]) -> _Plan
 
 
 def _require_in_scene(scene: SdfField, plan: _Planned, number: int) -> None:
-    """Raises InvalidInputError (EDIT_INVALID): nothing of the thing lies within the scene's bounds."""
+    """Raises InvalidInputError (EDIT_INVALID): nothing of the object lies within the scene's bounds."""
     low, high = scene.bounds
     for thing in (plan.removed, plan.placed):
         if thing is None:
             continue
         corners = _box_of(thing).corners()
         if bool((corners.amin(0) > high).any()) or bool((corners.amax(0) < low).any()):
-            message = f"edit {number}: what it changes lies outside of the scene's bounds"
-            hint = "T_object_scene takes scene coordinates to object coordinates. Check its direction and the units."
+            message = f"edit {number}: it changes a place outside of the scene's bounds"
+            hint = "T_object_scene maps scene coordinates to object coordinates. Check its direction and the units."
             raise InvalidInputError(message, reason="EDIT_INVALID", hint=hint)

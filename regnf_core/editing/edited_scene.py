@@ -90,7 +90,7 @@ class EditedScene:
 
     @property
     def places(self) -> tuple[OrientedBox, ...]:
-        """The box of each edit's thing."""
+        """The box of each edit's object."""
         return tuple(box.shifted(self.origin) for box in self._places)
 
     @property
@@ -149,7 +149,7 @@ class EditedScene:
         return distance, part
 
     def _evaluate(self, points: Tensor, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Distance (N,), gradient (N, 3), 0 unless it is asked for, and part (N,) at points (N, 3)."""
+        """Distance (N,), gradient (N, 3), 0 unless it is requested, and part (N,) at points (N, 3)."""
         points = self._near(points)
         asked = torch.ones(len(points), dtype=torch.bool, device=points.device)
         found = _Found.nothing_at(points)
@@ -224,7 +224,7 @@ class EditedScene:
         return colors
 
 
-# A scene without the matter that nobody saw: invented behind things, and in the way of cameras there.
+# A scene without unobserved matter: networks invent it behind objects, and it blocks cameras there.
 
 _AROUND = 2
 """Voxels round measured surface whose matter stays."""

@@ -79,19 +79,20 @@ class _Checked:
             if transform is None:
                 continue
             if transform.scale.shape != ():
-                raise InvalidInputError("an edit has one transform, not a batch", reason="INVALID_TRANSFORM")
+                raise InvalidInputError("an edit has one transform, not several", reason="INVALID_TRANSFORM")
             Sim3.from_matrix(transform.matrix())
         residual = getattr(self, "residual", None)
         if residual is not None and not 0.0 <= residual < math.inf:
-            raise invalid_edit("a residual is a length in object units, 0 or more")
+            raise invalid_edit("residual must be a length in object units, 0 or more")
 
 
 @dataclass(frozen=True, eq=False)
 class Substitution(_Checked):
-    """The object's own field where the scene shows the object: as a registration has found it.
+    """Substitutes the object's own field for the object in the scene, at the pose of a registration.
 
     T_object_scene: scene to object coordinates · residual: of the registration, in object units (``residual_rms`` times
-    the diameter); None: unknown. The larger it is, the farther from the object's surface the scene's copy is removed.
+    the diameter); None: unknown. The larger it is, the farther from the object's surface the scene's surface is
+    removed.
     """
 
     obj: SdfField
@@ -103,12 +104,11 @@ class Substitution(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Replacement(_Checked):
-    """Another object in place of one that was registered.
+    """Replaces a registered object by another object.
 
-    obj, T_object_scene, residual: as in a substitution, of what stands there now · replacement: what will
-    stand there · T_replacement_object: the known pose of both, from the object's coordinates to the replacement's;
-    None: it stands on the same base, upright, turned alike, and is as large: ``match`` says along which length ·
-    up_object, up_replacement: the vertical in each one's own frame.
+    obj, T_object_scene, residual: the present object, as in a substitution · replacement: the new object ·
+    T_replacement_object: from the object's coordinates to the replacement's; None: same base, upright, same heading and
+    same size, along the length that ``match`` selects · up_object, up_replacement: up axis in each one's own frame.
     """
 
     obj: SdfField
@@ -125,15 +125,16 @@ class Replacement(_Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.match not in ("height", "diagonal"):
-            raise invalid_edit(f"a replacement matches height or diagonal, not {str(self.match)[:20]!r}")
+            raise invalid_edit(f"`match` must be height or diagonal, not {str(self.match)[:20]!r}")
 
 
 @dataclass(frozen=True, eq=False)
 class Removal(_Checked):
-    """What stands in a box is taken away; floor and walls go on, and what reaches in from outside stays.
+    """Removes the content of a box. Floor and walls are continued, and surface that extends into the box from outside
+    is kept.
 
-    detection: all of the thing, scene frame · obj, T_object_scene: what was registered there, where it is known: then
-    its surface says what belongs to the thing. One of the two is needed.
+    detection: a box around the whole object, scene frame · obj, T_object_scene: the registered object, if it is known:
+    its surface then defines what is removed. One of the two is needed.
     """
 
     detection: OrientedBox | None = None
@@ -145,14 +146,14 @@ class Removal(_Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.obj is None) != (self.T_object_scene is None):
-            raise invalid_edit("a removal has an object and its transform, or neither")
+            raise invalid_edit("a removal needs both an object and its transform, or neither")
         if self.detection is None and self.obj is None:
             raise invalid_edit("a removal needs a detection, or an object and its transform")
 
 
 @dataclass(frozen=True, eq=False)
 class Insertion(_Checked):
-    """An object where nothing of the scene is removed. T_object_scene: any similarity, scene to object coordinates."""
+    """Adds an object. Nothing of the scene is removed. T_object_scene: any similarity, scene to object coordinates."""
 
     obj: SdfField
     T_object_scene: Sim3

@@ -25,7 +25,7 @@ def _rows_of(value: Any) -> Any:
     rows = value.get("matrix") if isinstance(value, dict) else value
     fault = similarity_fault(rows)
     if fault is not None:
-        raise ValueError(f"no similarity transform: {fault}")
+        raise ValueError(f"not a similarity transform: {fault}")
     return rows
 
 
@@ -40,7 +40,7 @@ def _detection_of(value: Any) -> Any:
 
 def _shown(text: str) -> str:
     if not text.isprintable():
-        raise ValueError("has characters that cannot be shown")
+        raise ValueError("has characters that cannot be displayed")
     return text
 
 
@@ -97,7 +97,7 @@ class RemovalRequest(Closed):
 
     def __post_init__(self) -> None:
         if (self.object is None) != (self.T_object_scene is None):
-            raise ValueError("a removal has an object and its transform, or neither")
+            raise ValueError("a removal needs both an object and its transform, or neither")
         if self.detection is None and self.object is None:
             raise ValueError("a removal needs a detection, or an object and its transform")
 

@@ -51,7 +51,7 @@ def write_field(field: SdfField, path: Path, resolution: int) -> tuple[int, int,
             near = distance.abs() <= _COLORED_CELLS * lattice.step
             colors[rows] = _colors(field, points, near).reshape(len(rows), y, z, 3)
     if not np.isfinite(values).all():
-        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+        raise InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
     bounds = [lattice.low.tolist(), (lattice.low + lattice.step * (lattice.counts - 1)).tolist()]
     description: dict[str, Any] = {
         "kind": "voxel_grid", "origin": bounds[0], "spacing": [lattice.step] * 3, "bounds": bounds

@@ -1,4 +1,4 @@
-"""Planes that a thing stands on or leans against, found in the scene's surface round its box."""
+"""Planes that an object stands on or leans against, found in the scene's surface around its box."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.surface.result_clouds import project_to_surface
 
 _DRAWN, _GROWN = 6000, 1.9
-"""Points drawn round the box, within the box grown by this factor."""
+"""Points drawn around the box, within the box grown by this factor."""
 _NEWTON_STEPS = 3
 _CANDIDATES = 96
 _MOST_PLANES = 4
@@ -41,7 +41,7 @@ class SupportPlane:
 
 
 def support_planes(scene: SdfField, box: OrientedBox, generator: torch.Generator) -> list[SupportPlane]:
-    """The planes that cross or nearly touch ``box`` and go on round it, the largest first; none where there are none.
+    """The planes that cross or nearly touch ``box`` and go on around it, the largest first; none where there are none.
 
     RANSAC over the surface outside of the box. A plane counts if most of the box lies before it, and if its points lie
     on several sides of the box: a neighbor's face has them on one.
@@ -96,7 +96,7 @@ def _best(
 
 
 def _supports(n: Tensor, offset: float, on_plane: Tensor, box: OrientedBox) -> bool:
-    """Whether the box stands before the plane and reaches it, and the plane goes on round the box's footprint."""
+    """Whether the box stands before the plane and reaches it, and the plane goes on around the box's footprint."""
     heights = box.corners() @ n - offset
     extent = float(heights.max() - heights.min())
     if float(heights.min()) > 0.08 * box.diagonal or float(heights.max()) < _IN_FRONT * extent:
@@ -117,7 +117,7 @@ _MARGIN = 0.04
 
 
 class PlacedObject:
-    """S(x) = S_object(T x) / s within a box round the object's surface, for T = ``T_object_scene`` with scale s.
+    """S(x) = S_object(T x) / s within a box around the object's surface, for T = ``T_object_scene`` with scale s.
 
     Outside of the box, where a trained field means nothing, sqrt(b^2 + S(p)^2) with b the distance to the box and p its
     nearest point: the surface lies in the box, which is convex, so the distance is no smaller (the angle at p between

@@ -211,8 +211,8 @@ def usable_device(device: torch.device | str) -> torch.device:
         found = torch.device(device)
         torch.empty(0, device=found)
     except (AssertionError, NotImplementedError, RuntimeError, TypeError) as error:
-        hint = 'Take "cpu"; `regnf doctor` says whether torch finds a GPU.'
-        raise InvalidOptionsError(f"torch cannot use the device {device!r:.40} here", hint=hint) from error
+        hint = 'Use "cpu". `regnf doctor` checks whether torch finds a GPU.'
+        raise InvalidOptionsError(f"torch cannot use the device {device!r:.40} on this machine", hint=hint) from error
     return found
 
 

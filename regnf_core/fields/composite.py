@@ -45,7 +45,7 @@ class SurfaceSource(Protocol):
 class TransformedField(FieldView):
     """S_frame(x) = S_field(T x) / s for T = ``T_field_frame``, which carries the new frame's points to the field's own.
 
-    The bounds are the axis-aligned box round the field's own bounds, in the new frame.
+    The bounds are the axis-aligned box around the field's own bounds, in the new frame.
     """
 
     def __init__(self, field: SdfField, T_field_frame: Sim3) -> None:

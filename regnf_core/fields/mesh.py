@@ -64,7 +64,7 @@ class MeshField:
         if self.faces.ndim != 2 or self.faces.shape[1] != 3 or len(self.faces) == 0:
             raise FieldFormatError("mesh faces are not (F, 3) with at least one triangle", reason="MESH_INVALID")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
-            raise FieldFormatError("a mesh face names a vertex that does not exist", reason="MESH_INVALID")
+            raise FieldFormatError("a mesh face refers to a vertex that does not exist", reason="MESH_INVALID")
         self._inside_above = inside_above
         self._native: MeshTree | None = None
         self.colors = colors

@@ -24,7 +24,7 @@ class PointTable(OnDevice):
     """At most one point a cell, found as the trainer finds it: by the cell's number in a buffer that may be too small.
 
     keys: (M,) int64, the taken numbers, ascending · rows: (M,), the point of each · offsets: (C,) the numbers of the
-    cells round a cell, relative to its own.
+    cells around a cell, relative to its own.
     """
 
     keys: Tensor

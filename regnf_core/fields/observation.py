@@ -1,4 +1,4 @@
-"""What was observed of a field: where a surface was measured, what was seen to be free, and what is unobserved.
+"""The observation of a field: where a surface was measured, where free space was observed, and what is unobserved.
 
 A field has a value everywhere, whether anything was measured there or not. Fields that were fitted to images or depths
 can say which is which; those that cannot have no observation.
@@ -137,7 +137,7 @@ class Observation:
 
     states: (X, Y, Z) uint8 · low: (3,) float64, the grid's lowest corner · voxel: edge · T_grid_frame: from the frame
     that points are given in to the grid's; None: the same · of_thing: SURFACE is the surface of one thing
-    alone, the one of a detection; where others were measured is UNSEEN: nobody saw that thing there.
+    alone, the one of a detection. Places where other surface was measured are UNSEEN.
     """
 
     states: Tensor

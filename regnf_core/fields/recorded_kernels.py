@@ -18,7 +18,7 @@ from torch import Tensor
 LEAST, MOST = 1 << 10, 1 << 16
 """Points of the smallest and of the largest graph: each keeps the memory of its layers."""
 _USES = 3
-"""So often a size is asked for before it is recorded: to record takes as long as some evaluations."""
+"""So often a size is requested before it is recorded: to record takes as long as some evaluations."""
 _log = logging.getLogger(__name__)
 
 Evaluation = Callable[[Tensor], tuple[Tensor, Tensor]]

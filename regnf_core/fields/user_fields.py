@@ -22,7 +22,8 @@ _STEP = 5e-4
 """Of the bounds' diagonal: half the difference that stands for a derivative. float32 keeps three digits of it."""
 _PROBES = 16
 _HINT = (
-    "It takes points (N, 3), a float32 tensor, and returns the signed distance (N,) of each, positive in free space."
+    "The function takes points (N, 3), a float32 tensor, and returns their signed distances (N,), positive in free "
+    "space."
 )
 
 
@@ -165,7 +166,7 @@ def checked_bounds(bounds: Any) -> Tensor:
 
 
 def _no_bounds(what: str) -> FieldFormatError:
-    hint = "Write the lowest and the highest corner of the region where the field has meaning: [[x, y, z], [x, y, z]]."
+    hint = "Write the lowest and the highest corner of the region in which the field is valid: [[x, y, z], [x, y, z]]."
     return FieldFormatError(f"the bounds {what}, expected two corners", reason="BOUNDS_INVALID", hint=hint)
 
 
@@ -176,7 +177,7 @@ def _values(name: str, found: Any, shape: tuple[int, ...], device: torch.device)
     plain = isinstance(found, np.ndarray) and found.dtype.kind in "fiu"
     values = torch.from_numpy(np.array(found)) if plain else found
     if not isinstance(values, Tensor) or values.is_complex() or values.dtype == torch.bool:
-        raise _unusable(f"{name} returns numbers of the kind {found.dtype}, expected real ones")
+        raise _unusable(f"{name} returns numbers of the type {found.dtype}, expected real numbers")
     if tuple(values.shape) == (*shape, 1):
         values = values.squeeze(-1)
     if tuple(values.shape) != shape:

@@ -30,7 +30,7 @@ _NEIGHBORS = 4
 class CellIndex(OnDevice):
     """Finds the rows of occupied cells. Its memory follows the number of cells, not the space between them.
 
-    low, size: (3,) int64, the box round the cells · keys: (N,), the cells' numbers within it, ascending · rows: (N,),
+    low, size: (3,) int64, the box around the cells · keys: (N,), the cells' numbers within it, ascending · rows: (N,),
     the row of each · table: (A, B, C, K), for each ``step``^3 cells of the box the rows of the K occupied cells that
     are nearest to their middle.
     """

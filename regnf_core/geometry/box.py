@@ -43,9 +43,9 @@ class OrientedBox:
             raise InvalidDetectionError("box size must be positive along every axis")
         identity = torch.eye(3, dtype=torch.float64)
         if not torch.allclose(self.rotation @ self.rotation.T, identity, atol=1e-5) or torch.det(self.rotation) < 0:
-            raise InvalidDetectionError("box rotation is not a proper rotation matrix")
+            raise InvalidDetectionError("box rotation is not a rotation matrix")
         if self.score is not None and not 0.0 <= self.score <= 1.0:
-            raise InvalidDetectionError("box score must lie within 0 and 1")
+            raise InvalidDetectionError("box score must be between 0 and 1")
 
     @classmethod
     def from_dict(cls, values: Any, index: int | None = None) -> OrientedBox:
@@ -72,7 +72,7 @@ class OrientedBox:
         low = torch.as_tensor(lower, dtype=torch.float64)
         high = torch.as_tensor(upper, dtype=torch.float64)
         if low.shape != (3,) or high.shape != (3,):  # a single number would spread over all axes
-            raise InvalidDetectionError("a box's corners have three coordinates each")
+            raise InvalidDetectionError("each corner of a box needs three coordinates")
         return cls((low + high) / 2, high - low, torch.eye(3, dtype=torch.float64), label, score)
 
     @classmethod
@@ -96,7 +96,7 @@ class OrientedBox:
         """A box from Open3D's OrientedBoundingBox or AxisAlignedBoundingBox. Raises InvalidDetectionError."""
         if not open3d_names(box):
             hint = "Give an OrientedBoundingBox or an AxisAlignedBoundingBox; from_dict takes a detection's JSON."
-            raise InvalidDetectionError(f"a {type(box).__name__} is no box of Open3D", hint=hint)
+            raise InvalidDetectionError(f"a {type(box).__name__} is not a box of Open3D", hint=hint)
         return cls.from_detection(replace(detection_of(box), label=label, score=score))
 
     @classmethod

@@ -54,7 +54,7 @@ class Bundle:
 
 
 class CopiedOnce:
-    """Tensors for work on any device: copied to each where they are asked for, once."""
+    """Tensors for work on any device: copied to each where they are requested, once."""
 
     def __init__(self, *parts: Tensor) -> None:
         self._there = {parts[0].device: parts}

@@ -47,7 +47,7 @@ def euler_from_rotation(R: Tensor) -> Tensor:
 # Neighbors, spacing and size of point sets: exact on any device.
 
 _DISTANCES_AT_ONCE = 2**25
-"""Of all points to some of those asked for, where there is no tree: bounds memory, at some 500 MB."""
+"""Of all points to some of those requested, where there is no tree: bounds memory, at some 500 MB."""
 
 
 class NearestNeighbors:

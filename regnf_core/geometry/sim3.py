@@ -33,7 +33,7 @@ def _numbers(values: Any) -> Tensor:
     try:
         return torch.as_tensor(values, dtype=torch.float64)
     except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-        raise _invalid("a transform is made of numbers, in rows of equal length") from error
+        raise _invalid("a transform must consist of numbers, in rows of equal length") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +79,10 @@ class Sim3(Bundle):
         scale = singular.mean(-1)
         spread = (singular[..., 0] - singular[..., 2]) / scale.clamp_min(1e-300)
         if not ((scale > 1e-12) & (spread <= _SIMILARITY_TOLERANCE)).all():
-            raise _invalid("the transform is no similarity: its axes are stretched differently or vanish")
+            raise _invalid("the transform is not a similarity: its axes have different lengths, or length 0")
         rotation = U @ Vh  # nearest rotation
         if not (torch.linalg.det(rotation) > 0).all():
-            raise _invalid("the transform mirrors space")
+            raise _invalid("the transform is a reflection")
         return cls(scale, rotation, M[..., :3, 3].clone())
 
     @classmethod
@@ -95,12 +95,12 @@ class Sim3(Bundle):
         """From scale (...), quaternion (..., 4) as (x, y, z, w), normalized here, and translation (..., 3)."""
         s, q, t = _numbers(scale), _numbers(rotation_quaternion_xyzw), _numbers(translation)
         if q.shape[-1:] != (4,) or t.shape[-1:] != (3,):
-            raise _invalid("a quaternion has four numbers and a translation three")
+            raise _invalid("a quaternion needs four numbers, and a translation three")
         if not all(torch.isfinite(part).all() for part in (s, q, t)):
             raise _invalid("the transform holds a number that is not finite")
         norm = q.norm(dim=-1, keepdim=True)
         if not ((s > 0).all() and (norm > 1e-9).all()):
-            raise _invalid("the scale must be positive and the quaternion must not vanish")
+            raise _invalid("the scale must be positive, and the quaternion must not be zero")
         return cls(s, matrix_from_quaternion(q / norm), t)
 
     @classmethod
@@ -111,7 +111,7 @@ class Sim3(Bundle):
         try:
             return cls.from_quaternion(values["scale"], values["rotation_quaternion_xyzw"], values["translation"])
         except KeyError as error:
-            raise _invalid(f"the transform lacks {error.args[0]!r}") from error
+            raise _invalid(f"the transform has no {error.args[0]!r}") from error
 
     @classmethod
     def exp(cls, tangent: Tensor) -> Sim3:

@@ -1,1 +1,2 @@
-"""The import gate: uploaded bytes become a safe field file, or a refusal with a reason. No uploaded byte is trusted."""
+"""The importer: uploaded bytes become a regnf field file, or a refusal with a reason. No uploaded byte is
+trusted."""

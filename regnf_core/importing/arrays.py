@@ -12,7 +12,7 @@ from regnf_core.errors import FieldFormatError
 
 Float32Array = npt.NDArray[np.float32]
 StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.float16] | npt.NDArray[np.int32]
-"""What a safe field holds."""
+"""What a regnf field file holds."""
 
 _FINITE_CHUNK = 1 << 20
 _MAX_ELEMENTS = 1 << 60
@@ -47,4 +47,4 @@ def finite_float32(name: str, values: npt.NDArray[Any]) -> Float32Array:
 def require_possible(name: str, shape: tuple[int, ...]) -> None:
     """Raise FieldFormatError (TENSOR_SHAPE) for a shape that no array has, even one of nothing."""
     if math.prod(max(extent, 1) for extent in shape) > _MAX_ELEMENTS:
-        raise tensor_error(f"{name} has a shape that no array has: {shape}", "TENSOR_SHAPE")
+        raise tensor_error(f"{name} has an impossible shape: {shape}", "TENSOR_SHAPE")

@@ -1,4 +1,4 @@
-"""A mesh file as an exact distance field outside of the gate: for files that are the user's own."""
+"""A mesh file as an exact distance field outside of the importer: for files that are the user's own."""
 
 from __future__ import annotations
 
@@ -57,5 +57,5 @@ def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
     except FieldFormatError as error:
         raise error.told(f"{named.name}: {error}") from error
     if len(geometry.faces) == 0:
-        raise malformed(f"{named.name} holds no triangles")
+        raise malformed(f"{named.name} has no triangles")
     return geometry

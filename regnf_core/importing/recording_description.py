@@ -10,7 +10,7 @@ from annotated_types import Ge, Le, MaxLen
 
 @dataclass(frozen=True)
 class RecordingDescription:
-    """Where the files say nothing, or say it wrongly. None: what the layout says."""
+    """Import options of a recording, if a value is missing or wrong in its files. null: the value of the layout."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
 

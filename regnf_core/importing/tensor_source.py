@@ -83,7 +83,7 @@ def as_tensor(name: str, value: object) -> TensorRef:
     if isinstance(value, TensorRef):
         return value
     if isinstance(value, (Placeholder, GlobalRef)):
-        message = f"{name} can only be made by running {value.full_name}, which is not allowed"
+        message = f"{name} would need to run {value.full_name}, which is not allowed"
         raise tensor_error(message, "UNSAFE_GLOBAL_IN_WEIGHTS")
     raise tensor_error(f"{name} is a {type(value).__name__}, not a tensor", "TENSOR_EXPECTED")
 
@@ -99,11 +99,11 @@ def _stored_type(name: str, ref: TensorRef, types: Mapping[str, np.dtype[Any]], 
     storage = ref.storage
     stored = types.get(storage.dtype or "")
     if stored is None:
-        raise tensor_error(f"{name} is stored as {storage.type_name}; {sort} numbers are needed", "TENSOR_DTYPE")
+        raise tensor_error(f"{name} is stored as {storage.type_name}; {sort} numbers are required", "TENSOR_DTYPE")
     if not _DEVICE.fullmatch(storage.device):
-        raise tensor_error(f"{name} has no data of its own (device {storage.device!r})", "TENSOR_DEVICE")
+        raise tensor_error(f"{name} has no data (device {storage.device!r})", "TENSOR_DEVICE")
     if not ref.plain:
-        raise tensor_error(f"{name} is more than a view of its storage", "TENSOR_NOT_DENSE")
+        raise tensor_error(f"{name} extends beyond its storage", "TENSOR_NOT_DENSE")
     return stored
 
 

@@ -26,7 +26,7 @@ class _Said:
 
 def _sound_box(box: list[list[float]]) -> list[list[float]]:
     if not all(low < high for low, high in zip(*box, strict=True)):
-        raise ValueError("the lowest corner is not below the highest along every axis")
+        raise ValueError("the lowest corner must be below the highest corner along every axis")
     return box
 
 
@@ -48,7 +48,8 @@ _Box = Annotated[list[_Corner], Len(2, 2), AfterValidator(_sound_box)]
 
 @dataclass(frozen=True)
 class GridDescription(_Said):
-    """What the table's size alone may leave open about a hash grid. Anything left out is searched for."""
+    """Import options for a hash grid, if its layout does not follow from the size of its table. The importer searches
+    for options that are left out."""
 
     levels: Annotated[int, Ge(1), Le(32)] | None = None
     features_per_level: Annotated[int, Ge(1), Le(32)] | None = None
@@ -59,23 +60,23 @@ class GridDescription(_Said):
     """Ratio of the resolutions of neighboring levels."""
     interpolation: Literal["linear", "smoothstep"] | None = None
     radius: Annotated[float, Gt(0), Le(1e6)] | None = None
-    """The grid covers [-radius, radius]^3 of the coordinates that it is given."""
+    """The grid covers [-radius, radius]^3 of its input coordinates."""
 
 
 @dataclass(frozen=True)
 class EncodingDescription(_Said):
-    """What the widths alone may leave open about the sines and cosines of the position."""
+    """Import options for the positional encoding, if its layout does not follow from the widths of the layers."""
 
     degree: Annotated[int, Ge(0), Le(24)] | None = None
     """Number of frequencies."""
     used: bool | None = None
-    """False: the network has the columns, but was trained with zeros in them."""
+    """False: the network has the columns, but was trained with zeros as their input."""
     two_pi: bool | None = None
-    """Whether the sines' argument is multiplied by 2 pi."""
+    """Whether the argument of the sines is multiplied by 2 pi."""
     base_frequency: Annotated[float, Ge(1e-3), Le(1e3)] | None = None
-    """The sines' lowest frequency, in place of ``two_pi``."""
+    """The lowest frequency of the sines, instead of ``two_pi``."""
     order: Literal["frequency", "kind", "kind_frequency", "axis"] | None = None
-    """How the columns are sorted. frequency: for each frequency three sines, then three cosines. kind: all sines, axis
+    """The order of the columns. frequency: for each frequency three sines, then three cosines. kind: all sines, axis
     by axis, then all cosines; kind_frequency: the same, frequency by frequency. axis: for each axis and frequency, the
     sine and the cosine."""
 
@@ -85,103 +86,107 @@ Inputs = Literal["all", "no_direction", "no_gradient", "features"]
 
 @dataclass(frozen=True)
 class ColorOverrides(_Said):
-    """What the widths alone may leave open about a network of colors. It changes nothing about the geometry."""
+    """Import options for a color network, if its layout does not follow from the widths of its layers. They do not
+    change the geometry."""
 
     keep: bool | None = None
-    """False: leave the color out."""
+    """False: do not import the color."""
     average_appearance: bool | None = None
-    """True: the mean of the images' appearances (sdfstudio, nerfstudio); else none of them."""
+    """True: use the mean of the appearance embeddings of all images (sdfstudio, nerfstudio). False: use zeros."""
     direction_degree: Annotated[int, Ge(0), Le(24)] | None = None
     """Frequencies of the direction's sines and cosines, or the degree of its spherical harmonics."""
     inputs: Inputs | None = None
-    """What the network sees: no_direction and no_gradient are NeuS's modes no_view_dir and no_normal; features:
-    nothing but the geometry's results (instant-nsr-pl)."""
+    """The inputs of the network. no_direction and no_gradient: NeuS's modes no_view_dir and no_normal. features: only
+    the outputs of the geometry network (instant-nsr-pl)."""
     hidden_width: Annotated[int, Ge(1), Le(1024)] | None = None
-    """Of a fully fused network's layers."""
+    """Width of the layers of a fully fused network."""
     padding: Annotated[float, Ge(0), Le(1)] | None = None
     """sdfstudio's rgb_padding."""
     output: Literal["sigmoid", "linear"] | None = None
-    """What stands behind the last layer."""
+    """The function after the last layer."""
     channels: Literal["rgb", "bgr"] | None = None
-    """The order in which NeuS was trained; its own trainer reads images as bgr."""
+    """The order of the color channels in NeuS's training. Its own trainer reads images as bgr."""
 
 
 @dataclass(frozen=True)
 class CamerasDescription(_Said):
-    """What the file of cameras does not say of them."""
+    """Import options for cameras: what is not in the camera file."""
 
     intrinsics: Annotated[list[Annotated[float, Gt(0), Le(1e6)]], Len(4, 4)] | None = None
     """fx, fy, cx, cy of all images, in pixels."""
     size: Annotated[list[Annotated[int, Ge(1), Le(100_000)]], Len(2, 2)] | None = None
     """Width and height of the images, in pixels; without it, twice cx and cy."""
     axes: Literal["opencv", "opengl"] | None = None
-    """opencv: a camera looks along its z axis, y is down. opengl: it looks against z, y is up."""
+    """opencv: a camera looks along +z, and y is down. opengl: it looks along -z, and y is up."""
 
 
 @dataclass(frozen=True)
 class UploadDescription(_Said):
-    """Overrides of what the gate would conclude by itself. None means: conclude it."""
+    """Import options. They replace what the importer derives from the file. null: derive it."""
 
     family: Annotated[str, MaxLen(64)] | None = None
     contraction: Literal["none", "linf", "linf_grid"] | None = None
-    """How far space is squeezed before the field sees it; see the field families' documentation."""
+    """The contraction of space before the network; see docs/families.md."""
     level_mask: Annotated[int, Gt(0), Le(32)] | None = None
-    """Only this many of the coarsest grid levels are evaluated, for checkpoints of coarse-to-fine training."""
+    """Number of grid levels that are evaluated, from the coarsest, for checkpoints of coarse-to-fine training."""
     latent_index: Annotated[int, Ge(0), Lt(1 << 24)] | None = None
-    """Which shape of a family of shapes, counted from 0 in the order of the checkpoint's latent codes."""
+    """Index of the shape, for a network of several shapes: the position of its latent code in the checkpoint, from
+    0."""
     latent: Annotated[list[FiniteFloat], Len(1, 512)] | None = None
-    """The shape's latent code itself, where the checkpoint has none."""
+    """The latent code of the shape, if the checkpoint has none."""
     bounds: _Box | None = None
-    """Lowest and highest corner of the region where the field has meaning, in its own frame, after ``world_scale``."""
+    """Lowest and highest corner of the region in which the field is valid, in its own frame, after ``world_scale``."""
     world_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
-    """Length, in the unit overrides, of one unit of the checkpoint's coordinates; distances scale with it."""
+    """Length of one unit of the checkpoint's coordinates, in the unit of the imported field. Distances scale with
+    it."""
     sign: Annotated[int, Ge(-1), Le(1), AfterValidator(_whole_sign)] | None = None
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Which axis of the field points up. Kept with the field, changes nothing about it."""
+    """The up axis of the field. It is stored with the field and does not change it."""
     input_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
-    """The factor of the coordinates before the network sees them, where no file has it."""
+    """Factor of the coordinates before the network, if no file has it."""
     output_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
-    """The factor of the network's results, where no file has it."""
+    """Factor of the network's output, if no file has it."""
     output_bias: Annotated[float, Ge(-1e6), Le(1e6)] | None = None
-    """Added to the network's result, in the checkpoint's unit."""
+    """Value that is added to the network's output, in the checkpoint's unit."""
     output_column: Annotated[int, Ge(0), Lt(1 << 16)] | None = None
-    """Which column of the last layer's result is the distance, counted from 0."""
+    """Index of the distance in the output of the last layer, from 0."""
     output_tanh: Annotated[int, Ge(0), Le(2)] | None = None
-    """How often tanh is applied to the last layer's result."""
+    """How often tanh is applied to the output of the last layer."""
     activation: Literal["relu", "softplus", "sine", "tanh", "elu", "gelu", "silu", "leaky_relu"] | None = None
-    """The function between the network's layers."""
+    """The activation function between the layers of the network."""
     activation_scale: Annotated[float, Gt(0), Le(1e6)] | None = None
-    """Softplus's beta, the sine's omega, or leaky_relu's slope for negative numbers."""
+    """The parameter of the activation: softplus's beta, the sine's omega, or leaky_relu's slope for negative
+    numbers."""
     first_activation_scale: Annotated[float, Gt(0), Le(1e6)] | None = None
-    """The sine's omega in the first layer, where it differs from that of the others."""
+    """The sine's omega in the first layer, if it differs from that of the other layers."""
     skip_factor: Annotated[float, Gt(0), Le(1e3)] | None = None
-    """The factor of what a layer is given that sees the network's input again: 1, or 1 / sqrt 2."""
+    """Factor of the inputs of a layer with a skip connection: 1, or 1 / sqrt 2."""
     skip_order: Literal["hidden_first", "input_first"] | None = None
-    """What comes first in such a layer's columns."""
+    """The order of the inputs of a layer with a skip connection."""
     skip_layer: Annotated[int, Ge(0), Le(32)] | None = None
-    """How many blocks stand before the layer behind which the network sees its input again; 0: there is none."""
+    """Number of blocks before the skip connection; 0: there is no skip connection."""
     truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
-    """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
+    """The distance that corresponds to the value 1 of a map of truncated distances, in the checkpoint's unit."""
     frame: Literal["dataset", "field"] | None = None
-    """field (the default): coordinates as the network sees them. dataset: those of the dataset, by the transform and
-    the scale that the trainer applied to it, which must be known from its settings or ``dataset_transform``."""
+    """field (the default): the coordinates of the network. dataset: those of the dataset. They follow from the
+    transform and the scale of the trainer, which must be in its config file or in ``dataset_transform``."""
     dataset_transform: _Similarity | None = None
-    """4 x 4 matrix of a similarity, row by row: takes points of the field's frame to the dataset's."""
+    """Row-major 4x4 matrix of a similarity transform. It maps points of the field's frame to the dataset's."""
     as_: Annotated[Literal["scene", "object"] | None, Field(alias="as")] = None
-    """scene: a surface seen from within, as a room's. object: a thing seen from around it."""
+    """scene: a surface seen from inside, such as a room. object: a surface seen from outside."""
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=MOST_OF_LABEL, pattern=LABEL_PATTERN)] | None = None
     use_grid: bool | None = None
-    """False: the network has a hash grid's columns, but was trained without it."""
+    """False: the network has the columns of a hash grid, but was trained without it."""
     hash: GridDescription = field(default_factory=GridDescription)
     positional_encoding: EncodingDescription = field(default_factory=EncodingDescription)
     cameras: CamerasDescription = field(default_factory=CamerasDescription)
     color: ColorOverrides = field(default_factory=ColorOverrides)
 
     def non_default(self) -> dict[str, Any]:
-        """The entries that say something, as plain (JSON) values."""
+        """The given import options, as plain (JSON) values."""
         values = asdict(self)
         for name in ("hash", "positional_encoding", "cameras", "color"):
             values[name] = {part: value for part, value in values[name].items() if value is not None}
@@ -190,7 +195,7 @@ class UploadDescription(_Said):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any] | None) -> UploadDescription:
-        """The description from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
+        """The import options from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
         return described(cls, values)
 
 
@@ -198,7 +203,7 @@ _Described = TypeVar("_Described")
 
 
 def described(kind: type[_Described], values: Mapping[str, Any] | None) -> _Described:
-    """A description of this kind from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
+    """Import options of this kind from plain (JSON) values. Raises FieldFormatError (INVALID_DESCRIPTION)."""
     try:
         return cast(_Described, _adapter(cast(Any, kind)).validate_json(json.dumps(values or {}, allow_nan=False)))
     except ValidationError as error:

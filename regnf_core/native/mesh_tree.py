@@ -64,7 +64,7 @@ class MeshTree:
         self.has_normals = False
         self._mesh = self._described()
         if steps.grow_mesh(self._mesh.address):
-            raise MemoryError("no memory for a mesh's hierarchy")
+            raise MemoryError("not enough memory for the hierarchy of a mesh")
 
     def _described(self, **normals: Tensor) -> Kept:
         return Kept(_Mesh, triangles=self._count, **self._arrays, **self._levels, **normals)

@@ -68,7 +68,7 @@ _FARTHEST = 1e150
 _FEW = 4096
 """Points below which another thread does not pay."""
 _AT_ONCE = 2048
-"""Points that a compiled model is asked for at once: what is worked out of them stays in a core's own cache."""
+"""Points that a compiled model is requested at once: what is worked out of them stays in a core's own cache."""
 
 
 def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -159,7 +159,7 @@ class NativeModel:
     """A function of points in compiled code, seen through a linear map: factor f(turn x + shift).
 
     ask: a regnf_ask · described: what it is given, with an ``address`` · turn: (9,) · shift: (3,) · checked: whether a
-    value that is not finite is a fault · counted: called with the number of points that it was asked for.
+    value that is not finite is a fault · counted: called with the number of points that it was requested.
     """
 
     ask: Any
@@ -201,7 +201,7 @@ class NativeModel:
             to = None if gradient is None else gradient[begin:].data_ptr()
             at, found = points[begin:].data_ptr(), value[begin:].data_ptr()
             if self.ask(self.described.address, at, end - begin, found, to):
-                raise MemoryError("no memory for the evaluation of a field")
+                raise MemoryError("not enough memory to evaluate a field")
 
         in_threads(part, len(points))
         return value
@@ -291,7 +291,7 @@ class Pair:
         kept = None if history is None else history.address
         state = steps.begin(self._address, of.address, settings.address, kept)
         if not state:
-            raise MemoryError("no memory for a registration's residuals")
+            raise MemoryError("not enough memory for the residuals of a registration")
         try:
             for number in range(len(widths) + 1):
                 if number:
@@ -325,7 +325,7 @@ class Pair:
                 found = value.data_ptr(), gradient.data_ptr()
             fault = fill(of_object, *found)
             if fault == _NO_MEMORY:
-                raise MemoryError("no memory for a registration's residuals")
+                raise MemoryError("not enough memory for the residuals of a registration")
             asked.count(poses)
             if fault != _DONE:
                 return False
@@ -389,7 +389,7 @@ def nearest(points: Tensor, places: Tensor, count: int) -> tuple[Tensor, Tensor]
     if found.steps.nearest(
         of.data_ptr(), len(of), at.data_ptr(), len(at), count, distance.data_ptr(), number.data_ptr()
     ):
-        raise MemoryError("no memory for a search of neighbors")
+        raise MemoryError("not enough memory to search neighbors")
     return distance.to(places), number.to(places.device)
 
 
@@ -407,7 +407,7 @@ def nearest_to_cells(points: Tensor, low: Tensor, edge: Tensor, cells: int) -> t
     if found.steps.nearest_to_cells(
         of.data_ptr(), len(of), corner.data_ptr(), edges.data_ptr(), cells, distance.data_ptr(), number.data_ptr()
     ):
-        raise MemoryError("no memory for a search of neighbors")
+        raise MemoryError("not enough memory to search neighbors")
     return distance.to(points), number
 
 

@@ -290,7 +290,7 @@ def _record(
 ) -> IterationRecord:
     loss = float(terms.total.detach())
     if not torch.isfinite(terms.total.detach()):
-        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+        raise InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
     return IterationRecord(
         iteration=iteration,
         loss=loss,

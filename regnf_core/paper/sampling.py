@@ -77,7 +77,7 @@ def _trace_views(field: SdfField, box: OrientedBox, positions: Tensor, options: 
     """(M, 3) first surface points, seen from the cameras at ``positions`` (V, 3), within the slightly grown box.
 
     Memory is bounded: rays are cast in parts and followed in groups. The groups are as large as they are because
-    networks round a little differently when a point is evaluated among others; one group is the usual case.
+    networks around a little differently when a point is evaluated among others; one group is the usual case.
     """
     grown = OrientedBox(box.center, box.size * (1.0 + _BOX_MARGIN), box.rotation)
     parts = cast_rays(positions, box.center, grown.corners(), options.image_size, options.pixel_stride)

@@ -44,17 +44,17 @@ class Camera:
         for name, shape in (("position", (3,)), ("axes", (3, 3))):
             value = torch.as_tensor(getattr(self, name), dtype=torch.float64, device="cpu")
             if tuple(value.shape) != shape or not torch.isfinite(value).all():
-                raise invalid_camera(f"a camera's {name} has {math.prod(shape)} finite numbers")
+                raise invalid_camera(f"a camera's {name} must have {math.prod(shape)} finite numbers")
             object.__setattr__(self, name, value)
         off = (self.axes.T @ self.axes - torch.eye(3, dtype=torch.float64)).abs().max()
         if not off <= _RIGHT_ANGLES or torch.det(self.axes) < 0:
-            raise invalid_camera("a camera's axes are no rotation")
+            raise invalid_camera("a camera's axes are not a rotation")
         if self.width < 1 or self.height < 1:
-            raise invalid_camera("a camera's image has at least one pixel along each side")
+            raise invalid_camera("a camera's image must have at least one pixel along each side")
         if not all(math.isfinite(one) and one > 0 for one in self.focal):
-            raise invalid_camera("a camera's focal lengths are above 0")
+            raise invalid_camera("a camera's focal lengths must be above 0")
         if not all(math.isfinite(one) for one in self.middle):
-            raise invalid_camera("a camera's principal point is finite")
+            raise invalid_camera("a camera's principal point must be finite")
         check_extent(1, self.width * self.height)
 
     @classmethod
@@ -72,13 +72,13 @@ class Camera:
         vector (3,). Looking straight along ``up``, another axis is taken for it.
         """
         if not 0.0 < field_of_view_deg <= _WIDEST_DEG:
-            raise invalid_camera(f"a field of view is above 0 and at most {_WIDEST_DEG:g} degrees")
+            raise invalid_camera(f"a field of view must be above 0 and at most {_WIDEST_DEG:g} degrees")
         at, to = (torch.as_tensor(value, dtype=torch.float64) for value in (position, target))
         if at.shape != (3,) or to.shape != (3,) or not torch.isfinite(torch.stack([at, to])).all():
-            raise invalid_camera("a camera's position and target have three finite numbers")
+            raise invalid_camera("a camera's position and target must have three finite numbers each")
         forward = to - at
         if not forward.norm() > 1e-12:
-            raise invalid_camera("a camera cannot look at the place where it stands")
+            raise invalid_camera("a camera's position and target must differ")
         focal = size[0] / 2.0 / math.tan(math.radians(field_of_view_deg) / 2.0)
         forward, up = forward / forward.norm(), up_vector(up)
         right = torch.linalg.cross(forward, up)
@@ -112,11 +112,11 @@ def up_vector(up: str | Sequence[float] | Tensor) -> Tensor:
     """(3,) unit float64 of "x", "-y" and the like, or of a vector. Raises InvalidInputError (CAMERA_INVALID)."""
     if isinstance(up, str):
         if up.removeprefix("-") not in ("x", "y", "z"):
-            raise invalid_camera(f"up is x, y or z, also with -, or a vector; not {up[:20]!r}")
+            raise invalid_camera(f"up must be x, y, z, -x, -y, -z or a vector, not {up[:20]!r}")
         return axis_vector(up[-1]) * (-1.0 if up.startswith("-") else 1.0)
     vector = torch.as_tensor(up, dtype=torch.float64)
     if vector.shape != (3,) or not torch.isfinite(vector).all() or not vector.norm() > 1e-12:
-        raise invalid_camera("up is a vector of three finite numbers, not all zero")
+        raise invalid_camera("up must be a vector of three finite numbers, not all zero")
     unit: Tensor = vector / vector.norm()
     return unit
 

@@ -155,7 +155,7 @@ def run_render(
     before: list[Picture] = []
     if request.before and request.edits:
         with work.stage("rendering before"):
-            # what the edits put before a camera may have stood round it
+            # what the edits put before a camera may have stood around it
             before = work.frames(rendered(scene, cut_away), "before", unit)
     work.pictures(after, before)
     if "mesh" in request.outputs:

@@ -24,7 +24,7 @@ from regnf_core.surface.sphere_tracing import Rays, finite_distance
 
 # How far whole bundles of neighboring rays are free: one evaluation of the field for many rays.
 #
-# A ball of radius D round the point at length t of a bundle's middle ray is free of surfaces. All its rays have the
+# A ball of radius D around the point at length t of a bundle's middle ray is free of surfaces. All its rays have the
 # same origin, and at length t none is farther from the middle one than t times the largest chord between their unit
 # directions. So all of them are free up to the length t + D - t chord. Where that is no more worth a step, the bundle
 # is divided into four. (Cone marching: Bastos and Celes 2012 for height fields; Hart 1996 for the balls.)
@@ -154,7 +154,7 @@ def surface_samples(region: Region, rays: Rays, start: Start) -> TileSamples:
 
 
 Part = NDArray[Any]
-"""(P, ...): one thing that is known of the pixels of a tile."""
+"""(P, ...): one object that is known of the pixels of a tile."""
 Progress = Callable[[float], None]
 """Called with the share done, 0..1, after each tile. May raise CancelledError to stop the work."""
 
@@ -216,7 +216,7 @@ def render_frames(
 
     def check() -> None:
         if cancelled is not None and cancelled():
-            raise CancelledError("the rendering was cancelled")
+            raise CancelledError("the rendering was canceled")
 
     def watched() -> Iterator[list[Part]]:
         done = in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
@@ -261,8 +261,12 @@ class Renderer:
             return
         if float(finite_distance(self.field, camera.position[None].float().to(self.field.device))[0]) <= 0.0:
             place = ", ".join(f"{value:.4g}" for value in position.tolist())
-            hint = "Move it into free space, or let what is before it be cut away: option cut_away."
-            raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_INVALID", hint=hint)
+            hint = (
+                "Move the camera into free space, or set the option cut_away, which removes the matter in front of it."
+            )
+            raise InvalidInputError(
+                f"the camera at ({place}) is inside solid matter", reason="CAMERA_INVALID", hint=hint
+            )
 
     def tiles(self, camera: Camera, processes: int) -> list[Tensor]:
         """The pixels of the frame in rectangles that fit the memory, and are enough for the processes."""

@@ -25,35 +25,37 @@ MOST_PIXELS_IN_ALL = 1 << 30
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Of all frames of one rendering."""
+    """Options of a rendering. They apply to all frames."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "use_attribute_docstrings": True}
 
     mode: Literal["surface", "volume"] = "surface"
-    """surface: where rays first meet the zero level. volume: NeuS's opacity along the ray; it shows how sharp a field
-    is, and takes three to four times as long."""
+    """surface: the first intersection of each ray with the zero level. volume: NeuS's opacity along the ray; it shows
+    how sharp a field is, and takes three to four times as long."""
     coloring: Literal["auto", "field", "shaded"] = "auto"
-    """auto: the field's colors where it has some, else shading. field: an error where it has none. shaded: never."""
+    """auto: the field's colors if it has colors, else shading. field: the field's colors, or an error if it has none.
+    shaded: always shading."""
     tints: bool = True
-    """Whether what was edited has its tint."""
+    """Whether edited objects are tinted."""
     antialias: Annotated[int, Ge(1), Le(4)] = 1
-    """Rays along each side of a pixel, for colors, normals and opacity; depths are of the pixels' middles or beside."""
+    """Rays along each side of a pixel, for colors, normals and opacity. Depths are those at the center of the pixel, or
+    next to it."""
     background: Rgb = (1.0, 1.0, 1.0)
-    """Where a ray meets nothing."""
+    """Color of a pixel whose ray hits no surface."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
-    """Where more light comes from, for shading; the scene's frame."""
+    """Direction of the light for shading, scene frame."""
     cut_away: bool = False
-    """Whether a camera may stand in matter, as one of an orbit always may: its rays then begin where they leave it.
-    Matter at the bounds is always cut away before a camera outside of them."""
+    """Whether a camera may be inside solid matter: its rays then start where they leave it. Cameras of an orbit always
+    may. For cameras outside of the bounds, matter at the bounds is always cut away."""
     inverse_deviation: Annotated[FiniteFloat, Gt(0), Le(1e9)] | None = None
-    """NeuS's s, per scene unit, for mode volume. None: the field's own where it was learned, else 2000 over its
-    bounds' diagonal."""
+    """NeuS's parameter s, per scene unit, for the mode volume. null: the learned value of the field, else 2000 divided
+    by the diagonal of its bounds."""
     memory_mb: Annotated[int, Ge(16), Le(65536)] = 256
-    """What a tile's rays may take, about. It bounds the size of tiles and changes nothing else."""
+    """Approximate memory for the rays of one tile, MB. It limits the size of tiles and does not change the picture."""
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RenderOptions:
-        """From plain (JSON) values. Raises InvalidOptionsError naming the first faulty one."""
+        """From plain (JSON) values. Raises InvalidOptionsError for the first invalid one."""
         try:
             return _OPTIONS_ADAPTER.validate_python(values)
         except ValidationError as error:
@@ -78,8 +80,8 @@ def check_extent(frames: int, pixels: int) -> None:
         (frames * pixels, MOST_PIXELS_IN_ALL, "pixels in all frames"),
     ):
         if count > most:
-            message = f"{count} {of}, at most {most} are rendered at once"
-            raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Ask for fewer or smaller frames.")
+            message = f"{count} {of}; one rendering can have at most {most}"
+            raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Request fewer or smaller frames.")
 
 
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -98,7 +100,7 @@ class OrbitRequest(Closed):
     """Cameras round one thing. edit: the number of an edit, whose object is looked at · detection: a box instead;
     neither: the first edit, or without edits the scene's bounds · elevation_deg: above the horizon · start_deg,
     sweep_deg: the first camera's turn about the vertical, and how far the last one is turned from it · distance: from
-    the thing's middle, scene units; None: all of it is in view."""
+    the instance's middle, scene units; None: all of it is in view."""
 
     edit: Annotated[int, Ge(0)] | None = None
     detection: Box = None
@@ -113,7 +115,7 @@ class OrbitRequest(Closed):
 
 @dataclass(frozen=True)
 class StationRequest(Closed):
-    """One place to look from. position, target: scene frame."""
+    """One camera. `position` and `target` are in the scene frame."""
 
     position: _Point
     target: _Point
@@ -127,7 +129,7 @@ class StationRequest(Closed):
 
 @dataclass(frozen=True)
 class PoseRequest(Closed):
-    """A camera whose pose and lens are known. T_scene_camera: rotation and place, OpenCV's axes (x right, y down, z
+    """A camera with known pose and intrinsics. T_scene_camera: rotation and position, OpenCV's axes (x right, y down, z
     forward) · intrinsics: fx, fy, cx, cy in pixels of an image of ``size`` (width, height)."""
 
     T_scene_camera: Rows
@@ -136,9 +138,9 @@ class PoseRequest(Closed):
 
     def __post_init__(self) -> None:
         if min(self.intrinsics[:2]) <= 0:
-            raise ValueError("focal lengths are above 0")
+            raise ValueError("focal lengths must be above 0")
         if abs(math.hypot(*(row[0] for row in self.T_scene_camera[:3])) - 1.0) > _UNIT:
-            raise ValueError("T_scene_camera has a scale, and a camera has none")
+            raise ValueError("T_scene_camera must not have a scale")
 
 
 @dataclass(frozen=True)
@@ -158,12 +160,12 @@ class RenderRequest(Closed):
     outputs: list[Output] = field(default_factory=lambda: ["color", "depth", "normal", "strip"])
     before: bool = True
     clear_unseen: bool = False
-    """Leave out the scene's matter where nothing was measured, where the scene knows that: fields invent it behind
-    things, and it hides them from there."""
+    """Whether unobserved matter of the scene is removed, if the scene has an observation. Networks invent such matter
+    behind objects, and it hides them from behind."""
     mesh_resolution: Annotated[int, Ge(2), Le(1024)] = 192
-    """Cells along the longest edge of the bounds, for ``mesh``."""
+    """Number of cells along the longest edge of the bounds, for ``mesh``."""
     field_resolution: Annotated[int, Ge(2), Le(1024)] = 192
-    """The same for ``field``."""
+    """Number of cells along the longest edge of the bounds, for ``field``."""
     seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
 
     @classmethod
@@ -171,7 +173,7 @@ class RenderRequest(Closed):
         """From plain values, all checked. Raises InvalidInputError naming the member: INVALID_OPTIONS, CAMERA_INVALID,
         EDIT_INVALID, INVALID_TRANSFORM, INVALID_DETECTION, RENDER_TOO_LARGE."""
         if not isinstance(values, dict):
-            raise InvalidOptionsError("a rendering is described by an object")
+            raise InvalidOptionsError("a rendering request must be an object")
         read_edits(values.get("edits", []))  # its own reasons
         try:
             request: RenderRequest = _ADAPTER.validate_python(values)
@@ -202,7 +204,7 @@ class RenderRequest(Closed):
     def check(self) -> None:
         """Raises InvalidInputError: CAMERA_INVALID, RENDER_TOO_LARGE."""
         if sum(one is not None for one in (self.orbit, self.look_at, self.poses)) > 1:
-            raise InvalidInputError("cameras: say one of orbit, look_at and poses", reason="CAMERA_INVALID")
+            raise InvalidInputError("cameras: give one of orbit, look_at and poses", reason="CAMERA_INVALID")
         edit = self.orbit.edit if self.orbit is not None else None
         if edit is not None and edit >= len(self.edits):
             raise InvalidInputError(f"orbit.edit: there is no edit {edit}", reason="CAMERA_INVALID")

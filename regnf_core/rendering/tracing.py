@@ -1,7 +1,7 @@
 """Where rays first meet a surface, with few evaluations of the field.
 
 Sphere tracing (Hart 1996) with automatic relaxation (Balint and Valasek 2018): the last two distances tell how fast a
-ray approaches; the step is as long as lets the spheres round its two ends just touch if that goes on. Where they turn
+ray approaches; the step is as long as lets the spheres around its two ends just touch if that goes on. Where they turn
 out not to touch, something may have been passed, and the ray goes back and takes the plain step.
 """
 

@@ -135,7 +135,7 @@ _HEADLIGHT, _SKY, _GROUND = 0.70, 0.34, 0.08
 _OWN_UNDER_TINT = 0.35
 """How much of a field's own color is left under a tint."""
 _SHARP = 2000.0
-"""Inverse deviation of a field that has none, times its bounds' diagonal: 90 % of the opacity within .3 % of it."""
+"""Inverse deviation of a field that has none, times its bounds' diagonal: 90 % of the opacity within 0.3 % of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +149,10 @@ class Painter:
 
     @classmethod
     def of(cls, field: SdfField, options: RenderOptions) -> Painter:
-        """Raises InvalidInputError (COLORS_MISSING): colors are asked for, and no part has any."""
+        """Raises InvalidInputError (COLORS_MISSING): colors are requested, and no part has any."""
         parts = field.parts if isinstance(field, PartedField) else (Part(field, None),)
         if options.coloring == "field" and not any(has_color(part.field) for part in parts):
-            hint = "Let it be shaded: coloring auto or shaded."
+            hint = "Use coloring auto or shaded."
             raise InvalidInputError("the field has no colors", reason="COLORS_MISSING", hint=hint)
         return cls(field, parts, up_vector(options.up).float(), options)
 

@@ -150,7 +150,7 @@ class RefinementConstants:
     unobserved_loss: float = 0.6  # largest loss of such a sample in the score [by hand, on objects known from one view]
     min_observed_share: float = 0.25  # of the object's samples: fewer observed ones weigh as if so many were [by hand]
     max_offset: float = 0.04  # diameters: largest offset between the two surfaces [early fits]
-    # Weight of "no offset", where one direction's samples weigh 1: round things may be larger as well as thicker.
+    # Weight of "no offset", where one direction's samples weigh 1: round objects may be larger as well as thicker.
     # [early fits]
     offset_prior: float = 0.02
     # The same where part of the scene was not observed: all that was seen from one side may be larger as well as
@@ -202,7 +202,7 @@ class SearchConstants:
     # Share of the box's edge: kernel width of the distance from the object's end to the box's face. [by hand, on random
     # worlds]
     box_width: float = 0.25
-    min_face_distance: float = 0.2  # diagonals: shorter edges count as so long; flat things' boxes are not [by hand]
+    min_face_distance: float = 0.2  # diagonals: shorter edges count as so long; flat objects' boxes are not [by hand]
     facing_cosine: float = -0.2  # of normal and line of sight, below: surface that faces the camera [by hand]
     seed_tolerance: float = 2.0  # so many times as far as poses may seeds, which are rough, leave the box [by hand]
     batch: int = 512  # poses at once: bounds memory, and stays in the processor's cache [by hand]
@@ -275,19 +275,20 @@ class VerdictConstants:
     usual_inliers: float = 0.6  # share of inliers in each direction, at least [main pairs]
     usual_unexplained: float = 0.1  # share of the surface near the object that is not the object's, at most [by hand]
     usual_explained: float = 0.4  # share of the surface in the box that the object explains, at least [main pairs]
-    # Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, the field
+    # Share of the object's samples. If there is no observation and more is hidden at the best pose, the field
     # itself says what was hidden, and the verdict is that of scenes of which it is known. Of the 282 right poses that
-    # the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth image]
+    # the other model is trained on 2 have more; of one depth image they have 0.6 to .9. [random worlds; one depth
+    # image]
     mostly_hidden: float = 0.5
     # Share of the surfaces of two candidates that differs and was seen, where they can be told apart: the least part of
     # a similar object is as large. [derived]
     min_deciding: float = 0.01
     most_differing: float = 0.5  # share of both surfaces: candidates that differ by more are not alike [by hand]
-    # Share of what was seen of the difference that must speak for the one more than for the other, to decide against
+    # Share of the observed difference that must support the one more than the other, to decide against
     # their probabilities. [by hand]
     min_favor: float = 0.2
     # Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
-    # better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right
+    # better pose, or one as good that makes this less likely. Of 113 poses of 0.8 to 0.95, 95 instead of 90 are right
     # after it, and 11 instead of 17 answers are wrong. [random worlds]
     doubtful: float = 0.95
     apart: float = 0.05  # diameters: poses farther apart cannot both be right, within 5 % of the truth [derived]
@@ -334,7 +335,7 @@ class CovarianceConstants:
     min_weight: float = 0.3  # kernel weight of an inlier; samples with less belong to something else [by hand]
     regularization: float = 1e-6  # relative, keeps matrices positive definite: far below every nugget [derived]
     # Distance of unit normals, about 35 degrees: how far surfaces may be turned from one another and still be off
-    # alike. The likelihood of the residuals has its maximum at .35 to .6. [random worlds]
+    # alike. The likelihood of the residuals has its maximum at 0.35 to .6. [random worlds]
     normals_length: float = 0.6
     # Of the covariance that the residuals tell. [random worlds, benchmarks/notes/covariance.md]
     residuals_factor: float = 3.8
@@ -361,7 +362,7 @@ class SamplingConstants:
 class SceneConstants:
     """What a detection shows of a scene (scene.py)."""
 
-    # Diagonals: so far in front of samples of a thing that images show is the object asked. The noise of depths is
+    # Diagonals: so far in front of samples of an instance that images show is the object asked. The noise of depths is
     # wider than thin walls: their other face would answer. [simulated frames]
     ahead_of_thing: float = 0.02
     # Of the option `scene_samples`: with fewer samples of what stands in the box, cells are halved. A halving makes
@@ -422,10 +423,11 @@ class OcclusionConstants:
     of a scene seen from one point (scene.py)."""
 
     # Of the distances from voxels with a measured surface to the nearest free one. The surface lies within a layer of
-    # such voxels, and those at its back are the farthest. .75 is too little for fits to a recorded kitchen. [by hand]
+    # such voxels, and those at its back are the farthest. 0.75 is too little for fits to a recorded kitchen. [by hand]
     clearance_quantile: float = 0.9
     # Voxels. One of the places at half of the clearance and at all of it in front of a surface element was seen to be
-    # free, or nobody saw the element from its front. The first lies beyond the surface's own voxel; next to a measured
+    # free, or no camera observed the element from its front. The first lies beyond the surface's own voxel; next
+    # to a measured
     # surface, a voxel may count as unobserved although it was seen. Compared with one and three voxels on random
     # worlds. [derived]
     min_clearance: float = 2.0

@@ -214,7 +214,8 @@ def _object_to_scene(
 
 
 def _hidden(A: Samples, cosines: Tensor) -> Tensor:
-    """(H, N) bool: which of the scene's samples nobody saw from their front, although the object faces another way."""
+    """(H, N) bool: which of the scene's samples no camera observed from their front, although the object faces another
+    way."""
     if A.hidden is None:
         return torch.zeros_like(cosines, dtype=torch.bool)
     return A.hidden & (cosines < EVIDENCE.min_inlier_cosine)

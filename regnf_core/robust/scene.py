@@ -288,7 +288,7 @@ class SceneView(Bundle):
 
     @property
     def of_thing(self) -> bool:
-        """Whether a detection in an image said which surface is the thing's, see
+        """Whether a detection in an image said which surface is the object's, see
         :class:`regnf_core.fields.observation.Observation`; the box has that camera's axes then."""
         return self.observation is not None and self.observation.of_thing
 
@@ -355,7 +355,7 @@ def _sampled_view(scene: SdfField, detection: OrientedBox, limit: int, further: 
         outside = ~((observed.points @ detection.rotation.to(observed.points)).abs() <= half).all(-1)
     edges = detection.rotation.mT * (detection.size / detection.diagonal)[:, None]
     foreground = observed
-    if observation is None or not observation.of_thing:  # else what the thing stands on is known
+    if observation is None or not observation.of_thing:  # else what the object stands on is known
         foreground = observed[~support_planes(observed, generator, edges, outside)]
     if len(foreground) < SCENE.min_foreground:
         foreground = observed if len(observed) >= SCENE.min_foreground else everything

@@ -270,7 +270,7 @@ class WorkingObservation:
 
 def not_finite() -> InvalidInputError:
     """For what a field said."""
-    return InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+    return InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
 
 
 # Samples of both surfaces, evenly spread over the surface in the region, with normals and exact field values.
@@ -353,7 +353,7 @@ def sample_scene_surface(
     low, high = -half, half
     known = observation_of(scene)
     if known is not None and known.of_thing and len(seen := known.measured()):
-        # Finely where the thing was seen, not where its back may be.
+        # Finely where the object was seen, not where its back may be.
         seen = frame.into(seen).double() @ rotation
         edge = known.voxel / detection.diagonal
         low, high = low.maximum(seen.amin(0) - edge), high.minimum(seen.amax(0) + edge)

@@ -96,9 +96,9 @@ class NetworkColor(Closed):
             require_shape(tensors, TABLE, (self.hash.entries, self.hash.features_per_level))
         check_layers(tensors, self.own_width + hidden_width)
         rows = count_rows(tensors, f"layers.{layers - 1}.weight")
-        require(rows == 3, f"the color's network has {rows} results, expected 3")
+        require(rows == 3, f"the color network has {rows} outputs, expected 3")
         if self.direction is not None and self.direction.encoding == "spherical_harmonics":
-            require(1 <= self.direction.degree <= 4, "spherical harmonics are known of degrees 1 to 4")
+            require(1 <= self.direction.degree <= 4, "spherical harmonics must have degree 1 to 4")
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def _similarity(rows: Rows) -> Rows:
 
 @dataclass(frozen=True)
 class Placement(Closed):
-    """How a field lies in its dataset's frame, where it is asked for in that."""
+    """How a field lies in its dataset's frame, where it is requested in that."""
 
     transform: Annotated[Rows, AfterValidator(_similarity)]
     """4 x 4 matrix of a similarity, row by row: takes points of the function's frame, after ``world_scale``, to

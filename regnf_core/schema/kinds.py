@@ -66,8 +66,8 @@ class MlpDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         layers = count_layers(tensors)
         require_layer_count(layers)
-        require(all(0 < i < layers for i in self.input_at), "input_at names the first layer or a missing one")
-        require(all(i < layers - 1 for i in self.normalized), "normalized names the last layer or a missing one")
+        require(all(0 < i < layers for i in self.input_at), "input_at has the first layer or a missing one")
+        require(all(i < layers - 1 for i in self.normalized), "normalized has the last layer or a missing one")
         norms = {f"norms.{i}.{part}" for i in self.normalized for part in ("weight", "bias")}
         require_names(tensors, layer_tensor_names(layers) | norms)
         check_layers(tensors, self.input_width, dict.fromkeys(self.input_at, self.input_width))
@@ -170,9 +170,9 @@ class OnnxDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         require_names(tensors, set(tensors), integers={name for name, spec in tensors.items() if spec.dtype == "I32"})
         numbers = sum(len(constant.values) for constant in self.constants.values())
-        require(numbers <= MAX_NUMBERS, f"the constants hold {numbers} numbers, at most {MAX_NUMBERS} are taken")
+        require(numbers <= MAX_NUMBERS, f"the constants hold {numbers} numbers; at most {MAX_NUMBERS} are allowed")
         given = [self.input, *tensors, *self.constants]
-        require(len(set(given)) == len(given), "two things of one name")
+        require(len(set(given)) == len(given), "two values have the same name")
         self._check_graph(dict.fromkeys(given, False) | {self.input: True})
 
     def _check_graph(self, by_points: dict[str, bool]) -> None:
@@ -181,13 +181,15 @@ class OnnxDescription(FieldDescription):
             where = f"node {number} ({node.op[:40]})"
             signature = OPERATORS.get(node.op)
             if signature is None:
-                require(False, f"{where}: no operator that is taken")
+                require(False, f"{where}: the operator is not supported")
                 continue
             require(signature.least <= len(node.inputs) <= signature.most, f"{where}: {len(node.inputs)} inputs")
             require(1 <= len(node.outputs) <= signature.outputs, f"{where}: {len(node.outputs)} outputs")
             known = all(name == "" or name in by_points for name in node.inputs)
-            require(known, f"{where}: an input that no node computes")
-            require(all(name and name not in by_points for name in node.outputs), f"{where}: an output made twice")
+            require(known, f"{where}: it has an input that no node computes")
+            require(
+                all(name and name not in by_points for name in node.outputs), f"{where}: its output is computed twice"
+            )
             moving = [by_points.get(name, False) for name in node.inputs]
             settled = not any(moving[i] for i in signature.settled if i < len(moving))
             require(settled, f"{where}: its shape would depend on the points")
@@ -252,7 +254,7 @@ class VoxelGridDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         require_names(tensors, {"values"} | (tensors.keys() & {WEIGHTS}))
         shape = tensors["values"].shape
-        require(len(shape) == 3 and min(shape) >= 2, f"values has shape {shape}, expected two nodes an axis at least")
+        require(len(shape) == 3 and min(shape) >= 2, f"values has shape {shape}, expected at least two nodes per axis")
         if WEIGHTS in tensors:
             require_shape(tensors, WEIGHTS, shape)
 
@@ -287,7 +289,7 @@ class NeuralPointsDescription(FieldDescription):
         points = count_rows(tensors, "points")
         require_shape(tensors, "points", (points, 3))
         shape = tensors["features"].shape
-        require(len(shape) == 2, f"features has shape {shape}, expected one row a point")
+        require(len(shape) == 2, f"features has shape {shape}, expected one row per point")
         require_shape(tensors, "features", (points, shape[1]))
         if self.oriented:
             require_shape(tensors, "orientations", (points, 4))

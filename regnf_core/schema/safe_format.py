@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# What a safe field file says about its tensors: which function they parametrize, and which shapes they must have.
+# What a regnf field file says about its tensors: which function they parametrize, and which shapes they must have.
 #
-# Torch-free: the import gate writes descriptions and the worker's parent reads them without loading torch.
+# Torch-free: the importer writes descriptions and the worker's parent reads them without loading torch.
 
 _MAX_DEPTH = 32
 
@@ -44,7 +44,7 @@ def parse_description(values: Any) -> FieldDescription:
     name = values.get("kind")
     described = KINDS.get(name) if isinstance(name, str) else None
     if described is None:
-        hint = " (did you mean `kind` where it says `family`?)" if name is None and "family" in values else ""
+        hint = " (did you mean `kind` instead of `family`?)" if name is None and "family" in values else ""
         raise FieldFormatError(f"unknown kind of field {name!r}{hint}", reason="FIELD_KIND_UNKNOWN")
     try:
         description = _adapter(described).validate_python(values)
@@ -135,7 +135,7 @@ def add_to_source(path: str | os.PathLike[str], notes: Mapping[str, Any]) -> Non
         entries["__metadata__"]["field"] = json.dumps(field, allow_nan=False, ensure_ascii=False)
         text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
         if len(text) > length:
-            raise FieldFormatError("the field file has no room for more notes", reason="SAFE_FORMAT_INVALID")
+            raise FieldFormatError("the field file cannot store more notes", reason="SAFE_FORMAT_INVALID")
         file.seek(8)
         file.write(text.ljust(length))
 
@@ -170,7 +170,7 @@ def read_header(path: str | os.PathLike[str]) -> tuple[FieldDescription, list[st
 def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
     version, text = metadata.get("regnf"), metadata.get("field")
     if version is None or text is None:
-        raise FieldFormatError("a safetensors file, but no regnf field", reason="SAFE_FORMAT_INVALID")
+        raise FieldFormatError("a safetensors file, but not a regnf field", reason="SAFE_FORMAT_INVALID")
     if version != FORMAT_VERSION:
         raise FieldFormatError(f"field format version {version[:20]!r} is not known", reason="SAFE_FORMAT_VERSION")
     if len(text) > _MAX_DESCRIPTION:

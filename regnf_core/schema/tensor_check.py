@@ -39,7 +39,7 @@ def require_names(tensors: Mapping[str, TensorSpec], names: Set[str], integers: 
 def require_shape(tensors: Mapping[str, TensorSpec], name: str, expected: tuple[int, ...]) -> None:
     """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless the tensor ``name`` has this shape."""
     shape = tensors[name].shape
-    require(shape == expected, f"{name} has shape {shape}, its description requires {expected}")
+    require(shape == expected, f"{name} has shape {shape}; its description requires {expected}")
 
 
 def count_rows(tensors: Mapping[str, TensorSpec], name: str) -> int:

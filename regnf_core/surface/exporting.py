@@ -29,7 +29,7 @@ def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     """
     kind = path.suffix.lower().removeprefix(".")
     if kind not in MESH_FORMATS:
-        raise InvalidInputError(f"no format for meshes: {path.suffix}", reason="INVALID_OPTIONS")
+        raise InvalidInputError(f"not a format for meshes: {path.suffix}", reason="INVALID_OPTIONS")
     field, origin = near_origin(field)
     surface = extract_surface(field, resolution, progress)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_normals=surface.normals, process=False)
@@ -91,7 +91,7 @@ def write_grid(field: SdfField, path: Path, resolution: int = 128, progress: Pro
         if progress is not None:
             progress(values[: rows[-1] + 1].size)
     if not np.isfinite(values).all():
-        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+        raise InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez(file, sdf=values, origin=lattice.low, spacing=np.full(3, lattice.step))
     return shape

@@ -106,7 +106,7 @@ class _Evaluator:
             self._count(len(chunk))
         values: Floats = np.concatenate(found)
         if not np.isfinite(values).all():
-            raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+            raise InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
         return values
 
     def normals(self, points: Floats) -> Floats:

@@ -78,7 +78,7 @@ def free_depths(field: SdfField, position: Tensor, directions: Tensor) -> tuple[
 
 
 _BASE = 40
-"""Voxels along the longest side of what was seen, before they are halved."""
+"""Voxels along the longest side of the observed region, before they are halved."""
 _POINTS_A_RAY = 12
 _RAYS_SHARE = 0.4
 """Of all evaluations, those for the images' rays. The surface's voxels take about as many, and the rest is for single
@@ -90,7 +90,7 @@ _MOST_CAMERAS, _RAYS_EACH = 128, 400
 _MARGIN = 1.0
 """Voxels before a surface that may be matter as well."""
 _CLOSE = 0.5
-"""Voxels behind the least depth of the rays round it at which a point is seen all the same."""
+"""Voxels behind the least depth of the rays around it at which a point is seen all the same."""
 _TRIES = 4
 """Cameras that a single point is looked for from."""
 _SEEING = 0.02
@@ -199,11 +199,11 @@ def _checked_sight(
     odds, sees = _odds(best, len(images)) / _odds(own, len(images)), 2 * seeing >= len(images)
     if sees and odds < _DOUBTFUL:
         return None
-    more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field, and {100 * best:.2g} % with {told}"
+    more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field; {100 * best:.2g} % with {told}"
     if sees:
         return f"CAMERAS_DOUBTFUL: {more}"
-    message = f"{len(images) - seeing} of {len(images)} cameras stand within matter or see no surface of the field"
-    message += f"; {more}" if told else ": are they of the same scene, in the same frame?"
+    message = f"{len(images) - seeing} of {len(images)} cameras are inside solid matter, or see no surface of the field"
+    message += f"; {more}" if told else ". Check that cameras and field are of the same scene, in the same frame"
     raise FieldFormatError(message, reason="CAMERAS_OF_ANOTHER_FRAME")
 
 
@@ -221,7 +221,7 @@ def _share_meeting(images: list[TracedDepths]) -> float:
 
 
 def _looked_through(points: Tensor, cameras: PinholeCameras, images: list[TracedDepths], margin: float) -> Tensor:
-    """(N,) bool: which points (N, 3) a camera looked through, before all of the rays round them by ``margin``."""
+    """(N,) bool: which points (N, 3) a camera looked through, before all of the rays around them by ``margin``."""
     through = torch.zeros(len(points), dtype=torch.bool)
     left = torch.arange(len(points))
     for camera, image in enumerate(images):

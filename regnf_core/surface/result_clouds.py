@@ -52,7 +52,7 @@ def mean_residual(
 #     0.5     MIN_SLOPE: clouds for viewers, an object's bounds
 #     0.2     samples for registration (robust/constants.py); shorter gradients are dropped there
 #     0.001   the surface beneath a sample (robust/constants.py): only a gradient of zero is left out
-#     1e-6    the import gate, which bounds the steps' length as well
+#     1e-6    the importer, which bounds the steps' length as well
 
 MIN_SLOPE = 0.5
 """Least |g| that is trusted. The gradient of an exact distance has length 1."""

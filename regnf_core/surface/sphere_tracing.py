@@ -156,7 +156,7 @@ def finite_distance(field: SdfField, points: Tensor) -> Tensor:
 def require_finite(distance: Tensor) -> None:
     """Raises InvalidInputError (FIELD_NOT_FINITE) for NaN or infinity."""
     if not torch.isfinite(distance).all():
-        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+        raise InvalidInputError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
 
 
 def first_hits(field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_step: float, tolerance: float) -> Hits:

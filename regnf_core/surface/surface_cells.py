@@ -87,7 +87,7 @@ class Cells(Bundle):
         return self[self.values.abs() <= _REACH * self.edge]
 
     def few_or_thin(self, enough: int) -> bool:
-        """Whether there are no more than ``enough`` cells, or the two faces of a thin thing share them."""
+        """Whether there are no more than ``enough`` cells, or the two faces of a thin object share them."""
         low, high = self.extent()
         return len(self.values) <= enough or float((high - low).min()) < _THIN * self.edge
 

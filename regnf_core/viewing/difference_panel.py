@@ -24,8 +24,8 @@ STATE_COLORS = np.array([(0.00, 0.45, 0.30), (0.84, 0.15, 0.12), (0.47, 0.44, 0.
 FILL = 0.7
 """Share of the panel that the surfaces may fill: the legend stands below them."""
 _RAISED = 0.06  # share of the panel
-_SAID = {SHOWN: "the scene shows it", ABSENT: "the scene is free there", UNKNOWN: "not seen, or not clear"}
-_DRAWN = ("only the first has it", "only the second has it", "the first (faint: behind it)")
+_SAID = {SHOWN: "observed in the scene", ABSENT: "free space in the scene", UNKNOWN: "unobserved or unclear"}
+_DRAWN = ("only the first has it", "only the second has it", "the first (faint: hidden)")
 _BODY_COLOR = (0.93, 0.935, 0.94)
 _SWATCH = (0.76, 0.77, 0.78)  # as the body looks in the shade
 _DOT = 0.012  # of the panel's edge: radius of a dot
@@ -51,9 +51,9 @@ class Deciding:
         """For which candidate it speaks, as a sentence: for the one whose surface is there, or the other's is not."""
         seen = self.states != UNKNOWN
         if not self.distinguishable or not seen.any():
-            return "Too little of it was seen to tell the two apart."
+            return "Too little of the difference was observed to distinguish the two."
         for_first = float(((self.states == SHOWN) != self.of_other)[seen].mean())
-        return f"Of what was seen, {100 * for_first:.0f} % speaks for the first."
+        return f"{100 * for_first:.0f} % of the observed difference supports the first."
 
 
 def difference_panel(

@@ -164,7 +164,7 @@ def _own_triangles(field: SdfField) -> Triangles | None:
 
 def _extracted(field: SdfField, budget_s: float) -> DisplayMeshes:
     if budget_s <= 0.0:
-        raise TooSlowError("the field is too slow to be drawn")
+        raise TooSlowError("the field is too slow to draw")
     began = time.process_time()
     clock = _Clock(began + 2.0 * budget_s)  # an estimate may be wrong: what is nearly done is not thrown away
     coarse = _surface(field, _COARSE_CELLS, clock)
@@ -191,7 +191,7 @@ class _Clock:
     def __call__(self, evaluations: int) -> None:
         del evaluations
         if time.process_time() > self.end:
-            raise TooSlowError("the field is too slow to be drawn")
+            raise TooSlowError("the field is too slow to draw")
 
 
 def _surface(field: SdfField, cells: int, clock: _Clock) -> Triangles:
@@ -209,9 +209,9 @@ _BUDGET_S = 5.0
 
 
 def field_views(path: Path) -> FieldViews:
-    """Draw the safe field in the file ``path``. What cannot be drawn in good time is left out.
+    """Draw the regnf field file in the file ``path``. What cannot be drawn in good time is left out.
 
-    Raises FieldFormatError for a file that is no safe field.
+    Raises FieldFormatError for a file that is no regnf field file.
     """
     field, up_axis = open_field(path), read_description(path)["up_axis"]
     fine = coarse = None

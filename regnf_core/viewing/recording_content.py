@@ -47,12 +47,12 @@ def verdict_text(result: RegistrationResult, object_name: str | None = None) -> 
         lines += [f"Object: `{object_name}`", ""]
     if result.probability is not None:
         sure = f"{_percent(result.probability)}, {level_in_words(result.level)}"
-        lines += [f"Probability that the answer is right: {sure}", ""]
+        lines += [f"Probability that the pose is within 5 % of the object's diameter: {sure}", ""]
     lines += ["T_scene_object, the object's pose in the scene (object coordinates to scene coordinates):", "", "```"]
     lines += [" ".join(f"{value: .6f}" for value in row) for row in result.T_scene_object.matrix().tolist()]
     lines += ["```", ""]
     if result.considered is not None:
-        lines += ["Poses that were judged (`scene/considered`):", "", "| | probability | reason | |"]
+        lines += ["Candidate poses (`scene/considered`):", "", "| | probability | reason | |"]
         lines += ["|---|---|---|---|"]
         lines += [
             f"| {number} | {_percent(one.metrics.get('probability'))} | {one.reason} | "
@@ -77,8 +77,8 @@ def recorded(result: RegistrationResult, detection: OrientedBox | None, object_n
     """The content of an .rrd file. Raises InvalidInputError (RECORDING_DISABLED)."""
     stream = rr.RecordingStream("regnf")
     if not rr.is_enabled(stream):
-        hint = "Unset RERUN in the environment, which turns rerun off."
-        raise InvalidInputError("rerun is turned off", reason="RECORDING_DISABLED", hint=hint)
+        hint = "Unset the environment variable RERUN, which disables rerun."
+        raise InvalidInputError("rerun is disabled", reason="RECORDING_DISABLED", hint=hint)
     memory = stream.memory_recording()
     try:
         stream.set_log_time_enabled(False)

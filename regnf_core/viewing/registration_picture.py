@@ -234,7 +234,7 @@ def _captions(sheet: Image.Image, shown: _Shown) -> None:
         ("Residual", "|S_object(T x) - s S_scene(x)|"),
     ]
     if shown.deciding is not None:
-        texts.append(("Where the first two candidates differ", shown.deciding.conclusion()))
+        texts.append(("Difference between the first two candidates", shown.deciding.conclusion()))
     for number, (heading, note) in enumerate(texts):
         left = number * _PANEL + 24
         draw.text((left, 16), heading, fill=_INK, font=title)

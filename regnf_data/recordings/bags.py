@@ -142,7 +142,7 @@ def _recording(bag: Bag, name: str, given: Given) -> Recording:
     camera = given.camera or (_camera(info, depth.topic) if info is not None else None)
     if camera is None:
         raise DatasetError(
-            f"{name}: {depth.topic} has no CameraInfo beside it: give --intrinsics fx,fy,cx,cy",
+            f"{name}: {depth.topic} has no CameraInfo: give --intrinsics fx,fy,cx,cy",
             reason="DATASET_INTRINSICS_INVALID",
         )
     poses, how = _poses(bag, frame_id, stamps)
@@ -150,7 +150,7 @@ def _recording(bag: Bag, name: str, given: Given) -> Recording:
     color = _color_topic(bag, depth)
     color_times, color_camera, same = _color_side(bag, color, frame_id)
     if color is not None and not same:
-        notes.append(f"{color.topic} is taken as seen from the depth camera's place")
+        notes.append(f"{color.topic} is assumed to be taken from the position of the depth camera")
     frames: list[StoredFrame | None] = []
     for index, (stamp, time, pose) in enumerate(zip(stamps, times, poses, strict=True)):
         if pose is None:
@@ -268,7 +268,7 @@ def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str
     links = _links(bag)
     chain, at = _chain(links, frame)
     if any(not link.static for link in chain):
-        return _chained(chain, stamps), f"poses are tf's, from {at!r} to {frame!r}"
+        return _chained(chain, stamps), f"poses are from tf, {at!r} to {frame!r}"
     odometry = bag.of_type(*_POSES)
     if odometry:
         best = max(odometry, key=lambda each: (each.msgtype == _POSES[0], each.msgcount))
@@ -276,14 +276,14 @@ def _poses(bag: Bag, frame: str, stamps: Array) -> tuple[list[Array | None], str
         below, at = _chain(links, frame, child)
         if child and at != child:
             below = []
-        return _chained([*below, body], stamps), f"poses are those of {best.topic}" + (
+        return _chained([*below, body], stamps), f"poses are from {best.topic}" + (
             ""
             if not child or below or frame == child
-            else f", taken for the camera's: no tf leads from {child!r} to {frame!r}"
+            else f", assumed to be those of the camera: tf has no transform from {child!r} to {frame!r}"
         )
     if len(stamps) == 1 or chain:
-        return _chained(chain, stamps), "no tf and no odometry moves: the camera is taken to stand still"
-    return [np.eye(4) for _ in stamps], "the bag has no poses: use one frame at a time"
+        return _chained(chain, stamps), "tf and odometry do not change: the camera is assumed to be static"
+    return [np.eye(4) for _ in stamps], "the bag has no poses: register in one frame at a time"
 
 
 def _chain(links: dict[str, Link], frame: str, top: str | None = None) -> tuple[list[Link], str]:
@@ -359,7 +359,7 @@ def _compressed_depth(message: Any, name: str, unit: float) -> NDArray[np.float3
         data = bytes(_DEPTH_HEAD.size) + data
     if "rvl" in message.format.lower() or len(data) < _DEPTH_HEAD.size:
         raise DatasetError(
-            f"{name}: depth compressed as {message.format!r:.60} is not read", reason="DATASET_IMAGE_INVALID"
+            f"{name}: depth compressed as {message.format!r:.60} is not supported", reason="DATASET_IMAGE_INVALID"
         )
     _, a, b = _DEPTH_HEAD.unpack_from(data)
     stored = _decoded(data[_DEPTH_HEAD.size :], name)
@@ -391,7 +391,7 @@ def _pixels(message: Any, name: str) -> NDArray[Any]:
     """(H, W) or (H, W, C) of a sensor_msgs/Image."""
     if message.encoding not in _CODINGS:
         raise DatasetError(
-            f"{name}: images of the encoding {message.encoding!r:.40} are not read", reason="DATASET_IMAGE_INVALID"
+            f"{name}: images of the encoding {message.encoding!r:.40} are not supported", reason="DATASET_IMAGE_INVALID"
         )
     kind, channels = _CODINGS[message.encoding]
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")

@@ -64,7 +64,7 @@ class Camera:
             return replace(self, size=size)
         down, across = size[0] / self.size[0], size[1] / self.size[1]
         if abs(math.log(down / across)) > 0.02:
-            turned = "are its width and height exchanged?" if self.size == size[::-1] else "not the same shape"
+            turned = "check whether width and height are swapped" if self.size == size[::-1] else "not the same shape"
             raise DatasetError(
                 f"{name}: the image has {size[1]} x {size[0]} pixels (width x height), its camera"
                 f" {self.size[1]} x {self.size[0]}: {turned}",
@@ -118,7 +118,7 @@ class Camera:
             said = f"focal lengths {K[0, 0]:g}, {K[1, 1]:g}; last row {K[2].tolist()}"
             raise DatasetError(f"{name}: the intrinsics are not a camera matrix: {said}", reason=_INVALID)
         if K[:2].max() < _LEAST_PIXELS:
-            said = "are shares of the image: multiply fx and cx by its width, fy and cy by its height"
+            said = "are relative to the image size: multiply fx and cx by its width, fy and cy by its height"
             raise DatasetError(f"{name}: the intrinsics {said}", reason=_INVALID)
         if abs(K[0, 1]) > 1e-3 * K[0, 0]:
             raise DatasetError(f"{name}: the camera's axes are skewed", reason="DATASET_CAMERA_UNSUPPORTED")
@@ -132,7 +132,7 @@ class Camera:
             if self.off_middle(self.size) > _OFF_MIDDLE:
                 raise DatasetError(
                     f"{name}: the principal point ({K[0, 2]:g}, {K[1, 2]:g}) is not inside the image, {width} x"
-                    f" {height}: are the intrinsics those of another resolution?",
+                    f" {height}. Check whether the intrinsics are for another resolution.",
                     reason=_INVALID,
                 )
             self._check_lens(name)
@@ -153,7 +153,7 @@ class Camera:
             off = np.abs(self._bent(slopes) - aim).max()
         if not off < 0.02:
             raise DatasetError(
-                f"{name}: the lens is beyond what its model can undo", reason="DATASET_CAMERA_UNSUPPORTED"
+                f"{name}: the distortion of the lens is too large for its model", reason="DATASET_CAMERA_UNSUPPORTED"
             )
 
     def _bent(self, slopes: Array) -> Array:
@@ -257,7 +257,10 @@ def camera_of_values(values: Any, name: str) -> CameraFile | None:
             stated = _first(each, "depth_scale", "depth_units", "scale", "depth_unit", "DepthMapFactor")
             unit = _NAMED_UNITS.get(str(each.get("depth_unit"))) or depth_unit(stated)
             if unit is None and each.get("depth_unit") is not None:
-                told = f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters a step, as 0.001, or mm"
+                told = (
+                    f"{name}: depth_unit {str(each['depth_unit'])[:40]!r}: expected meters per step such as 0.001,"
+                    f" or mm"
+                )
                 raise DatasetError(told, reason=_INVALID)
             return CameraFile(camera, unit, each.get("T_world_camera"))
     return None
@@ -318,7 +321,7 @@ def _matrix(values: Mapping[str, Any], name: str) -> Array | None:
         if matrix.shape == (4,):
             return np.array([[matrix[0], 0.0, matrix[2]], [0.0, matrix[1], matrix[3]], [0.0, 0.0, 1.0]])
         if value is not None and matrix.dtype.kind == "f" and matrix.size:
-            raise DatasetError(f"{name}: {key} is no camera matrix: {matrix.size} numbers", reason=_INVALID)
+            raise DatasetError(f"{name}: {key} is not a camera matrix: {matrix.size} numbers", reason=_INVALID)
     return None
 
 
@@ -342,16 +345,16 @@ def lens_of(coefficients: Any, fisheye: bool, name: str) -> tuple[Lens, tuple[fl
     try:
         numbers = tuple(float(value) for value in coefficients)
     except (TypeError, ValueError) as error:
-        raise DatasetError(f"{name}: the lens's coefficients are no numbers", reason=_INVALID) from error
+        raise DatasetError(f"{name}: the distortion coefficients are not numbers", reason=_INVALID) from error
     if not any(numbers):
         return "none", ()
     if not all(map(math.isfinite, numbers)):
-        raise DatasetError(f"{name}: the lens's coefficients are not finite", reason=_INVALID)
+        raise DatasetError(f"{name}: the distortion coefficients are not finite", reason=_INVALID)
     if fisheye:
         return "fisheye", (*numbers, 0.0, 0.0, 0.0, 0.0)[:4]
     if any(numbers[8:]):
         raise DatasetError(
-            f"{name}: a lens of {len(numbers)} coefficients: up to eight are modeled",
+            f"{name}: {len(numbers)} distortion coefficients: at most eight are supported",
             reason="DATASET_CAMERA_UNSUPPORTED",
         )
     return "brown", numbers[:8]
@@ -365,7 +368,7 @@ _NAMED = re.compile(r"\b(f[xy]|c[xy]|pp[xy]|width|height)\s*[:=]\s*([-+.\deE]+)"
 
 
 def _numbers(line: str) -> list[float]:
-    """A line's numbers; none where a word is no number."""
+    """A line's numbers; none where a word is not a number."""
     try:
         return [float(word) for word in _WORDS.split(line) if word]
     except ValueError:

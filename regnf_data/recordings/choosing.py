@@ -75,7 +75,7 @@ def choose_frames(
                 f"{recording.name}: no frame shows a surface in the box", reason="DATASET_NOTHING_IN_BOUNDS"
             )
     edge = float((bounds[1] - bounds[0]).max() if box is None else box.size.max()) / _CELLS_ACROSS
-    # Two frames of a room see a wall alike; of a thing in a box, the one with the narrower pixels counts for more.
+    # Two frames of a room see a wall alike; of an object in a box, the one with the narrower pixels counts for more.
     worth = [1.0 if box is None else sharp for _, sharp in seen]
     picked = _greedy([_cells(each, edge) for each in points], worth, most)
     return Chosen(tuple(sorted(looked_at[each] for each in picked)), bounds)

@@ -47,8 +47,8 @@ def mask_of(value: Any, size: Size | None = None) -> Mask:
                     return _of_picture(image)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             known = ", ".join(_MASK_FORMATS)
-            raise InvalidDetectionError(f"the mask is no image of the kinds {known}, as base64") from error
-    said = f"the mask is no file, no image as base64 and no run lengths of COCO: {str(value)[:80]!r}"
+            raise InvalidDetectionError(f"the mask is not a base64 image of these types: {known}") from error
+    said = f"the mask is not a file, not a base64 image and not a run-length encoding of COCO: {str(value)[:80]!r}"
     raise InvalidDetectionError(said, hint=HINT)
 
 
@@ -70,7 +70,7 @@ def _run_lengths(value: Mapping[str, Any]) -> Mask:
         counts = value["counts"]
         lengths = _text_lengths(counts) if isinstance(counts, str) else [int(count) for count in counts]
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InvalidDetectionError(f"the mask's run lengths cannot be read: {error}") from error
+        raise InvalidDetectionError(f"the mask's run-length encoding cannot be read: {error}") from error
     within = height > 0 and width > 0 and height * width <= MOST_PIXELS
     if not within or min(lengths, default=0) < 0 or sum(lengths) != height * width:
         raise InvalidDetectionError(f"the mask's runs have {sum(lengths)} pixels, its size {width} x {height}")
@@ -109,9 +109,9 @@ def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
             flat = [[number * size[1 - at % 2] for at, number in enumerate(polygon)] for polygon in flat]
         height, width = (int(side) for side in size) if size else (int(reach) + 2, int(reach) + 2)
     except (TypeError, ValueError) as error:
-        raise InvalidDetectionError("the mask's polygons are not lists of x, y, x, y ...", hint=HINT) from error
+        raise InvalidDetectionError("the polygons of the mask are not lists x, y, x, y ...", hint=HINT) from error
     if any(len(polygon) < 6 or len(polygon) % 2 for polygon in flat) or not 0 < height * width <= MOST_PIXELS:
-        raise InvalidDetectionError("a mask's polygon has three corners at least", hint=HINT)
+        raise InvalidDetectionError("a polygon of a mask needs at least three corners", hint=HINT)
     image = Image.new("1", (width, height))
     for polygon in flat:
         ImageDraw.Draw(image).polygon(polygon, fill=1)
@@ -121,7 +121,7 @@ def _polygon(polygons: Sequence[Any], size: Any) -> Mask:
 # Lifting.
 
 _FEWEST = 30
-"""Measured pixels of a thing, at least."""
+"""Measured pixels of an object, at least."""
 _JUMP = 0.015
 """A share of the depth: neighbors that differ by more lie on different surfaces."""
 _AROUND, _EDGE = 0.5, 8
@@ -134,7 +134,7 @@ _PLANE_SHARE = 0.15
 _WHOLE, _MOSTLY = 0.9, 0.5
 """Shares of a surface within the detection: it ends there; it belongs to what is detected."""
 _LONGER = 1.2
-"""Diameters of the thing: a surface that is longer is not its own."""
+"""Diameters of the object: a surface that is longer is not its own."""
 _BEHIND = 0.2
 """Of what is in the middle of a detection, behind a plane of its background, at most."""
 _TRIMMED = 0.01
@@ -144,8 +144,8 @@ _LOOSE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """box: around the thing, in the world · points: (P, 3), of its surface, world · pixels: (H, W) of the depth image,
-    those of the thing · frame: in which."""
+    """box: around the object, in the world · points: (P, 3), of its surface, world · pixels: (H, W) of the depth image,
+    those of the object · frame: in which."""
 
     box: OrientedBox
     points: Array
@@ -156,8 +156,8 @@ class Lifted:
 @dataclass(frozen=True, eq=False)
 class _Part:
     """Of an image, around a detection, (h, w) pixels. depth: 0 for none · points: (h, w, 3), camera frame · inside:
-    what is detected · seed: the pixel (row, column) that it points at · clicked: whether that one is the thing's ·
-    diameter: the thing's, m."""
+    what is detected · seed: the pixel (row, column) that it points at · clicked: whether that one is the object's ·
+    diameter: the object's, m."""
 
     depth: NDArray[np.float32]
     points: Array
@@ -168,12 +168,12 @@ class _Part:
 
 
 def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None) -> Lifted:
-    """The thing of a detection, in space. diameter: of the known object, m, where its size is known.
+    """The instance of a detection, in space. diameter: of the known object, m, where its size is known.
 
     The depth in a mask, in a box or around a point falls into connected surfaces, without the planes that go on around
-    it (a table, a wall). The thing is the surface that fills most of the detection and does not go on beyond it: where
-    it ends a few pixels beyond an outline, the outline is taken to be off. Its box has the camera's axes; behind, it
-    reaches as far as the thing is wide, since its back was not seen.
+    it (a table, a wall). The instance is the surface that fills most of the detection and does not go on beyond it:
+    where it ends a few pixels beyond an outline, the outline is taken to be off. Its box has the camera's axes; behind,
+    it reaches as far as the instance is wide, since its back was not seen.
     Raises InvalidDetectionError, naming the frame, for detections without depth or of another size than the image.
     """
     region, seed = _region(frame, detection)
@@ -182,7 +182,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
         raise _without_depth(frame, f"{int(measured.sum())} of {int(region.sum())} pixels of the detection")
     clicked = detection.point_2d is not None
     if clicked and seed is not None and diameter is not None:
-        # Nothing of a thing that was clicked on is farther from the click than its diameter.
+        # Nothing of an object that was clicked on is farther from the click than its diameter.
         here = _points(frame, measured)
         rows, columns = np.nonzero(measured)
         middle = here[np.hypot(rows - seed[0], columns - seed[1]).argmin()]
@@ -198,12 +198,12 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
     pixels[window] = _thing(_Part(frame.depth[window], points, region[window], moved, clicked, diameter or np.inf))
     camera_points = points[pixels[window]]
     if diameter is not None and len(camera_points):
-        # Nothing of the thing is farther from its middle than its diameter.
+        # Nothing of the object is farther from its middle than its diameter.
         near = np.linalg.norm(camera_points - np.median(camera_points, axis=0), axis=1) <= diameter
         pixels[pixels] = near
         camera_points = camera_points[near]
     if len(camera_points) < _FEWEST:
-        raise _without_depth(frame, f"{len(camera_points)} of the thing's pixels")
+        raise _without_depth(frame, f"{len(camera_points)} of the object's pixels")
     low, high = (np.quantile(camera_points, share, axis=0) for share in (_TRIMMED, 1.0 - _TRIMMED))
     behind = max(float((high - low)[:2].max()), diameter or 0.0)
     high[2] = max(high[2], low[2] + behind)
@@ -215,7 +215,7 @@ def lift(frame: Frame, detection: ImageDetection, diameter: float | None = None)
 
 
 def _without_depth(frame: Frame, said: str) -> InvalidDetectionError:
-    said = f"frame {frame.name}: depth was measured in {said}; {_FEWEST} are needed"
+    said = f"frame {frame.name}: depth was measured in {said}; at least {_FEWEST} are required"
     return InvalidDetectionError(said, reason="DETECTION_WITHOUT_DEPTH")
 
 
@@ -236,7 +236,9 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
         if not mask.any():
             raise InvalidDetectionError(f"frame {frame.name}: the mask is empty")
         if not mask.all() and mask[[0, -1]].all() and mask[:, [0, -1]].all():
-            raise InvalidDetectionError(f"frame {frame.name}: the mask is true all along the border: is it inverted?")
+            raise InvalidDetectionError(
+                f"frame {frame.name}: the mask is true along the whole border. Check whether it is inverted."
+            )
         return frame.registered(mask), None
     mask = np.zeros(given, dtype=np.bool_)
     if detection.box_2d is not None:
@@ -246,14 +248,14 @@ def _region(frame: Frame, detection: ImageDetection) -> tuple[Mask, tuple[float,
         columns, rows = (np.clip([a, b], 0, side) for a, b, side in ((left, right, width), (top, bottom, height)))
         mask[int(rows[0]) : int(np.ceil(rows[1])), int(columns[0]) : int(np.ceil(columns[1]))] = True
         if not mask.any():
-            raise InvalidDetectionError(f"frame {frame.name}: the box lies outside the image, {width} x {height}")
+            raise InvalidDetectionError(f"frame {frame.name}: the box is outside the image, {width} x {height}")
         middle = ((rows[0] + rows[1]) / 2.0, (columns[0] + columns[1]) / 2.0)
     else:
         assert detection.point_2d is not None
         u, v = detection.point_2d
         if not (0 <= u < width and 0 <= v < height):
             raise InvalidDetectionError(
-                f"frame {frame.name}: the point ({u:g}, {v:g}) lies outside the image of {width} x {height} pixels"
+                f"frame {frame.name}: the point ({u:g}, {v:g}) is outside the image of {width} x {height} pixels"
             )
         mask[:] = True
         middle = (v, u)
@@ -277,7 +279,7 @@ def _window(region: Mask) -> tuple[slice, slice]:
 
 
 def _thing(part: _Part) -> Mask:
-    """(h, w): the pixels of the thing."""
+    """(h, w): the pixels of the object."""
     measured = part.depth > 0.0
     kept = measured & ~_background(part)
     if (kept & part.inside).sum() < _FEWEST:
@@ -296,7 +298,7 @@ def _thing(part: _Part) -> Mask:
     total, held = (np.bincount(labels, each, minlength=count) for each in (None, inside))
     share = held / np.maximum(total, 1)
     best = int((np.bincount(labels, weight, minlength=count) * share**2).argmax())
-    # Something thin before it may part the thing: pieces at its depth belong to it.
+    # Something thin before it may part the object: pieces at its depth belong to it.
     depths = part.depth[kept]
     low, high = np.quantile(depths[labels == best], [0.05, 0.95])
     reach = max(high - low, _JUMP * high)
@@ -360,7 +362,7 @@ def _extent(points: Array) -> float:
 
 
 def _middle(part: _Part, own: Mask) -> Mask:
-    """Of the measured pixels ``own`` of a detection, those that are surely the thing's, or nearly so."""
+    """Of the measured pixels ``own`` of a detection, those that are surely the object's, or nearly so."""
     if part.seed is None:
         core = own & (ndimage.distance_transform_edt(part.inside) > _EDGE)
         return core if core.sum() >= _FEWEST else own

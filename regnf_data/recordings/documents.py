@@ -45,7 +45,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 def _object(path: Path) -> dict[str, Any]:
     values = read_json(path)
     if not isinstance(values, dict):
-        raise DatasetError(f"{path.name} is no JSON object", reason=_INVALID)
+        raise DatasetError(f"{path.name} is not a JSON object", reason=_INVALID)
     return values
 
 
@@ -62,16 +62,14 @@ def read_bop(folder: Path, given: Given) -> Recording:
     cameras = _object(folder / "scene_camera.json")
     depths, colors = folder / "depth", _subfolder(folder, ("rgb", "gray"))
     if not depths.is_dir():
-        raise DatasetError(
-            f"{folder.name} has no depth images: a scene of colors alone", reason="DATASET_DEPTH_MISSING"
-        )
+        raise DatasetError(f"{folder.name} has no depth images, only color images", reason="DATASET_DEPTH_MISSING")
     frames: list[StoredFrame | None] = []
     unplaced = 0
     for key in sorted(cameras, key=lambda each: (not each.isdigit(), each.zfill(12))):
         values = cameras[key]
         name = key.zfill(6)
         if not isinstance(values, dict):
-            raise DatasetError(f"scene_camera.json: {key} is no camera", reason=_INVALID)
+            raise DatasetError(f"scene_camera.json: {key} is not a camera", reason=_INVALID)
         camera = given.camera or _bop_camera(values, name)
         unit = given.depth_unit or 0.001 * float(values.get("depth_scale", 1.0))
         pose: Array | None = np.eye(4)
@@ -82,7 +80,7 @@ def read_bop(folder: Path, given: Given) -> Recording:
                 matrix[:3, 3] = np.array(values["cam_t_w2c"], np.float64)
             except (TypeError, ValueError) as error:
                 raise DatasetError(
-                    f"scene_camera.json: the pose of {key} is no 9 and 3 numbers", reason=_INVALID
+                    f"scene_camera.json: the pose of {key} is not 9 and 3 numbers", reason=_INVALID
                 ) from error
             pose = pose_of(matrix, name, inverse=True, unit=0.001)
         else:
@@ -92,7 +90,9 @@ def read_bop(folder: Path, given: Given) -> Recording:
         frames.append(frame_of(name, camera, pose, depth, unit, color))
     notes = []
     if unplaced and len(cameras) > 1:
-        notes.append(f"{unplaced} of {len(cameras)} frames have no pose in a common world: use one frame at a time")
+        notes.append(
+            f"{unplaced} of {len(cameras)} frames have no pose in a common world frame: register in one frame at a time"
+        )
     return recording_of(folder.name, "BOP", frames, notes)
 
 
@@ -132,8 +132,8 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
     named = [each for each in listed if each.get("depth_file_path") or each.get("depth_path")]
     if not named:
         raise DatasetError(
-            f"{file.name} names no depth images (depth_file_path): colors alone make no map. Name one"
-            " for each frame, beside its file_path",
+            f"{file.name} has no depth images (depth_file_path), which a map needs. Give one for each frame, next to "
+            f"its file_path",
             reason="DATASET_DEPTH_MISSING",
         )
     frames: list[StoredFrame | None] = []
@@ -167,7 +167,7 @@ _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIA
 
 
 def _unsupported(name: str, model: str) -> DatasetError:
-    said = f"{name}: cameras of the model {model[:40]} are not modeled"
+    said = f"{name}: cameras of the model {model[:40]} are not supported"
     return DatasetError(said, reason="DATASET_CAMERA_UNSUPPORTED")
 
 
@@ -298,7 +298,9 @@ def _dense(path: Path) -> NDArray[np.float32]:
             values = np.fromfile(file, np.float32, width * height * channels)
             depth = values.reshape(height, width) if channels == 1 else None
     except ValueError as error:
-        raise DatasetError(f"{path.name} is no depth map of COLMAP: {error}", reason="DATASET_IMAGE_INVALID") from error
+        raise DatasetError(
+            f"{path.name} is not a depth map of COLMAP: {error}", reason="DATASET_IMAGE_INVALID"
+        ) from error
     if depth is None:
         raise DatasetError(f"{path.name} has {channels} channels", reason="DATASET_IMAGE_INVALID")
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
@@ -333,7 +335,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         except (IndexError, ValueError) as error:
             if isinstance(error, DatasetError):
                 raise
-            raise DatasetError(f"{path.name}: {line[:60]!r} is no camera", reason=_INVALID) from error
+            raise DatasetError(f"{path.name}: {line[:60]!r} is not a camera", reason=_INVALID) from error
 
 
 Image = tuple[str, int, Array, Array]
@@ -352,7 +354,7 @@ def _text_images(path: Path) -> Iterator[Image]:
             w, x, y, z, *place = (float(word) for word in words[1:8])
             yield words[9], int(words[8]), np.array([x, y, z, w]), np.array(place)
         except (IndexError, ValueError) as error:
-            raise DatasetError(f"{path.name}: {line[:60]!r} is no image", reason=_INVALID) from error
+            raise DatasetError(f"{path.name}: {line[:60]!r} is not an image", reason=_INVALID) from error
 
 
 def _unpack(file: BinaryIO, form: str, name: str) -> tuple[Any, ...]:

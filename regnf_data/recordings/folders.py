@@ -69,7 +69,7 @@ def _tum_poses(folder: Path) -> Path | None:
 def read_tum(folder: Path, given: Given) -> Recording:
     """Poses between time stamps are interpolated."""
     published = next((value for part, value in _TUM_CAMERAS.items() if part in folder.resolve().name), None)
-    note = "the folder has no intrinsics: those that the benchmark publishes for it are taken"
+    note = "the folder has no intrinsics: the published ones of the benchmark are used"
     camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _TUM_STEP_M, published, note)
     depths, colors = _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
     color_stamps = np.array([stamp for stamp, _ in colors])
@@ -80,7 +80,7 @@ def read_tum(folder: Path, given: Given) -> Recording:
         first, last = depths[0][0], depths[-1][0]
         raise DatasetError(
             f"{folder.name}: the images are from {first:.2f} to {last:.2f} s, the poses from {stamps[0]:.2f} to"
-            f" {stamps[-1]:.2f} s: none belong together",
+            f" {stamps[-1]:.2f} s: no image has a pose",
             reason="DATASET_NO_FRAMES",
         )
     frames: list[StoredFrame | None] = []
@@ -176,7 +176,7 @@ def is_seven_scenes(path: Path) -> bool:
 
 def read_seven_scenes(folder: Path, given: Given) -> Recording:
     """Millimeters; the largest number stands for none; poses lead from the camera to the world."""
-    note = "the folder has no intrinsics: those that 7-Scenes publishes for it are taken (585, 585, 320, 240)"
+    note = "the folder has no intrinsics: the published ones of 7-Scenes are used (585, 585, 320, 240)"
     camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _MILLIMETER, _SEVEN_SCENES, note)
     frames = []
     for pose_file in sorted(folder.glob("[!.]*.pose.txt")):
@@ -213,7 +213,7 @@ def read_redwood(folder: Path, given: Given) -> Recording:
     depths = _subfolder(folder, _DEPTH_FOLDERS)
     if path is None or depths is None:
         raise DatasetError(f"{folder.name} has no depth/ or no trajectory", reason="DATASET_NO_METADATA")
-    note = "the folder has no intrinsics: those of the PrimeSense camera, Open3D's default, are taken"
+    note = "the folder has no intrinsics: those of the PrimeSense camera (Open3D's default) are used"
     camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _MILLIMETER, _PRIMESENSE, note)
     if path.name == "odometry.csv" and camera.size is None:  # of Stray Scanner's video
         camera = replace(camera, size=(1440, 1920))
@@ -238,7 +238,7 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
     if path.suffix == ".log":
         lines = list(_lines(path))
         if len(lines) % 5:
-            raise DatasetError(f"{path.name}: expected five lines a pose", reason=_INVALID)
+            raise DatasetError(f"{path.name}: expected five lines per pose", reason=_INVALID)
         for at in range(0, len(lines), 5):
             number = int(_number(lines[at].split()[0], path.name))
             poses[number] = [[_number(word, path.name) for word in line.split()] for line in lines[at + 1 : at + 5]]
@@ -252,7 +252,7 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
         if lengths == {4} and len(rows) % 4 == 0:
             return dict(enumerate(np.split(np.array(rows), len(rows) // 4)))
         if lengths not in ({12}, {16}):
-            raise DatasetError(f"{path.name}: expected a pose a line, 12 or 16 numbers", reason=_INVALID)
+            raise DatasetError(f"{path.name}: expected one pose per line, 12 or 16 numbers", reason=_INVALID)
         return dict(enumerate(rows))
     values = read_json(path)
     # Open3D's PoseGraph, and its PinholeCameraTrajectory, world to camera: matrices by columns.
@@ -262,7 +262,7 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
             found = {index: each[member] for index, each in enumerate(listed) if member in each}
             poses = {index: np.array(each, np.float64).reshape(4, 4).T for index, each in found.items()}
             return {index: np.linalg.inv(pose) for index, pose in poses.items()} if inverse else poses
-    raise DatasetError(f"{path.name} has no poses that are known: nodes or parameters of Open3D", reason=_INVALID)
+    raise DatasetError(f"{path.name} has no poses in Open3D's form (nodes or parameters)", reason=_INVALID)
 
 
 # ScanNet, extracted: color/0.jpg, depth/0.png, pose/0.txt, intrinsic/.
@@ -352,14 +352,14 @@ def read_frame(path: Path, given: Given) -> Recording:
     """The camera's frame is the world, unless the file of intrinsics says T_world_camera."""
     files = _frame_files(path)
     if files is None:
-        raise DatasetError(f"{path.name} has not one depth image", reason="DATASET_NO_FRAMES")
+        raise DatasetError(f"{path.name} has no depth image", reason="DATASET_NO_FRAMES")
     depth, color = files
     folder = path if path.is_dir() else path.parent
     found = camera_beside(folder) if path.is_dir() or given.camera is None else None
     camera, unit, _ = _camera_of(path.name, found, given, _MILLIMETER)
     stated = given.depth_unit or (found and found.depth_unit)
     guessed = not stated and whole_numbers(depth)
-    notes = ["no file says the depth's unit: millimeters are taken"] if guessed else []
+    notes = ["the depth unit is not in any file: millimeters are assumed"] if guessed else []
     # A camera file of the color image's resolution is scaled to the depth image's.
     size = checked_size(depth)
     pose = np.eye(4) if found is None or found.pose is None else pose_of(found.pose, "T_world_camera")
@@ -403,8 +403,8 @@ def _camera_of(
         return camera, unit, []
     if published is None:
         raise DatasetError(
-            f"{name} has no intrinsics: no file called camera or intrinsics there holds fx, fy, cx, cy or a matrix K."
-            " Write one, or give --intrinsics fx,fy,cx,cy",
+            f"{name} has no intrinsics: no file named camera or intrinsics there has fx, fy, cx, cy or a matrix K. "
+            f"Write one, or give --intrinsics fx,fy,cx,cy",
             reason="DATASET_INTRINSICS_INVALID",
         )
     return camera_of(*published, size=(480, 640), whole_centers=True), unit, [note]
@@ -460,7 +460,7 @@ def _number(word: str, name: str) -> float:
     try:
         return float(word)
     except ValueError as error:
-        raise DatasetError(f"{name}: {word[:40]!r} is no number", reason=_INVALID) from error
+        raise DatasetError(f"{name}: {word[:40]!r} is not a number", reason=_INVALID) from error
 
 
 def _order(path: Path) -> tuple[list[int], str]:

@@ -37,7 +37,7 @@ def images_of(
     most: int = MOST_FRAMES,
     progress: Callable[[int, int], None] | None = None,
 ) -> TakenImages:
-    """The images at ``path``. A folder of sdfstudio is taken whole, with its masks, things and bounds.
+    """The images at ``path``. A folder of sdfstudio is taken whole, with its masks, objects and bounds.
 
     bounds: (2, 3), world; None: round what the depths show · most: frames; fewer where they are large.
     Raises DatasetError.
@@ -52,7 +52,7 @@ def images_of(
     images = recording.posed_images(chosen.indices, chosen.bounds if bounds is None else bounds)
     notes = list(recording.notes)
     if len(images) < len(recording):
-        notes.append(f"{len(images)} of {len(recording)} frames are taken: those that add most")
+        notes.append(f"{len(images)} of {len(recording)} frames are used: those that add most new surface")
     if bounds is None:
         notes.append(_found(chosen.bounds))
     return TakenImages(images, tuple(notes))
@@ -74,4 +74,4 @@ def _of_sdfstudio(folder: Path, given: Given, bounds: Array | None) -> TakenImag
 
 def _found(bounds: Array) -> str:
     low, high = ("(" + ", ".join(f"{value:.4g}" for value in row) + ")" for row in bounds)
-    return f"bounds round what the depths show: {low} to {high}"
+    return f"bounds around the measured depths: {low} to {high}"

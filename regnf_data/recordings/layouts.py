@@ -44,7 +44,7 @@ class Layout:
             if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EMFILE, errno.ENFILE):
                 raise
             if isinstance(error, FileNotFoundError | NotADirectoryError):
-                said = f"{path.name} is not of the layout {self.words}: it has no {Path(str(error.filename)).name}"
+                said = f"{path.name} does not have the layout {self.words}: it has no {Path(str(error.filename)).name}"
                 raise DatasetError(said, reason="DATASET_NO_METADATA") from error
             # Readers check what is often wrong; of the rest the reason is all that there is to say.
             said = f"{path.name} cannot be read as {self.words}: {type(error).__name__}: {error}"
@@ -116,7 +116,7 @@ def read_layout(path: str | os.PathLike[str], given: Given | None = None) -> Rec
         name = given.layout.partition(":")[0]  # a bag's topic may follow
         if name not in named:
             raise DatasetError(
-                f"no layout is called {given.layout[:40]!r}: {', '.join(named)}", reason="DATASET_NOT_RECOGNIZED"
+                f"unknown layout {given.layout[:40]!r}: {', '.join(named)}", reason="DATASET_NOT_RECOGNIZED"
             )
         return named[name].recording(source, given)
     for layout in LAYOUTS:
@@ -127,11 +127,11 @@ def read_layout(path: str | os.PathLike[str], given: Given | None = None) -> Rec
         names = ", ".join(str(each.relative_to(source)) for each in below[:_MOST_LISTED])
         more = f" and {len(below) - _MOST_LISTED} more" if len(below) > _MOST_LISTED else ""
         raise DatasetError(
-            f"{source.name} is no recording, but holds {len(below)}: give one of {names}{more}",
+            f"{source.name} is not a recording, but contains {len(below)}: give one of {names}{more}",
             reason="DATASET_NOT_RECOGNIZED",
         )
     known = "; ".join(f"{layout.words}: {layout.looks_for}" for layout in LAYOUTS)
-    said = f"{source.name} is no recording that is known{_almost(source)}. Looked for {known}"
+    said = f"{source.name} is not a known recording{_almost(source)}. Supported are {known}"
     raise DatasetError(said, reason="DATASET_NOT_RECOGNIZED")
 
 
@@ -141,10 +141,10 @@ def _almost(source: Path) -> str:
     depths = [p for p in files if "depth" in str(p.relative_to(source)).lower()]
     read = [p for p in depths if p.suffix.lower() in folders.DEPTHS]
     if depths and not read:
-        return f": depth is not read from {depths[0].name}, but from {', '.join(folders.DEPTHS)}"
+        return f": depth images are read from {', '.join(folders.DEPTHS)}"
     if not read:
         return ""
-    return f": no poses were found for its {len(read)} depth images. Without poses give one of them, {read[0].name}"
+    return f": no poses were found for its {len(read)} depth images. Without poses, give one of them, {read[0].name}"
 
 
 def has_layout(path: str | os.PathLike[str]) -> bool:

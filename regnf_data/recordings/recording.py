@@ -38,7 +38,7 @@ class Frame:
 
     depth: (H, W) float32, meters along the camera's axis, 0 where nothing was measured · camera: of the depth image ·
     T_world_camera: (4, 4), OpenCV's axes · color: (H', W', 3) uint8 as it was taken, by ``color_camera`` from the same
-    place · mask: (H', W') of the same size as the color, or as the depth without color: true on the thing.
+    place · mask: (H', W') of the same size as the color, or as the depth without color: true on the object.
     """
 
     name: str
@@ -130,7 +130,7 @@ class Recording:
 
     name: of the folder or file · layout: what it is, in its users' words · notes: what the reader took for granted ·
     T_metric_world: (4, 4), to the frame in meters, where the layout has one · is_metric: whether the world's unit is
-    the meter, as far as files can tell · terms: what the layout's files call things.
+    the meter, as far as files can tell · terms: what the layout's files call objects.
     """
 
     name: str
@@ -233,7 +233,7 @@ class Given:
         """Raises DatasetError (DATASET_INTRINSICS_INVALID)."""
         found = None if said.intrinsics is None else camera_of_values(said.intrinsics, "intrinsics")
         if found is None and said.intrinsics is not None:
-            raise DatasetError("the description's intrinsics hold none", reason="DATASET_INTRINSICS_INVALID")
+            raise DatasetError("the import options have no intrinsics", reason="DATASET_INTRINSICS_INVALID")
         unit = said.depth_unit or (found.depth_unit if found else None)
         return cls(found.camera if found else None, unit, said.layout, said.camera_axes)
 
@@ -281,7 +281,7 @@ class DepthFile:
         if unit <= _MILLIMETER and (spread or 0.0 < depth.max() <= _EIGHT_BITS * unit):
             which = f"multiples of {spread}" if spread else f"whole numbers up to {round(depth.max() / unit)}"
             raise DatasetError(
-                f"{path.name}: its depths are {which}: an image of 8 bits", reason="DATASET_IMAGE_INVALID"
+                f"{path.name}: its depths are {which}: it has only 8 bits", reason="DATASET_IMAGE_INVALID"
             )
         return depth
 
@@ -291,7 +291,7 @@ class DepthFile:
             return []
         if not no_meters(read_depth(self.path, checked_size(self.path), 1.0)):
             return []
-        return [f"{self.path.name}: its depths are too large for meters: steps of {self.unit:g} m are taken"]
+        return [f"{self.path.name}: its depths are too large for meters: steps of {self.unit:g} m are assumed"]
 
 
 def no_meters(depth: NDArray[np.float32]) -> bool:
@@ -315,7 +315,7 @@ def checked_size(path: Path) -> Size:
     if path.suffix.lower() in ARRAYS:
         shape = tuple(side for side in array_file(path).shape if side != 1)
         if len(shape) != 2:
-            raise DatasetError(f"{path.name} is no image of one channel", reason="DATASET_IMAGE_INVALID")
+            raise DatasetError(f"{path.name} is not an image with one channel", reason="DATASET_IMAGE_INVALID")
         size = (int(shape[0]), int(shape[1]))
     else:
         with opened_image(path) as image:
@@ -354,13 +354,15 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _NOT_RIGID:
         scale = np.cbrt(abs(np.linalg.det(rotation)))
         hint = f": its axes have the length {scale:.3g}" if abs(scale - 1.0) > _NOT_RIGID else ""
-        raise DatasetError(f"{name}: the pose is no rotation and translation{hint}", reason="DATASET_POSE_NOT_RIGID")
+        raise DatasetError(
+            f"{name}: the pose is not a rotation and a translation{hint}", reason="DATASET_POSE_NOT_RIGID"
+        )
     if np.linalg.det(rotation) < 0.0:
-        raise DatasetError(f"{name}: the pose mirrors (its determinant is -1)", reason="DATASET_POSE_NOT_RIGID")
+        raise DatasetError(f"{name}: the pose is a reflection (its determinant is -1)", reason="DATASET_POSE_NOT_RIGID")
     if given.shape == (4, 4) and not np.allclose(given[3], (0.0, 0.0, 0.0, 1.0), atol=1e-6):
         if np.allclose(given[:3, 3], 0.0):
             raise DatasetError(
-                f"{name}: the pose is transposed: its last row holds the translation", reason="DATASET_POSE_NOT_RIGID"
+                f"{name}: the pose is transposed: its last row has the translation", reason="DATASET_POSE_NOT_RIGID"
             )
         raise DatasetError(f"{name}: the pose's last row is not 0 0 0 1", reason="DATASET_POSE_NOT_RIGID")
     u, _, vt = np.linalg.svd(rotation)

@@ -1,7 +1,7 @@
 """A recording in one file of plain arrays: what a service keeps, and what is sent to it. No image is decoded from it.
 
 A safetensors file. depth: (N, H, W) int16, steps of ``depth_unit``, (N, 1) float64, meters along the camera's axis, 0
-where nothing was measured · K: (N, 3, 3) float64, pixel centers at + .5 · T_world_camera: (N, 4, 4) float64, OpenCV's
+where nothing was measured · K: (N, 3, 3) float64, pixel centers at + 0.5 · T_world_camera: (N, 4, 4) float64, OpenCV's
 axes · color: (N, H', W', 3) uint8 and color_K: (N, 3, 3), where the frames have colors. Its metadata: an entry
 ``recording``, JSON.
 """
@@ -161,7 +161,7 @@ def read_stored(path: Path, name: str | None = None) -> Recording:
         if terms.axes not in ("opencv", "opengl"):
             raise ValueError("the axes of its cameras are not known")
     except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
-        message = f"{path.name} is no recording of regnf: {error}"
+        message = f"{path.name} is not a recording of regnf: {error}"
         raise DatasetError(message[:300], reason="DATASET_FILE_INVALID") from error
     frames = []
     for number in range(count):
@@ -242,7 +242,9 @@ def frame_of_arrays(
     meters = image.astype(np.float32) * np.float32((depth_unit or 0.001) if whole else (depth_unit or 1.0))
     limit = np.iinfo(image.dtype).max if whole else np.inf
     if not whole and depth_unit is None and no_meters(meters):
-        message = f"{name}: the depths are {np.nanmedian(meters):.4g} in the median, no meters: say depth_unit"
+        message = (
+            f"{name}: the depths are {np.nanmedian(meters):.4g} in the median, which are not meters: give depth_unit"
+        )
         raise DatasetError(message, reason="DATASET_IMAGE_INVALID")
     meters[~((meters > 0.0) & (image < limit))] = 0.0
     matrix: Array = np.array(K, np.float64)

@@ -68,7 +68,7 @@ def align_frames(frames: Sequence[Frame], region: OrientedBox) -> Aligned:
             frame = replace(frame, T_world_camera=_rigid(T @ frame.T_world_camera))
             points, normals = points @ motion[:3, :3].T + motion[:3, 3], normals @ motion[:3, :3].T
             if moved > _MOVED_LEAST * 2.0 * half.max():
-                notes.append(f"frame {frame.name} was moved by {moved:.2g} to agree with the frames before it")
+                notes.append(f"frame {frame.name} was moved by {moved:.2g} to match the previous frames")
         spreads.append(left)
         done.append(frame)
         known = np.concatenate([known[0], points]), np.concatenate([known[1], normals])

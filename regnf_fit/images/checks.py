@@ -23,8 +23,8 @@ _EXPLAINED = 0.5
 """Of the depths; a unit that puts fewer within the bounds explains nothing."""
 UNITS = (
     (0.3048, "feet"), (0.2, "steps of 1/5000 that were read as 1/1000"), (5.0, "steps of 1/1000 read as 1/5000"),
-    (0.0254, "inches"), (0.01, "centimeters"), (100.0, "units that were divided by 100 too often"),
-    (0.001, "millimeters"), (1000.0, "units that were divided by 1000 too often"), (0.0002, "steps of 1/5000"),
+    (0.0254, "inches"), (0.01, "centimeters"), (100.0, "units that were divided by 100 by mistake"),
+    (0.001, "millimeters"), (1000.0, "units that were divided by 1000 by mistake"), (0.0002, "steps of 1/5000"),
 )  # fmt: skip
 """Factors that bring lengths of another unit into the world's, nearest to 1 first, and what the unit then is."""
 
@@ -41,14 +41,14 @@ def check_images(images: PosedImages) -> None:
     product = rotation @ rotation.transpose(0, 2, 1)
     # not (a <= b): NaN must fail too
     if not (np.isfinite(images.T_world_camera).all() and (np.abs(product - np.eye(3)) <= 1e-3).all()):
-        raise DatasetError("a camera's pose is not finite, or no rotation", reason="DATASET_POSE_NOT_RIGID")
+        raise DatasetError("a camera's pose is not finite, or not a rotation", reason="DATASET_POSE_NOT_RIGID")
     focal = images.intrinsics[:, [0, 1], [0, 1]]
     if not (np.isfinite(images.intrinsics).all() and (focal > 0.0).all()):
         raise DatasetError("a camera's focal length is not positive", reason="DATASET_INTRINSICS_INVALID")
     check_bounds(images.bounds)
     if images.depths is not None:
         if not np.isfinite(images.depths).all() or (images.depths > 0).mean() < _MIN_DEPTH_SHARE:
-            raise DatasetError("no image has depths worth the name", reason="DATASET_DEPTH_MISSING")
+            raise DatasetError("no image has enough depth measurements", reason="DATASET_DEPTH_MISSING")
     elif float(images.colors.reshape(-1, 3).std(axis=0).max()) < _MIN_SPREAD:
         raise DatasetError("the images have no depths and are all of one color", reason="DATASET_NO_COLOR_VARIETY")
 
@@ -60,19 +60,19 @@ def check_seen(images: PosedImages, shown: int) -> None:
     """
     if shown >= _MIN_PIXELS:
         return
-    text = f"only {shown} pixels show anything within the bounds, {_box(images.bounds)}"
+    text = f"only {shown} pixels show a surface within the bounds, {_box(images.bounds)}"
     is_default = np.array_equal(images.bounds, USUAL_BOUNDS)
     if is_default:
         text += " (the default where meta_data.json has no scene_box)"
     origins, rays, depths = sampled_rays(images)
     if len(depths) == 0:
-        hint = None if images.masks is None else "Masks are true on the object. Are these the other way round?"
+        hint = None if images.masks is None else "Masks are true on the object. Check whether these are inverted."
         raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
     ends = np.quantile(origins + depths[:, None] * rays, [0.05, 0.95], axis=0)
     text += f"; depths are {np.median(depths):.4g} in the median and end within {_box(ends)}"
     if is_default:  # nobody chose these bounds: that another unit would fit them says nothing
         box = json.dumps({"scene_box": {"aabb": np.round(ends, 3).tolist()}})[1:-1]
-        hint = f"Say in meta_data.json what the field is to cover. Around the depths: {box}"
+        hint = f"Give the region of the field in meta_data.json. Around the depths it is {box}"
     else:
         hint = _unit_hint(images, origins, rays, depths)
     raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)

@@ -253,7 +253,7 @@ def held_out_images(count: int) -> list[int]:
 def likeness(
     field: RadianceField, color: SurfaceColor, images: PosedImages, chosen: list[int], size: float
 ) -> tuple[float, float] | None:
-    """Of the field's surface, colored, to the chosen images: decibels (PSNR) over all pixels that show the thing, and
+    """Of the field's surface, colored, to the chosen images: decibels (PSNR) over all pixels that show the object, and
     their mean structural similarity, up to 1. None where they show nothing of it."""
     squared, similar, pixels = 0.0, 0.0, 0
     for number in chosen:
@@ -289,7 +289,7 @@ def structural_similarity(one: Tensor, other: Tensor) -> Tensor:
 def _picture(
     field: RadianceField, color: SurfaceColor, images: PosedImages, number: int, size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Which pixels (H, W) show the thing, the image (H, W, 3), the field's picture; black where nothing is shown."""
+    """Which pixels (H, W) show the object, the image (H, W, 3), the field's picture; black where nothing is shown."""
     device = field.table.device
     height, width = images.colors.shape[1:3]
     pixels = number * height * width + np.arange(height * width)
@@ -299,7 +299,7 @@ def _picture(
     drawn, seen = torch.zeros(len(rays), 3, device=device), torch.zeros(len(rays), 3, device=device)
     if len(index):
         behind = field.background.sigmoid()
-        if bool(rays.background.any()):  # of what is behind the thing the field knows nothing
+        if bool(rays.background.any()):  # of what is behind the object the field knows nothing
             behind = rays.colors[rays.background].mean(dim=0)
         rays = rays.take(index)
         # by what a ray's direction changes to the pixel right of its own, and to the one below it

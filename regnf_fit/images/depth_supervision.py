@@ -49,7 +49,7 @@ class DepthSupervision:
 
     rays: (R,) those with depth · before, behind: (R,) how far along them the band reaches before and behind the surface
     · noise: (R,) how far off along them their ends may be · trust: (R,) what they count, 1 in the mean · detailed: (D,)
-    indices of those that end at detail · free_points: (P, 3), free by what was seen · clearances: (P,) their distance
+    indices of those that end at detail · free_points: (P, 3), observed free space · clearances: (P,) their distance
     to the nearest measured surface · size: the bounds' diagonal · near: what the map of all depths says, if that is
     learned in place of rays.
     """

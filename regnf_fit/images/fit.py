@@ -48,7 +48,7 @@ from regnf_fit.options import OF_IMAGES, FitProgress, ReconstructionOptions, Rec
 
 # How large a network images need: a grid as fine as their pixels, with an entry for each cell that shows surface.
 #
-# A hash grid covers [-2, 2]^3, whatever the bounds. In a room of that size a thing is a few per cent of it, and its
+# A hash grid covers [-2, 2]^3, whatever the bounds. In a room of that size an object is a few per cent of it, and its
 # surface is only one of many that share the table: one size of grid cannot suit a cup and a room alike.
 
 _LEVELS = {512: 8, 1024: 9}
@@ -99,7 +99,7 @@ def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
     return state
 
 
-# The color of a fitted field as a safe field keeps it: a network that follows the geometry's.
+# The color of a fitted field as a regnf field file keeps it: a network that follows the geometry's.
 
 _FORM = NetworkColor("network", direction=DirectionEncoding("frequency", DIRECTION_DEGREE), gradient="unit")
 
@@ -302,7 +302,7 @@ def _train(
         if done % _REPORT_EVERY == 0 or done == total or done % interval == 0:
             recent = trainer.mean_loss()
             if not math.isfinite(recent) or not trainer.is_finite():
-                raise FitDivergedError(f"the fit diverged about iteration {done}")
+                raise FitDivergedError(f"the fit diverged at about iteration {done}")
             if files.checkpoint is not None and done % interval == 0 and done < total:
                 write_checkpoint(files.checkpoint, trainer.state(), key)
             if progress is not None:

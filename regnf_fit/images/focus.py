@@ -1,6 +1,7 @@
 """The region of a detection, from a few depth images, as finely as a pixel is wide there, in a fraction of a second.
 
-A map of a room has voxels of a centimeter, and takes seconds. A thing of 10 cm needs millimeters, in its own box alone.
+A map of a room has voxels of a centimeter, and takes seconds. An object of 10 cm needs millimeters, in its own box
+alone.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _BEHIND = 8.0
 _AROUND = 8
 """Pixels around the region's picture, for the planes at its edge."""
 _FEW, _TRIED, _PLANES, _PLANE_SHARE, _ALONG = 3000, 100, 3, 0.15, 0.8
-"""Points beside the thing that planes are looked for in, those that one is tried through, planes at most, the share of
+"""Points beside the object that planes are looked for in, those that one is tried through, planes at most, the share of
 the points on one, and the cosine between its normal and theirs."""
 _MARGIN = 1.5
 """Voxels before a surface that are not called free yet, and as many standard deviations of the depth."""
@@ -52,7 +53,7 @@ class _View:
     """What one image measured in the region, in the region's frame. points, normals: (P, 3) · T_camera_region: (4, 4) ·
     K: (3, 3), of the part of the image that shows the region · depth: (H, W) of that part, 0 for none ·
     margin: (H, W), a standard deviation of the depth · told: (P,) 1 for points
-    of the thing of a detection, -1 for those beside it, 0 where the image has none."""
+    of the object of a detection, -1 for those beside it, 0 where the image has none."""
 
     points: Floats
     normals: Floats
@@ -68,8 +69,8 @@ def focused_field(
 ) -> SdfField:
     """Signed distances in ``region``, world frame and unit, with what the images have seen of it.
 
-    things: of the first frames, (H, W) each, where they show the thing of a detection. What they show beside it hides
-    and is in the way, but nobody saw the thing there: its surface counts as unobserved.
+    objects: of the first frames, (H, W) each, where they show the object of a detection. What they show beside it hides
+    and is in the way, but no camera observed the object there: its surface counts as unobserved.
     voxel: from node to node; None: as wide as a pixel of the sharper images is at its surface, or as the number of
     nodes asks: distances near the surface are those from the planes of the pixels, so that wide voxels cost little.
     spread: a standard deviation of depths from frame to frame, beside the noise of each.
@@ -221,8 +222,8 @@ def _distances(offset: Singles, planes: Singles, behind: NDArray[np.bool_], edge
 
 
 def _on_planes(points: Floats, normals: Floats, told: NDArray[np.int8], within: float) -> NDArray[np.bool_]:
-    """(P,): on a plane that holds much of what lies beside the thing, as a table, and little of the thing: what such a
-    plane shows to other images, where the thing hid it, is not the thing's either."""
+    """(P,): on a plane that holds much of what lies beside the object, as a table, and little of the object: what such
+    a plane shows to other images, where the object hid it, is not the object's either."""
     out = np.zeros(len(points), np.bool_)
     beside, thing = np.flatnonzero(told < 0), told > 0
     if not len(beside) or not (told == 0).any():
@@ -249,7 +250,7 @@ def _observation(
     points: Floats, told: NDArray[np.int8], free: NDArray[np.bool_], low: Floats, edge: float, shape: tuple[int, ...]
 ) -> Observation:
     """Voxels of two nodes' edge: free where all their nodes are, a surface where a point lies, but for those where
-    points beside the thing lie and none of it."""
+    points beside the object lie and none of it."""
     counts = tuple(max(1, -(-(n - 1) // 2)) for n in shape)
     states = np.full(counts, UNSEEN, np.uint8)
     padded = np.zeros(tuple(2 * n for n in counts), np.bool_)
@@ -266,7 +267,7 @@ def _observation(
         surfaces[layer][tuple(cells[within & (told == which)].T)] = True
     shown, beside, thing = surfaces
     somebody = shown
-    if thing.any():  # what other images show may be the thing's where it goes on from what the detection shows
+    if thing.any():  # what other images show may be the object's where it goes on from what the detection shows
         somebody = shown & ~ndimage.binary_dilation(beside, iterations=2)
         pieces, _ = ndimage.label(somebody | thing, np.ones((3, 3, 3)))
         somebody &= np.isin(pieces, np.unique(pieces[thing]))

@@ -102,7 +102,7 @@ def map_grid(prepared: PreparedImages, rays: PixelRays, size: FusionOptions) -> 
 def write_map(
     images: PosedImages, grid: BlockGrid, path: Path, progress: Progress | None = None, colors: bool = True
 ) -> PosedImages:
-    """Write the safe field that ``images``, which have depths, fuse to within their bounds; the images as fused.
+    """Write the regnf field file that ``images``, which have depths, fuse to within their bounds; the images as fused.
 
     colors: whether the map has colors.
     """
@@ -141,7 +141,7 @@ def fuse_images(
     label: str | None = None,
     source: dict[str, Any] | None = None,
 ) -> FusionReport:
-    """Fuse ``images`` within their bounds to a map in ``output``, a safe field in the images' world frame.
+    """Fuse ``images`` within their bounds to a map in ``output``, a regnf field file in the images' world frame.
 
     Raises DatasetError as a fit does, DATASET_DEPTH_MISSING for images without depths; InvalidOptionsError for voxels
     that are too small for the surface that was measured.

@@ -50,12 +50,12 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
     height, width = frames[0].depth.shape
     colors = {one.color.shape[1::-1] for one in frames if one.color is not None}
     step, guessed = _step(frames[0].depth), any("unit" in note for note in recording.notes)
-    known = "what was said" if said and said.depth_unit else "a guess" if guessed else "the recording"
+    known = "as given" if said and said.depth_unit else "a guess" if guessed else "the recording"
     report = {
         "kind": "recording",
         "layout": recording.layout,
         "frames": len(recording),
-        "unit": "meters" if recording.is_metric else "the recording's own",
+        "unit": "meters" if recording.is_metric else "from the recording",
         "depth_images": f"{width} x {height}",
         "color_images": " and ".join(f"{w} x {h}" for w, h in sorted(colors)) or None,
         "depth_step": step,
@@ -72,7 +72,7 @@ def inspect_recording(recording: Recording, said: Given | None = None) -> Inspec
                 round(math.degrees(2.0 * math.atan(side / (2.0 * focal))), 1)
                 for side, focal in ((width, camera.K[0, 0]), (height, camera.K[1, 1]))
             ],
-            "lens": "none" if stored.camera.lens == "none" else f"{stored.camera.lens}, taken out of the images",
+            "lens": "none" if stored.camera.lens == "none" else f"{stored.camera.lens}, removed from the images",
         },
         "bounds": [[_rounded(value) for value in row] for row in chosen.bounds.tolist()],
         "path": _rounded(float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())),
@@ -101,7 +101,7 @@ def _agreement(recording: Recording) -> str:
     if len(recording) < 2:
         return "one frame: nothing to compare"
     try:
-        return check_recording(recording) or "frames that see the same place agree"
+        return check_recording(recording) or "frames that show the same place agree"
     except DatasetError as error:
         return f"{error.reason}: {error}. {error.hint or ''}".strip()
 

@@ -131,7 +131,7 @@ _DEPTH_BINS = 20
 
 @dataclass(frozen=True)
 class LocalPlanes:
-    """Of N images: cosines (N, H, W) between ray and surface normal, at least .1, 0 where no plane could be laid ·
+    """Of N images: cosines (N, H, W) between ray and surface normal, at least 0.1, 0 where no plane could be laid ·
     deviations: (N, H, W) standard deviation of a depth's noise, its own units."""
 
     cosines: NDArray[np.float32]
@@ -254,10 +254,10 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
 
     voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
     spread: of the depths from image to image; what is nearer to a measured surface than that is not seen to be free.
-    A voxel is free where all four rays round its center, in some image, pass it by: at the edge of a thing one of them
-    ends there. (The center's own pixel is not enough: voxels are about as wide as a pixel.)
+    A voxel is free where all four rays around its center, in some image, pass it by: at the edge of an object one of
+    them ends there. (The center's own pixel is not enough: voxels are about as wide as a pixel.)
 
-    Raises InvalidOptionsError for more voxels than a safe field keeps.
+    Raises InvalidOptionsError for more voxels than a regnf field file keeps.
     """
     if not 0 <= voxels <= MAX_COUNT:
         raise InvalidOptionsError(f"observation_voxels: {voxels} is not from 0 to {MAX_COUNT}")
@@ -319,7 +319,7 @@ def _looked_through(centers: Tensor, images: PosedImages, image: int, clear: Ten
 def attach_observation(
     path: Path, images: PosedImages, voxels: int = 192, spread: DepthSpread | None = None
 ) -> Observation:
-    """Keep with the safe field in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
+    """Keep with the regnf field file in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
 
     spread: of the depths from image to image; None: as these images show it, all of whose pixels it takes.
     Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the
@@ -344,7 +344,7 @@ def attach_observation(
 def _check_frame(field: SdfField, seen: Observation, noise: float) -> None:
     """Raise DatasetError (DATASET_OF_ANOTHER_FRAME) unless the field's surface runs where one was measured.
 
-    noise: how far from it depths may end, world units; many voxels in a small thing before a coarse sensor.
+    noise: how far from it depths may end, world units; many voxels in a small object before a coarse sensor.
     """
     cells = (seen.states == SURFACE).nonzero()
     cells = cells[:: max(1, len(cells) // _CHECKED)]
@@ -353,6 +353,7 @@ def _check_frame(field: SdfField, seen: Observation, noise: float) -> None:
     near = max(_NEAR * seen.voxel, noise)
     if len(cells) == 0 or not float((distance <= near).float().mean()) >= _AGREEING:
         raise DatasetError(
-            "the field has no surface where the images saw one: are they of the same scene, in the same frame?",
+            "the field has no surface where the images show one. Check that both are of the same scene, in the same "
+            "frame.",
             reason="DATASET_OF_ANOTHER_FRAME",
         )

@@ -111,7 +111,7 @@ def shaded(frame: Frame) -> NDArray[np.uint8]:
 
 
 def _panels(frame: Frame, shape: tuple[int, ...], points: Floats) -> list[_Panel]:
-    """The whole image, and what is round the object, if some of it is in the image."""
+    """The whole image, and what is around the object, if some of it is in the image."""
     height, width = shape[:2]
     zoom = min(_HEIGHT / height, _WIDEST / width)
     panels = [_Panel(np.zeros(2), zoom, (round(height * zoom), round(width * zoom)))]

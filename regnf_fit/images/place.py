@@ -1,4 +1,4 @@
-"""Where one thing is looked for: in a scene's field, or in the region of a recording that a detection is about."""
+"""Where one object is looked for: in a scene's field, or in the region of a recording that a detection is about."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def start_shape(images: PosedImages, start: Start, measured: PixelRays) -> Start
     """A ball in the middle of the bounds; for a room a hollow one, so large that all of the bounds is free.
 
     measured: the rays that end on a surface within the bounds, none without depths. By themselves they tell a room
-    from a thing: its surface is seen from the side of the bounds' middle (:func:`faces_middle`). Without depths, the
+    from an object: its surface is seen from the side of the bounds' middle (:func:`faces_middle`). Without depths, the
     cameras tell it: most of them stand within the bounds.
     """
     low, high = images.bounds
@@ -202,7 +202,7 @@ def faces_middle(measured: PixelRays, center: Tensor, size: float) -> bool:
     """Whether surface that was measured, at least one ray, is rather seen from the side of ``center`` (3,).
 
     It is the sign of the sum, over equal cells of surface, of (mean direction to the cameras) . (place - center): a
-    convex thing seen from outside has a positive sum, a room seen from inside a negative one. size: the bounds'
+    convex object seen from outside has a positive sum, a room seen from inside a negative one. size: the bounds'
     diagonal, field units.
     """
     ends = ends_of(measured)

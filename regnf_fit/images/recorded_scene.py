@@ -77,7 +77,7 @@ def recorded_scene(
         box = first[0].box if len(first) == 1 else _common(first, diameter)
         own = [one.frame for one in first]
         left = ", ".join(one.frame.name for one in shown if one not in first)
-        told = (f"the detections of other frames show another thing than {left}: left out",) if left else ()
+        told = (f"the detections of other frames show another object than {left}: they are not used",) if left else ()
     region = _around(box)
     names = [frame.name for frame in own]
     others: list[Frame] = []
@@ -98,9 +98,11 @@ def recorded_scene(
     known = replace(options, robust=replace(options.robust, object_unit=unit))
     notes = (*recording.notes, *told, *([disagreement] if disagreement else ()), *aligned.notes)
     if not recording.is_metric:
-        notes += ("the recording's world is not in meters: the scale is free, and lengths are in its unit",)
+        notes += ("the recording is not in meters: the scale is free, and lengths are in the recording's unit",)
     if unit in METERS and options.robust.object_unit == "auto":
-        notes += (f"the object's unit is taken to be {unit}, by its size: say --object-unit, or --scale free",)
+        notes += (
+            f"the object's unit is assumed to be {unit}, from its size; if not, give --object-unit, or --scale free",
+        )
     return RecordedScene(field, box, known, camera, frame, tuple(one.name for one in frames), notes)
 
 
@@ -110,7 +112,8 @@ def _around(box: OrientedBox) -> OrientedBox:
 
 
 def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:
-    """The object's unit. `auto`: the one in which the object is as large as what was seen, `free` without one."""
+    """The object's unit. `auto`: the one in which the object's size matches the observed surface, `free` without
+    one."""
     if said != "auto":
         return said
     if object_bounds is None:
@@ -124,7 +127,7 @@ def _unit(said: Unit, extent: float, object_bounds: Floats | None) -> Unit:
 def _lifted(
     recording: Recording, detections: Sequence[ImageDetection], said: Unit, object_bounds: Floats | None
 ) -> tuple[list[Lifted], Unit, float | None]:
-    """The things of the detections, the object's unit, and its diameter in the world where that is known."""
+    """The instances of the detections, the object's unit, and its diameter in the world where that is known."""
     frames = [recording.frames[recording.index(one.frame)].read() for one in detections]
     pairs = list(zip(frames, detections, strict=True))
     shown: list[Lifted] = []
@@ -139,7 +142,7 @@ def _lifted(
 
 
 def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
-    """Of the things that detections of frames show, those that meet most others in space: they are one.
+    """Of the objects that detections of frames show, those that meet most others in space: they are one.
 
     Raises InvalidDetectionError, naming the frames, where none of several meets another.
     """
@@ -152,15 +155,15 @@ def _meeting(shown: list[Lifted], diameter: float | None) -> list[Lifted]:
         names = ", ".join(one.frame.name for one in shown)
         nearest = float(apart[apart > 0.0].min(initial=np.inf))
         raise InvalidDetectionError(
-            f"the detections of the frames {names} show no common thing: they lie {nearest:.2g} apart or more in space,"
-            f" and it is {reach:.2g} long. Check the frames' poses, or give the detections of one frame"
+            f"the detections of the frames {names} show no common object: they are at least {nearest:.2g} apart in "
+            f"space, and the object's size is {reach:.2g}. Check the frames' poses, or give the detections of one frame"
         )
     return [one for one, found in zip(shown, meets[best], strict=True) if found]
 
 
 def _common(shown: Sequence[Lifted], diameter: float | None) -> OrientedBox:
-    """The box of the axes of the first one round what several frames show of one thing; behind, seen from the first,
-    it reaches as far as the thing is wide."""
+    """The box of the axes of the first one round what several frames show of one object; behind, seen from the first,
+    it reaches as far as the object is wide."""
     box = shown[0].box
     axes = box.rotation.numpy()
     local = np.concatenate([one.points for one in shown]) @ axes

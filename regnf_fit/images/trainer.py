@@ -339,7 +339,7 @@ class Trainer:
         depths = samples_by_weight(self.field.function(), rays, sharpness.detach(), self.generator)
         rendered = render_rays(self.field, rays, depths, sharpness, self.field.background.sigmoid())
         error = (rendered.colors - rays.colors).abs().mean(dim=1)
-        # what lies behind a masked thing has no color of its own
+        # what lies behind a masked object has no color of its own
         loss = weights.color * error[~rays.background].sum() / len(rays)
         if self._masked:
             wanted = (~rays.background).float()

@@ -29,7 +29,7 @@ from regnf_fit.options import FitOptions, FitProgress, FitReport
 
 
 class MeshTarget(NamedTuple):
-    """field: the mesh, scaled if that was asked for · source: where it came from, as the fitted field records it."""
+    """field: the mesh, scaled if that was requested · source: where it came from, as the fitted field records it."""
 
     field: MeshField
     source: dict[str, Any]
@@ -84,7 +84,8 @@ def padded_bounds(target: SdfField, padding: float) -> Tensor:
 
 
 def near_samples(target: SdfField, count: int, noise: tuple[float, ...], rng: np.random.Generator) -> ExactSamples:
-    """About ``count`` samples round the surface: surface points with Gaussian noise of several scales, as diagonals."""
+    """About ``count`` samples around the surface: surface points with Gaussian noise of several scales, as
+    diagonals."""
     surface = _surface_points(target, count, rng)
     scales = diagonal(target) * rng.choice(noise, size=(len(surface), 1))
     return _measure(target, surface + scales * rng.standard_normal(surface.shape))

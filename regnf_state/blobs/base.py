@@ -1,9 +1,9 @@
-"""Where bytes live: uploads, safe fields, results. Keys are relative, '/'-separated and never leave the store.
+"""Where bytes live: uploads, regnf field files, results. Keys are relative, '/'-separated and never leave the store.
 
 Keys in use:
     fields/{sha256}/original               the upload, until its import has ended or as long as it is kept
     fields/{sha256}/settings-{sha256}      the trainer's settings that came with it, for as long
-    fields/{sha256}/field.safetensors      the safe field, or the recording, that workers open
+    fields/{sha256}/field.safetensors      the regnf field file, or the recording, that workers open
     fields/{sha256}/object-model-{n}.safetensors   its model as an object by revision n of the engine; the first job
                                            that needs the model makes it, or a library's entry
     fields/{sha256}/preview.png, mesh.glb, mesh-coarse.glb   what people look at; workers make it when they have time

@@ -117,7 +117,7 @@ class LocalBlobStore:
     def require(self) -> None:
         """Raises StorageUnavailableError while the store is away."""
         if not self.temporary.is_dir():
-            raise StorageUnavailableError(errno.ENODEV, "the blob store is away")
+            raise StorageUnavailableError(errno.ENODEV, "the blob store is not available")
 
     @contextmanager
     def translate_errors(self) -> Iterator[None]:
@@ -132,7 +132,7 @@ class LocalBlobStore:
         except OSError as error:
             if error.errno in _FULL:
                 raise StorageFullError(error.errno, "no space is left in the blob store") from error
-            raise StorageUnavailableError(error.errno, f"the blob store fails: {error.strerror}") from error
+            raise StorageUnavailableError(error.errno, f"the blob store failed: {error.strerror}") from error
 
     def tried(self, do: Callable[[], _Value]) -> _Value:
         """What ``do`` returns once the store is there."""
@@ -166,7 +166,7 @@ class LocalBlobStore:
         """Where a blob lies. Raises ValueError for a malformed key, or one that a link leads out of the store."""
         path = self.root / check_key(key)
         if not path.resolve().is_relative_to(self.root):
-            raise ValueError("the blob key leads out of the store")
+            raise ValueError("the blob key is outside of the store")
         return path
 
     def writer(self) -> LocalBlobWriter:

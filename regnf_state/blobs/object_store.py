@@ -65,7 +65,7 @@ def translate_errors() -> Iterator[None]:
     try:
         yield
     except BaseError as error:
-        raise StorageUnavailableError(f"the object store refuses: {type(error).__name__}") from error
+        raise StorageUnavailableError(f"the object store refused the request: {type(error).__name__}") from error
 
 
 _TEMPORARY = ".tmp"

@@ -77,7 +77,7 @@ class Journal:
             self._write(job, "accepted")
 
     def _forget_before(self, job: JobRecord) -> None:
-        """Drop what is said of attempts before this one: a job that is asked for again and again must not grow."""
+        """Drop what is said of attempts before this one: a job that is requested again and again must not grow."""
         for key in list(self._blobs.list(_folder(job.id))) if job.attempt > 1 else ():
             if int(key.rpartition("/")[2].partition("-")[0]) < job.attempt:
                 self._blobs.delete(key)
@@ -89,7 +89,7 @@ class Journal:
         except UnreadableRecordError as error:
             if error.newer:
                 raise
-            logger.error("%s in the journal: written anew", error)
+            logger.error("%s in the journal: written again", error)
             return False
 
     def join(self, jobs: Sequence[JobRecord]) -> None:
@@ -129,7 +129,7 @@ class Journal:
         try:
             return self._recall(job_id, now)
         except (ValueError, UnreadableRecordError) as error:
-            logger.error("the journal of job %s does not read: %s", job_id, error)
+            logger.error("the journal of job %s cannot be read: %s", job_id, error)
             return None
 
     def _recall(self, job_id: str, now: float) -> JobRecord | None:
@@ -176,7 +176,7 @@ class Journal:
         except FileNotFoundError:
             return None
         except UnreadableRecordError as error:
-            logger.error("the journal of field %s does not read: %s", reference, error)
+            logger.error("the journal of field %s cannot be read: %s", reference, error)
             return None
         if field.state == "rejected" or self._blobs.exists(f"fields/{reference}/field.safetensors"):
             # an import that was not written down as ended finds its own report, and ends at once
@@ -241,10 +241,10 @@ def claim_storage(redis: Redis, storage_id: str, adopt: str | None = None) -> No
     if adopt == storage_id:
         redis.set(STORAGE_KEY, storage_id)
         redis.delete(GENERATION_KEY)  # the journal of this storage is read now
-        logger.warning("this Redis was of the storage %s; it is of the storage %s now", known, storage_id)
+        logger.warning("this Redis belonged to the storage %s; it now belongs to the storage %s", known, storage_id)
         return
     raise StorageMismatchError(
-        f"this Redis holds the records of the storage {known}, and the storage here is {storage_id}. Check "
-        "REGNF_REDIS_URL, REGNF_STORAGE_URL and REGNF_STATE_DIR: every process of a service needs the same. If this "
-        f"storage shall have this Redis, start once with REGNF_ADOPT_STORAGE={storage_id}"
+        f"this Redis has the records of the storage {known}, but the storage here is {storage_id}. Check "
+        "REGNF_REDIS_URL, REGNF_STORAGE_URL and REGNF_STATE_DIR: all processes of a service need the same values. To "
+        "use this Redis with this storage, start once with REGNF_ADOPT_STORAGE={storage_id}"
     )

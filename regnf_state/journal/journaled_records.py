@@ -248,7 +248,8 @@ class Rebuilder:
         self._blobs = blobs
 
     def run_if_needed(self) -> Rebuilt:
-        """Read the journal unless Redis holds all of it. Raises RedisError, OSError; then the next call begins anew."""
+        """Read the journal unless Redis holds all of it. Raises RedisError, OSError; then the next call begins
+        again."""
         if self._records.generation.is_current():
             return Rebuilt()
         token = self._records.generation.begin()
@@ -279,7 +280,7 @@ class Rebuilder:
             return None
         if self._records.has_expired(job, now):
             if self._is_known(job_id):
-                return None  # it was asked for again
+                return None  # it was requested again
             self._blobs.delete_prefix(f"jobs/{job_id}")
             self._records.journal.forget(job_id)
             return job_id

@@ -72,7 +72,7 @@ class CircuitBreaker:
             self._answered_at = self._clock()
             was_open, self._probe_at = self.is_open, None
         if was_open:
-            logger.warning("Redis answers again")
+            logger.warning("Redis responds again")
 
     def _failed(self, began: float, is_probe: bool) -> None:
         """A call got no answer. Where others got theirs meanwhile, it was slow, and Redis is there."""
@@ -81,7 +81,7 @@ class CircuitBreaker:
             if opens or is_probe:
                 self._probe_at = self._clock() + self._probe_every_s
         if opens:
-            logger.warning("Redis does not answer: calls fail at once until it does")
+            logger.warning("Redis does not respond: calls fail immediately until it does")
 
 
 CALL_S = 4.0

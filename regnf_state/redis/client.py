@@ -50,7 +50,7 @@ class NoRedisError(RuntimeError):
 def redis_address(settings: Settings) -> str:
     """The address to connect to. Raises NoRedisError."""
     if settings.redis_url is None:
-        raise NoRedisError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
+        raise NoRedisError("set REGNF_REDIS_URL, or use `regnf serve`, which starts its own Redis")
     if settings.redis_password is None:
         return settings.redis_url
     return _with_password(settings.redis_url, settings.redis_password)

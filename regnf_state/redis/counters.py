@@ -25,7 +25,7 @@ def counted(name: str, *labels: str, by: int = 1) -> Command:
 
 
 def count(redis: Redis, name: str, *labels: str) -> None:
-    """Count one that is no part of a change. Counters that are no hash, or no number, begin anew."""
+    """Count one that is no part of a change. Counters that are no hash, or no number, begin again."""
     counter = "|".join((name, *labels))
     try:
         redis.hincrby(COUNTERS_KEY, counter, 1)
@@ -97,7 +97,7 @@ class Counters:
 
 
 def _held(redis: Redis) -> Any:
-    """Nothing where the counters are no hash: the next event begins them anew."""
+    """Nothing where the counters are no hash: the next event begins them again."""
     try:
         return redis.hgetall(COUNTERS_KEY)
     except ResponseError as error:

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 # A document is a hash of ``document`` (JSON), ``version``, ``format`` and ``token``; other members of the hash stay as
 # they are. The token names the write that made it: when a connection breaks after the script ran and the client runs
-# it again, the second run finds its own token. An index that is no index is set aside, and begun anew: until then it
+# it again, the second run finds its own token. An index that is no index is set aside, and begun again: until then it
 # holds nothing. COMPACT is no command of Redis: a stream has four kilobytes set apart with its first event, which are
 # given back here.
 _WRITE = (
@@ -149,7 +149,7 @@ class RedisDocuments:
         return stored, moment[0] + moment[1] / 1e6
 
     def _fetch_in_portions(self, kind: Kind[Any], names: Sequence[str]) -> Iterator[tuple[str, int, Stored | None]]:
-        """The same a few at a time, as they are asked for, with the bytes of each: at most PAGE_BYTES are held."""
+        """The same a few at a time, as they are requested, with the bytes of each: at most PAGE_BYTES are held."""
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:
                 pipeline.hstrlen(kind.key(name), "document")
@@ -213,7 +213,7 @@ class RedisDocuments:
     # what cannot be read
 
     def _record(self, kind: Kind[_Record], name: str, stored: Stored | None) -> _Record | None:
-        """What was read, decoded. What is damaged is set aside, and made anew where that is possible.
+        """What was read, decoded. What is damaged is set aside, and made again where that is possible.
 
         Raises UnreadableRecordError.
         """
@@ -235,7 +235,7 @@ class RedisDocuments:
         except UnreadableRecordError:
             return None
         except OSError as error:
-            logger.warning("%s %s is left out: %s", kind.name, name, type(error).__name__)
+            logger.warning("%s %s is skipped: %s", kind.name, name, type(error).__name__)
             return None
 
     def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
@@ -319,7 +319,7 @@ def is_wrong_type(answer: object) -> bool:
 
 def _decoded(kind: Kind[_Record], name: str, stored: Stored) -> _Record:
     if stored.document is None or stored.version is None:
-        raise UnreadableRecordError(name, "it is no record")
+        raise UnreadableRecordError(name, "it is not a record")
     record = decoded(kind.record, name, stored.document, stored.format)
     if text(stored.version) != str(record.version):
         raise UnreadableRecordError(name, "its versions differ")  # no change could ever be written

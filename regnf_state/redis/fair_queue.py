@@ -198,7 +198,7 @@ class FairQueue:
         self._script = redis.register_script(_SCRIPT)
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
-        """One step. Where the keys are damaged the queue begins anew, and the reaper queues what waited."""
+        """One step. Where the keys are damaged the queue begins again, and the reaper queues what waited."""
         return self._mended(lambda: int(self._run(self._redis, step, name, *arguments)))
 
     def _run(self, client: Redis, step: str, name: str, *arguments: Any) -> Any:
@@ -211,7 +211,7 @@ class FairQueue:
         except ResponseError as error:
             if not _tells_of_damage(error):
                 raise
-            logger.error("the fair queue is damaged and begins anew: %s", error)
+            logger.error("the fair queue is damaged and starts empty: %s", error)
         damaged = [key for key in LISTS if self._redis.type(key) != b"list"]
         held: list[Any] = [*self._redis.scan_iter(f"{_PREFIX}*", count=1000), *damaged]
         if held:

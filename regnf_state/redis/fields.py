@@ -62,7 +62,7 @@ def unlisted(record: FieldRecord) -> list[Command]:
 # Why an owner's uploads were rejected, kept after their fields are gone: the same bytes are not imported again for
 # it.
 #
-# Kept is what follows from the bytes, their description and the version of the gate. What a limit, a setting or the
+# Kept is what follows from the bytes, their description and the version of the importer. What a limit, a setting or the
 # machine had its part in (load, memory, storage, a worker's death) may end otherwise next time: it is never kept.
 # Each owner has rejections of its own. Those of others would tell it, by how soon the answer comes, what others have
 # sent.
@@ -104,7 +104,7 @@ class RedisRejections(RedisDocuments):
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
 _UNDRAWN = f"{PREFIX}fields:undrawn"
-"""Ready fields whose mesh and picture are to be made, by the time they were asked for."""
+"""Ready fields whose mesh and picture are to be made, by the time they were requested."""
 _ATTEMPTS_KEPT_S = str(48 * 3600)
 """How long a deleted field's count of attempts is kept: longer than anything else that names them."""
 _LOOKED_AT = 256
@@ -190,7 +190,7 @@ class RedisFieldRecords(RedisRejections):
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         """Store a new field, or return the one that exists (False).
 
-        A rejected field starts anew with what ``record`` says, as the next attempt (True): enqueue its import.
+        A rejected field starts again with what ``record`` says, as the next attempt (True): enqueue its import.
         Rejected ones count towards no quota. Raises QuotaError.
         """
         while True:
@@ -233,7 +233,7 @@ class RedisFieldRecords(RedisRejections):
         return found
 
     def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
-        """Several fields in one round trip, in the order asked for."""
+        """Several fields in one round trip, in the order requested."""
         return self._read_each(FIELD, references)
 
     def list_fields(
@@ -266,7 +266,7 @@ class RedisFieldRecords(RedisRejections):
         return self._read_many(FIELD, names)
 
     def undrawn_fields(self) -> list[str]:
-        """The ready fields whose mesh and picture are to be made, those asked for last first."""
+        """The ready fields whose mesh and picture are to be made, those requested last first."""
         names: Any = self._redis.zrevrange(_UNDRAWN, 0, -1)
         return [text(name) for name in names]
 
@@ -275,11 +275,11 @@ class RedisFieldRecords(RedisRejections):
         self._redis.zadd(_UNDRAWN, {sha256: self.now()}, xx=True)
 
     def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
-        """Start an import anew as the next attempt; ``lost`` as in requeue_job. Raises StaleAttemptError."""
+        """Start an import again as the next attempt; ``lost`` as in requeue_job. Raises StaleAttemptError."""
         return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
     def reimport_field(self, known: FieldRecord, description: dict[str, Any], label: str | None) -> FieldRecord:
-        """A field whose import has ended, to be imported anew as the next attempt, with another description.
+        """A field whose import has ended, to be imported again as the next attempt, with another description.
 
         Raises StaleAttemptError when it has changed since it was ``known``.
         """
@@ -353,7 +353,7 @@ class RedisLibrary(RedisFieldRecords):
                 raise NameTakenError(notes.name)
 
     def entries_named(self, owner: str, names: Sequence[str]) -> list[LibraryEntry | None]:
-        """An owner's entries by their names, in the order asked for."""
+        """An owner's entries by their names, in the order requested."""
         keys = [name_key(owner, name) for name in names]
         references: list[Any] = self._redis.mget(keys) if keys else []
         held = {key: text(reference) for key, reference in zip(keys, references, strict=True) if reference is not None}

@@ -200,7 +200,7 @@ class RecordStore(RedisLibrary):
     def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
         """Store a new job, or return the one that exists under its id (False).
 
-        A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
+        A finished job that failed or was dismissed is started again as the next attempt (True): enqueue what is
         returned, with its attempt. A webhook of ``record`` that the job does not have yet is added to it, and told at
         once if the job has finished. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
         QuotaError when the owner, or the job of webhooks, has as many as it may.
@@ -262,7 +262,7 @@ class RecordStore(RedisLibrary):
         return found
 
     def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
-        """Several jobs in one round trip, in the order asked for; one that cannot be read keeps no other back."""
+        """Several jobs in one round trip, in the order requested; one that cannot be read keeps no other back."""
         found = {name: self._held(name, stored) for name, stored in self._fetch_now(JOB, job_ids)[0]}
         damaged = self.unreadable.among([JOB.key(name) for name, held in found.items() if held is None])
         for name in found:

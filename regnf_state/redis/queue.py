@@ -23,7 +23,7 @@ from regnf_state.redis.fair_queue import FairQueue, Waiting
 #
 # RQ itself would import whatever function a hash names, and the callbacks in it, and hand it on to jobs that depend
 # on it. A worker therefore never lets RQ read one. It takes a name from RQ's list, checks here that the hash says
-# exactly what ``written`` writes for this name, and makes the job anew from the name. With a key, the hash must be
+# exactly what ``written`` writes for this name, and makes the job again from the name. With a key, the hash must be
 # signed too.
 
 SIGNATURE = "regnf_signature"

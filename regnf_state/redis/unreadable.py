@@ -23,7 +23,7 @@ PREFIX = "regnf:"
 
 # Lua that our scripts share: a command that goes on past what has been damaged in its key.
 
-# A key of another type is set aside for a week, and begun anew; so is a count that nothing can be added to. One script
+# A key of another type is set aside for a week, and begun again; so is a count that nothing can be added to. One script
 # runs whole or not at all only as long as none of its commands fails: those before it are not undone.
 MENDED = """
 local function mended(command)
@@ -110,7 +110,7 @@ class UnreadableRecords:
 
     @staticmethod
     def _ask(look: Callable[[], Any]) -> Any:
-        """None where the list itself is none: the next record that is noted begins it anew."""
+        """None where the list itself is none: the next record that is noted begins it again."""
         try:
             return look()
         except ResponseError as error:

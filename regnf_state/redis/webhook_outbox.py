@@ -131,7 +131,7 @@ def entering(before: JobRecord | None, after: JobRecord, expires: float) -> list
 
 
 def forgetting(record: JobRecord) -> list[Command]:
-    """What drops the messages of a job that is deleted or started anew."""
+    """What drops the messages of a job that is deleted or started again."""
     commands: list[Command] = []
     for place in range(len(record.webhooks)):
         message = Message.about(record, place)
@@ -162,7 +162,7 @@ class RedisOutbox:
             except ValueError:
                 self._redis.zrem(due_key(line), name)
                 count(self._redis, "records_unreadable", "webhook")
-                logger.error("a message about a job has a name that cannot be read: it is dropped")
+                logger.error("a message about a job has an unreadable name: it is dropped")
 
     def settle(self, message: Message, delivery: Delivery, outcome: str = "dropped") -> None:
         """Write down how a send went: put the message off until ``next_at``, or be done with it."""

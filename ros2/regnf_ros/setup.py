@@ -15,7 +15,7 @@ setup(
     zip_safe=True,
     maintainer="regnf contributors",
     maintainer_email="regnf@example.org",
-    description="Asks a regnf service where detected objects stand, and publishes their poses.",
+    description="Registers detected objects with a regnf service and publishes their poses.",
     license="MIT",
     entry_points={"console_scripts": [f"register_objects = {NAME}.node:main"]},
 )

@@ -165,7 +165,7 @@ def _containers(plan: Plan, buildah: Buildah, folder: Path) -> Iterator[Containe
 
 
 def use(plan: Plan) -> None:
-    """One registration, as a client that has the first of the tokens or none if none is asked for."""
+    """One registration, as a client that has the first of the tokens or none if none is requested."""
     address = f"http://{HOSTS['api']}:8080"
     tokens: list[str] = json.loads(plan.api["environment"]["REGNF_API_TOKENS"])
     token = tokens[0].split(":", 1)[-1] if tokens else None

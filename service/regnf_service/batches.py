@@ -110,7 +110,7 @@ class Posting:
             return
         free, reason = services.records.room_for_jobs(caller, services.settings.max_queued_jobs, services.quota)
         if len(new) > free:
-            detail = f"The lines need {len(new)} new jobs; there is room for {free}. Nothing was started."
+            detail = f"The lines need {len(new)} new jobs, but only {free} are possible. No job was started."
             fitting = {"new_jobs": len(new), "fitting_lines": self._fitting(free)}
             raise Problem(reason, detail, headers=RETRY_LATER, extra=fitting)
 
@@ -128,7 +128,7 @@ class Posting:
         while len(kept) >= services.settings.quota_batches:
             ended = next((entry for entry in reversed(kept) if not _is_active(services, caller, entry.key)), None)
             if ended is None:
-                detail = "You have the maximum number of batches, and none has ended. Wait for one."
+                detail = "You have the maximum number of batches, and none has ended. Wait until one ends."
                 raise Problem("QUOTA_ACTIVE_JOBS", detail, headers=RETRY_LATER)
             services.batches.delete(caller, ended.key.rpartition("/")[2])
             kept.remove(ended)

@@ -1,4 +1,4 @@
-"""How many things of a kind may go on at once in this process: of each caller, and of all together."""
+"""How many objects of a kind may go on at once in this process: of each caller, and of all together."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ class Slots:
     def take(self, caller: str, count: int = 1) -> None:
         """Take so many; give them back with ``free``. Raises Problem."""
         if self._taken[caller] + count > self._most:
-            detail = f"At most {self._most} {self._what} at once are taken. Wait until one of yours has ended."
+            detail = f"At most {self._most} {self._what} at once are allowed. Wait until one of your own has ended."
             raise Problem("TOO_MANY_REQUESTS_AT_ONCE", detail, headers=RETRY_LATER)
         self._taken[caller] += count
 

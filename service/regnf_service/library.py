@@ -52,5 +52,5 @@ def remove_entry(services: Services, caller: str, name: str) -> None:
 
 def _entry_of(field: FieldRecord) -> LibraryEntry:
     entry = LibraryEntry.of(field)
-    assert entry is not None, "it was set a moment ago"
+    assert entry is not None, "another client has just set it"
     return entry

@@ -28,8 +28,8 @@ OTHER = "other"
 
 def fairness_metrics(fair: FairQueue) -> Iterator[Metric]:
     """What each caller has waiting, and for how long."""
-    waiting = _by_caller("waiting", "Jobs and imports that wait, by caller.")
-    oldest = _by_caller("wait_seconds", "How long the first of them has waited.")
+    waiting = _by_caller("waiting", "Waiting jobs and imports, by caller.")
+    oldest = _by_caller("wait_seconds", "Waiting time of the oldest one.")
     lines = fair.lines()
     for line in lines[:_MOST_CALLERS]:
         waiting.add_metric((line.owner,), line.waiting)
@@ -45,19 +45,19 @@ def _by_caller(name: str, about: str) -> GaugeMetricFamily:
 
 
 _COUNTS = {
-    "job_attempts": ("Times that a job was handed to the workers.", ()),
-    "jobs_finished": ("Jobs that have ended.", ("status", "verdict", "reason")),
-    "imports": ("Imports that have ended.", ("state", "reason")),
-    "jobs_evicted": ("Finished jobs that went before their time, to make room.", ()),
-    "records_unreadable": ("Records that could not be read, by what they were of.", ("kind",)),
-    "queue_payloads_refused": ("Entries in the queue that this service has not written.", ("queue",)),
-    "webhook_sends": ("Messages about jobs that were sent, or not.", ("outcome",)),
+    "job_attempts": ("Number of job attempts that were given to workers.", ()),
+    "jobs_finished": ("Ended jobs.", ("status", "verdict", "reason")),
+    "imports": ("Ended imports.", ("state", "reason")),
+    "jobs_evicted": ("Finished jobs that were deleted early to free space.", ()),
+    "records_unreadable": ("Unreadable records, by kind.", ("kind",)),
+    "queue_payloads_refused": ("Queue entries that this service did not write.", ("queue",)),
+    "webhook_sends": ("Webhook messages, by outcome.", ("outcome",)),
 }
 _TIMES = {
-    "job_wait_seconds": ("From a job's acceptance to its start.", ()),
-    "job_run_seconds": ("From a job's start to its end.", ("status",)),
-    "job_phase_seconds": ("Time in a phase.", ("phase",)),
-    "import_seconds": ("From an upload to the end of its import, waiting included.", ()),
+    "job_wait_seconds": ("Time from the acceptance of a job to its start.", ()),
+    "job_run_seconds": ("Time from the start of a job to its end.", ("status",)),
+    "job_phase_seconds": ("Time of a phase.", ("phase",)),
+    "import_seconds": ("Time from an upload to the end of its import, including waiting.", ()),
 }
 
 
@@ -70,16 +70,16 @@ class Metrics:
             "regnf_http_requests", "Requests answered.", ("method", "route", "status"), registry=self.registry
         )
         self.seconds = Histogram(
-            "regnf_http_request_seconds", "Until the answer began.", ("route",), registry=self.registry
+            "regnf_http_request_seconds", "Time until the response began.", ("route",), registry=self.registry
         )
-        self.received = Counter("regnf_received_bytes", "Bytes of bodies.", ("route",), registry=self.registry)
+        self.received = Counter("regnf_received_bytes", "Size of bodies.", ("route",), registry=self.registry)
         self.redis_errors = Counter(
-            "regnf_redis_errors", "Answers and scrapes for which Redis was away.", registry=self.registry
+            "regnf_redis_errors", "Responses and scrapes without Redis.", registry=self.registry
         )
         ProcessCollector(registry=self.registry)
         self.quota_refusals = Counter(
             "regnf_quota_refusals",
-            "Calls refused because of what their caller has.",
+            "Calls refused because of a quota of the caller.",
             ("reason",),
             registry=self.registry,
         )
@@ -108,33 +108,33 @@ class _Held(Collector):
 
     def collect(self) -> Iterator[Metric]:
         services = self._services
-        yield _gauge("uploads_active", "Uploads under way.", services.uploads.taken)
-        yield _gauge("streams_active", "Event streams being read.", services.streams.taken)
+        yield _gauge("uploads_active", "Uploads in progress.", services.uploads.taken)
+        yield _gauge("streams_active", "Open event streams.", services.streams.taken)
         try:
             held = list(self._ask())
         except RedisError:
             self._metrics.redis_errors.inc()
-            yield _gauge("redis_up", "Whether Redis answered this scrape.", 0)
+            yield _gauge("redis_up", "Whether Redis responded to this scrape.", 0)
             return
-        yield _gauge("redis_up", "Whether Redis answered this scrape.", 1)
+        yield _gauge("redis_up", "Whether Redis responded to this scrape.", 1)
         yield from held
 
     def _ask(self) -> Iterator[Metric]:
         services = self._services
         active = services.records.active_jobs()
-        yield _gauge("queue_depth", "Jobs that wait for a worker.", sum(job.status == "accepted" for job in active))
-        jobs = GaugeMetricFamily("regnf_jobs_active", "Jobs that wait or run.", labels=("status", "phase"))
+        yield _gauge("queue_depth", "Jobs waiting for a worker.", sum(job.status == "accepted" for job in active))
+        jobs = GaugeMetricFamily("regnf_jobs_active", "Jobs waiting or running.", labels=("status", "phase"))
         for labels, count in sorted(Tally((job.status, job.phase or "") for job in active).items()):
             jobs.add_metric(labels, count)
         yield jobs
         imports = len(services.records.validating_fields())
-        yield _gauge("imports_active", "Imports that wait or run.", imports)
+        yield _gauge("imports_active", "Imports waiting or running.", imports)
         yield _gauge(
-            "unfinished", "Jobs and imports that wait or run: what workers are needed for.", len(active) + imports
+            "unfinished", "Jobs and imports waiting or running: the load of the workers.", len(active) + imports
         )
-        yield _gauge("workers", "Workers that have reported lately.", services.queue.live_workers())
-        yield _gauge("webhooks_waiting", "Messages still to be sent.", RedisOutbox(services.redis).waiting())
-        yield _gauge("records_set_aside", "Records known to be unreadable.", services.records.unreadable.total())
+        yield _gauge("workers", "Workers with a recent heartbeat.", services.queue.live_workers())
+        yield _gauge("webhooks_waiting", "Messages that are not sent yet.", RedisOutbox(services.redis).waiting())
+        yield _gauge("records_set_aside", "Unreadable records.", services.records.unreadable.total())
         yield from fairness_metrics(services.queue)
         counters = Counters(services.redis)
         for name, (about, names) in _COUNTS.items():

@@ -44,7 +44,7 @@ from regnf_state.journal.journaled_records import Rebuilder
 from regnf_state.settings import Settings
 from regnf_state.stores import Stores, open_stores
 
-# Ending long answers when the process is told to stop.
+# Ends long responses when the process must stop.
 #
 # The server waits for open connections before it ends the application, so an event stream that waits for the
 # application's end would never end. Hence we listen to the signals ourselves, and pass them on.
@@ -87,7 +87,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await in_thread(_check_storage, services)
-        contract = asyncio.create_task(in_thread(app.openapi))  # takes a while, so not when it is asked for
+        contract = asyncio.create_task(in_thread(app.openapi))  # takes a while, so not when it is requested
         reaping = asyncio.create_task(_reap(services))
         delivering = asyncio.create_task(deliver_until_stopped(services.webhooks, services.records, services.stopping))
         with served(metrics.registry, services.settings.metrics_address), stopping_on_signals(services.stopping):
@@ -108,7 +108,7 @@ def _check_storage(services: Services) -> None:
     try:
         claim_storage(services.redis, services.records.journal.storage_id(), services.settings.adopt_storage or None)
     except (RedisError, OSError) as error:
-        logger.warning("whose records Redis holds is looked up later: %s", type(error).__name__)
+        logger.warning("the owner of Redis's records is checked later: %s", type(error).__name__)
     except StorageMismatchError as error:
         logger.critical("%s: %s", error.reason, error)
         raise
@@ -126,9 +126,9 @@ async def _reap(services: Services) -> None:
             logger.critical("%s: %s", error.reason, error)
             signal.raise_signal(signal.SIGTERM)  # it would mix the jobs of two services
         except (RedisError, OSError) as error:
-            logger.warning("the reaper: a store does not answer: %s", type(error).__name__)
+            logger.warning("the reaper: a store does not respond: %s", type(error).__name__)
         except Exception:
-            logger.exception("an internal error ended this round of the reaper; the next round follows")
+            logger.exception("an internal error ended this round of the reaper; the next round will run")
         await pause(_REAP_EVERY_S, services.stopping)
 
 
@@ -210,7 +210,7 @@ def _include_routers(app: FastAPI, **how: Any) -> None:
 
 
 _DRAIN_S = 5
-"""How long open requests may go on once the process is told to stop."""
+"""How long open requests may continue when the process must stop."""
 _MOST_HEAD_BYTES = 16 * 1024
 _IDLE_S = 75
 """How long a connection stays open between two requests: longer than a proxy keeps one that it may use again."""

@@ -22,7 +22,7 @@ from regnf_state.redis.queue import JobQueue
 from regnf_state.room import Originals, Room
 from regnf_state.settings import Settings
 
-# One look for all event streams of the process: in each round the store is asked once about every job they follow.
+# One look for all event streams of the process: in each around the store is asked once about every job they follow.
 
 Position = tuple[str, str | None]
 """A job's id, and the last of its events that a stream has sent."""

@@ -37,9 +37,9 @@ def split_entry(entry: str) -> tuple[str | None, str]:
     if not named:
         name, secret = "", entry
     if not secret or not secret.isascii() or not secret.isprintable() or " " in secret:
-        raise TokensError(f"the entry of {name or 'a caller without a name'} holds no token")
+        raise TokensError(f"the entry of {name or 'a caller without a name'} has no token")
     if name == ANONYMOUS:
-        raise TokensError(f"the name {ANONYMOUS} is taken: it is who calls where no token is asked for")
+        raise TokensError(f"the name {ANONYMOUS} is reserved for callers without a token")
     return name or None, secret
 
 

@@ -51,7 +51,9 @@ def test_what_is_read_is_not_overwritten(run: Run, tmp_path: Path) -> None:
     before = mesh.read_bytes()
     for given, output in ((mesh, mesh), (mesh, link), (link, mesh)):
         outcome = run("convert", given, output, code=2)
-        assert outcome.stderr.startswith(f"INVALID_OPTIONS {output}: it is read, and would be overwritten")
+        assert outcome.stderr.startswith(
+            f"INVALID_OPTIONS {output}: this is an input file, and it would be overwritten"
+        )
     assert mesh.read_bytes() == before
 
 
@@ -85,12 +87,12 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
     said = ("--intrinsics", "25,25,16,12,32,24")
     safe = tmp_path / "ball.safetensors"
     run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said, code=0)
-    assert "records which parts were observed" in run("inspect", safe).stdout
+    assert "it has an observation" in run("inspect", safe).stdout
     observation = observation_of(open_field(safe))
     assert observation is not None
     assert observation.at(torch.tensor([[0.0, 0.0, 0.49], [0.0, 0.0, -0.49], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]
     options = ("--cameras", tmp_path / "poses.txt", *said, "--camera-axes", "opengl")
     refused = run("convert", tmp_path / "ball.glb", safe, *options, code=2).stderr
     assert "CAMERAS_OF_ANOTHER_FRAME" in refused
-    assert "say --camera-axes opencv" in " ".join(refused.split())
+    assert "give --camera-axes opencv" in " ".join(refused.split())
     assert "INVALID_OPTIONS" in run("convert", tmp_path / "ball.glb", safe, *said, code=2).stderr

@@ -114,7 +114,10 @@ def test_an_interrupted_batch_ends_its_processes_silently(tmp_path: Path) -> Non
         stdout, stderr = running.communicate(timeout=60)
     assert (running.returncode, stdout) == (130, "")
     said = [line for line in stderr.splitlines() if line.strip() and "0:00:" not in line and "━" not in line]
-    assert said == [f"90 pairs, 0 done; results in {results.name}", "interrupted: the same command goes on from here"]
+    assert said == [
+        f"90 pairs, 0 done; results in {results.name}",
+        "interrupted: run the same command again to continue",
+    ]
 
 
 FRAME = """
@@ -189,7 +192,7 @@ def test_a_full_output_says_so(command: list[str], tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.splitlines() == [
         "FILE_UNUSABLE output: No space left on device",
-        "hint: Make room on the disk, or name another place.",
+        "hint: Free space on the disk, or give another path.",
     ]
 
 
@@ -208,6 +211,6 @@ def test_a_full_disk_leaves_nothing(command: list[str], tmp_path: Path) -> None:
         "from regnf_cli.main import main; main()"
     )
     done = run(["-c", limited, *command], tmp_path)
-    told = [words in done.stderr for words in ("FILE_UNUSABLE", "Make room", "Traceback")]
+    told = [words in done.stderr for words in ("FILE_UNUSABLE", "Free space on the disk", "Traceback")]
     assert (done.returncode, told, left(tmp_path)) == (2, [True, True, False], ["made"]), done.stderr
     assert list((tmp_path / "made").iterdir()) == []

@@ -45,4 +45,4 @@ def test_a_fit_says_which_faces_it_turned(run: Run, tmp_path: Path) -> None:
         "fit", tmp_path / "table.ply", tmp_path / "field.safetensors", "--iterations", "1", "--table-log2", "10", code=0
     )
     assert "table.ply: " in outcome.stderr
-    assert "turned round" in outcome.stderr
+    assert "was flipped" in outcome.stderr

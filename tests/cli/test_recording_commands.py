@@ -88,7 +88,7 @@ def test_inspect_says_what_a_recording_is(name: str, run: Run, tmp_path: Path) -
 def test_inspect_tells_a_wrong_unit_and_a_frame_alone(run: Run, tmp_path: Path) -> None:
     folder = writers.tum(tmp_path / "recording", walk())
     found = report(run, folder, "--depth-unit", "mm")
-    assert found["depth_step_from"] == "what was said"
+    assert found["depth_step_from"] == "as given"
     assert "DATASET_FRAMES_DISAGREE" in found["agreement"]
     writers.depth_png(tmp_path / "depth.png", walk(1).depths[0], 1000.0)
     found = report(run, tmp_path / "depth.png", "--intrinsics", "70,72,39,31", "--picture", tmp_path / "it.png")
@@ -108,7 +108,7 @@ def test_fuse_takes_any_layout_and_refuses_what_disagrees(run: Run, tmp_path: Pa
     assert "DATASET_FRAMES_DISAGREE" in refused
     assert not output.exists()
     outcome = run("fuse", folder, output, "--voxel", 0.05, code=0)
-    assert "bounds round what the depths show" in outcome.stderr
+    assert "bounds around the measured depths" in outcome.stderr
     assert read_description(output)["kind"] == "voxel_blocks"
     for bounds in ("1,2,3", "one,2,3,4,5,6"):
         assert "--bounds" in run("fuse", folder, output, "--bounds", bounds, code=2).stderr

@@ -79,13 +79,13 @@ def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: R
     assert said.startswith("verdict      ambiguous  (SEVERAL_POSES_AGREE)")
     assert VERDICT_REASONS["SEVERAL_POSES_AGREE"] in said
     assert re.search(
-        r"^probability +\d+\.\d % that one of the poses listed is right \((default|strict)\)$", said, flags=re.M
+        r"^probability +\d+\.\d % that one of the listed poses is right \((default|strict)\)$", said, flags=re.M
     )
     assert re.search(r"^ *1 +0\.\d{4} +180 degrees about z", said, flags=re.M)
     assert said.index("T_scene_object") < said.index("center")
     assert "T_object_scene" not in said
     assert re.search(r"^center( +-?[\d.]+){3} in the scene, ±( [\d.e-]+){3} scene units$", said, flags=re.M)
-    assert re.search(r"^scale +[\d.]+ object units for each scene unit, ± [\d.e-]+ %$", said, flags=re.M)
+    assert re.search(r"^scale +[\d.]+ object units per scene unit, ± [\d.e-]+ %$", said, flags=re.M)
     assert re.search(r"^rotation +±( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
     assert re.search(r"^symmetry +2 rotations about z of the object look the same", said, flags=re.M)
 
@@ -94,7 +94,7 @@ def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: R
     ("symmetry", "said"),
     [
         ({"order": 1, "axis": None, "continuous": False}, "none"),
-        ({"order": 4, "axis": None, "continuous": False}, "4 rotations look the same, the identity included"),
+        ({"order": 4, "axis": None, "continuous": False}, "4 rotations look the same, including the identity"),
         ({"order": 1, "axis": [0, 0, 1], "continuous": True}, "any rotation about z of the object"),
         ({"order": 2, "axis": [1, 0, 0], "continuous": True}, "any rotation about x of the object, and"),
     ],
@@ -135,7 +135,7 @@ def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
     assert read_options(file, None) == read_options(file, "paper") == {"preset": "paper"}
     assert read_options(None, "paper") == {"preset": "paper"}
     assert read_options(None, None) == {}
-    with pytest.raises(InvalidOptionsError, match="says 'paper', --preset robust"):
+    with pytest.raises(InvalidOptionsError, match="has 'paper', and --preset is robust"):
         read_options(file, "robust")
 
 

@@ -121,8 +121,8 @@ def test_a_ranking_says_whether_candidates_can_be_told_apart(capfd: pytest.Captu
     show_ranking({"candidates": ranked}, 3)
     told = [line.strip() for line in capfd.readouterr().out.splitlines()][-2:]
     assert told == [
-        "2 is told apart from the first by 3.7 % of the surface, which was seen",
-        "3 cannot be told apart from the first by what was seen",
+        "2 is distinguished from the first by 3.7 % of the surface, which was observed",
+        "3 cannot be distinguished from the first by the observed surface",
     ]
 
 

@@ -156,12 +156,16 @@ def test_tables(text: str, ending: str, tmp_path: Path) -> None:
 
 
 HEADERS = {
-    "misspelled": ("scen,object,detection\n", "no member `scen` is known", "Did you mean `scene`"),
-    "without a column": ("scene,object\n", "`detection` is missing", "Name the columns"),
-    "none at all": ("room.ply,chair.ply,box.json\n", "no member `room.ply`", "Name the columns"),
-    "twice": ("scene,object,detection,scene\n", "twice", "Name the columns"),
-    "empty": ("key\n", "`scene` is missing", "Name the columns"),
-    "no text": ("scene,object,detection\na\x81b", "no text in UTF-8 from byte 25 (0x81) on, nor in Windows-1252", ""),
+    "misspelled": ("scen,object,detection\n", "unknown member `scen`", "Did you mean `scene`"),
+    "without a column": ("scene,object\n", "`detection` is missing", "Write the column names"),
+    "none at all": ("room.ply,chair.ply,box.json\n", "unknown member `room.ply`", "Write the column names"),
+    "twice": ("scene,object,detection,scene\n", "twice", "Write the column names"),
+    "empty": ("key\n", "`scene` is missing", "Write the column names"),
+    "no text": (
+        "scene,object,detection\na\x81b",
+        "not a text in UTF-8 from byte 25 (0x81) on, and not in Windows-1252",
+        "",
+    ),
 }
 
 
@@ -193,11 +197,14 @@ def test_failed_rows_are_shown(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"\x80\x01\x00\x00\x00\x00\x00\x00{", "no text in UTF-8 from byte 1 (0x80) on, and has control characters"),
-        ("ä".encode() + b"\xff", "no text in UTF-8 from byte 3 (0xff) on"),
-        (b"\xef\xbb\xbfab\xff", "no text in UTF-8 from byte 6 (0xff) on"),
-        (b"\xff\xfea\x00b", "no text in UTF-16-LE from byte 5 (0x62) on"),
-        (b"{\x00\x01\x00", "no text in UTF-8 or UTF-16-LE: it has the control character 0x01"),
+        (
+            b"\x80\x01\x00\x00\x00\x00\x00\x00{",
+            "not a text in UTF-8 from byte 1 (0x80) on, and it has control characters",
+        ),
+        ("ä".encode() + b"\xff", "not a text in UTF-8, from byte 3 (0xff) on"),
+        (b"\xef\xbb\xbfab\xff", "not a text in UTF-8, from byte 6 (0xff) on"),
+        (b"\xff\xfea\x00b", "not a text in UTF-16-LE, from byte 5 (0x62) on"),
+        (b"{\x00\x01\x00", "not a text in UTF-8 or UTF-16-LE: it has the control character 0x01"),
     ],
 )
 def test_what_is_no_text_says_what_was_tried(data: bytes, said: str) -> None:
@@ -209,7 +216,7 @@ def test_what_is_no_text_says_what_was_tried(data: bytes, said: str) -> None:
 def test_every_reader_says_which_byte_it_was(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"robot:\x81")
-    said = r"no text in UTF-8 from byte 7 \(0x81\) on, nor in Windows-1252"
+    said = r"not a text in UTF-8 from byte 7 \(0x81\) on, and not in Windows-1252"
     for kind, read in (
         (InvalidInputError, lambda: read_detection(file)),
         (FieldFormatError, lambda: read_documents((SettingsFile("a.yml", memoryview(file.read_bytes())),))),

@@ -188,7 +188,7 @@ def test_what_does_not_go_together(world: World) -> None:
     assert_refused(post(world, searching(world, **paper)), 422, "PRESET_UNSUITABLE")
     assert_refused(post(world, one | start | {"options": {"preset": "fastest"}}), 422, "INVALID_OPTIONS")
     gone = assert_refused(post(world, one | {"options": {"robust": {"min_inlier_share": 0.5}}}), 422, "INVALID_OPTIONS")
-    assert gone["hint"] == "The probability alone decides: see `robust.acceptance`"
+    assert gone["hint"] == "Only the probability decides: see `robust.acceptance`"
 
 
 @stays

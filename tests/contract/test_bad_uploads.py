@@ -142,7 +142,7 @@ def test_a_text_part_one_byte_too_long_is_refused_by_its_name(world: World) -> N
     for name, limit in (("upload", 272), ("description", 16384)):
         answer = send(world, part(name, b"a" * (limit + 1)) + END)
         problem = assert_refused(answer, 413, "REQUEST_TOO_LARGE")
-        assert problem["detail"] == f"The part {name} takes at most {limit} bytes."
+        assert problem["detail"] == f"The part {name} can have at most {limit} bytes."
 
 
 def test_a_digest_of_a_body_in_parts_is_compared_with_all_of_it(world: World) -> None:

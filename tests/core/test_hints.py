@@ -17,6 +17,7 @@ import typer
 from regnf_cli.commands import app_of
 from regnf_core.errors import _FAMILIES, HINTS, VERDICT_REASONS, InvalidOptionsError, hint_of, verdict_hint
 from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.options import RegistrationOptions, _names
 from regnf_core.rendering.request import RenderOptions
 from regnf_core.rotations import similarity_fault
@@ -139,12 +140,13 @@ def test_every_command_that_a_hint_names_is_there() -> None:
 def test_every_option_and_setting_that_a_hint_names_is_there() -> None:
     options = {".".join((*group, name)) for group, names in _names().items() for name in names}
     options |= {one.name for one in fields(RenderOptions)}
+    imports = {one.name for one in fields(UploadDescription)}
     settings = {f"REGNF_{name.upper()}" for name in Settings.model_fields} | {
         name for path in ROOT.glob("regnf_*/**/*.py") for name in re.findall(r'"(REGNF_[A-Z_]+)"', path.read_text())
     }
     for path, text in texts():
-        for name in re.findall(r"\boption ((?:robust\.)?[a-z]+_[a-z_]+)\b", text):
-            assert name in options, (path, text)
+        for kind, name in re.findall(r"\b(import )?option ((?:robust\.)?[a-z]+_[a-z_]+)\b", text):
+            assert name in (imports if kind else options), (path, text)
         for name in re.findall(r"REGNF_[A-Z_]*[A-Z]", text):
             assert name in settings, (path, name)
 

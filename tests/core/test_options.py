@@ -30,7 +30,7 @@ def test_an_unknown_option_is_refused_with_the_name_that_was_meant(values: dict[
 
 
 def test_a_limit_of_a_share_is_refused_with_what_decides_now() -> None:
-    with pytest.raises(InvalidOptionsError, match=r"the probability alone decides: see `robust\.acceptance`"):
+    with pytest.raises(InvalidOptionsError, match=r"only the probability decides: see `robust\.acceptance`"):
         RegistrationOptions.from_dict({"robust": {"min_inlier_share": 0.5}})
 
 

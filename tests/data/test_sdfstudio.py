@@ -300,7 +300,7 @@ def test_the_largest_number_of_a_type_is_no_depth(folder: Path, kind: type[np.un
 
 
 def test_a_mask_or_a_colored_picture_is_no_depth(folder: Path) -> None:
-    for mode, said in (("1", "one bit a pixel"), ("P", "a palette of colors")):
+    for mode, said in (("1", "one bit per pixel"), ("P", "a palette of colors")):
         Image.fromarray(np.eye(4, 6, dtype=np.uint8) * 255).convert(mode).save(folder / "depth.png")
 
         def use(metadata: dict[str, Any]) -> None:

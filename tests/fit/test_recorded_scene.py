@@ -55,13 +55,13 @@ def test_a_detection_of_another_thing_is_left_out_and_named() -> None:
     recording, masks = recording_of_turns([0.0, 15.0, -15.0])
     found = recorded_scene(recording, told(masks, (1,)), BOUNDS, METERS)
     np.testing.assert_allclose(found.box.center.numpy(), CENTER, atol=0.3 * RADIUS)
-    assert any("another thing than 1" in note for note in found.notes)
+    assert any("another object than 1" in note for note in found.notes)
     assert found.camera.frame == "0"
 
 
 def test_detections_that_show_no_common_thing_are_refused() -> None:
     recording, masks = recording_of_turns([0.0, 15.0])
-    with pytest.raises(InvalidDetectionError, match="the detections of the frames 0, 1 show no common thing"):
+    with pytest.raises(InvalidDetectionError, match="the detections of the frames 0, 1 show no common object"):
         recorded_scene(recording, told(masks, (1,)), BOUNDS, METERS)
 
 

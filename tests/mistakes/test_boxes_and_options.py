@@ -22,17 +22,17 @@ BOXES = [
     Case("YAML", "MALFORMED_JSON", 2, "b.json", "not JSON", "Write it as JSON", "center: [0, 0, 0]"),
     Case("empty detection", "MALFORMED_JSON", 2, "b.json", "value is expected", "It is empty", ""),
     Case("cut off", "MALFORMED_JSON", 2, "b.json", "not JSON", "ends too early", '{"center": [0, 0, 0]'),
-    Case("NaN", "INVALID_DETECTION", 2, r"b.json: detection.center\[0\] is NaN", "expected a finite", "leave such boxes out", '{"center": [NaN, 0, 0], "size": [1, 1, 1]}'),
+    Case("NaN", "INVALID_DETECTION", 2, r"b.json: detection.center\[0\] is NaN", "expected a finite", "Leave such boxes out", '{"center": [NaN, 0, 0], "size": [1, 1, 1]}'),
     Case("numbers as texts", "INVALID_DETECTION", 2, r'center\[0\] is the text "0"', "expected a number", "quotation", '{"center": ["0", 0, 0], "size": [1, 1, 1]}'),
     Case("no size", "INVALID_DETECTION", 2, "detection.size", "is missing", FORMS, '{"center": [0, 0, 0]}'),
     Case("misspelled member", "INVALID_DETECTION", 2, "detection.cnter", "not a member", "Did you mean `center`", '{"cnter": [0, 0, 0], "size": [1, 1, 1]}'),
     Case("position", "INVALID_DETECTION", 2, "detection.position", "not a member", "Did you mean `center`", '{"position": [0, 0, 0], "size": [1, 1, 1]}'),
     Case("yaw", "INVALID_DETECTION", 2, "detection.yaw", "not a member", "rotation_quaternion_xyzw", '{"center": [0, 0, 0], "size": [1, 1, 1], "yaw": 90}'),
     Case("half extents", "INVALID_DETECTION", 2, "half_extents", "not a member", "full edge lengths", '{"center": [0, 0, 0], "half_extents": [1, 1, 1]}'),
-    Case("order of the quaternion", "INVALID_DETECTION", 2, r"detection.rotation is four numbers, \[1, 0, 0, 0\]", "unknown order", "xyzw.*wxyz", '{"center": [0, 0, 0], "size": [1, 1, 1], "rotation": [1, 0, 0, 0]}'),
-    Case("scaled matrix", "INVALID_DETECTION", 2, "detection.R", "no rotation: R R", "keep the scale in `size`", '{"center": [0, 0, 0], "size": [1, 1, 1], "R": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}'),
+    Case("order of the quaternion", "INVALID_DETECTION", 2, r"detection.rotation is a quaternion of unknown order, \[1, 0, 0, 0\]", "unknown order", "xyzw.*wxyz", '{"center": [0, 0, 0], "size": [1, 1, 1], "rotation": [1, 0, 0, 0]}'),
+    Case("scaled matrix", "INVALID_DETECTION", 2, "detection.R", "not a rotation: R R", "Put the scale into `size`", '{"center": [0, 0, 0], "size": [1, 1, 1], "R": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}'),
     Case("reflection", "INVALID_DETECTION", 2, "detection.R", "expected a rotation", "Negate", '{"center": [0, 0, 0], "size": [1, 1, 1], "R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}'),
-    Case("swapped corners", "INVALID_DETECTION", 2, r"max\[0\] is -0.8", "expected more than min", "look swapped", '{"min": [0.1, 0.2, 0.3], "max": [-0.8, -0.5, -0.4]}'),
+    Case("swapped corners", "INVALID_DETECTION", 2, r"max\[0\] is -0.8", "expected more than min", "are swapped", '{"min": [0.1, 0.2, 0.3], "max": [-0.8, -0.5, -0.4]}'),
     Case("negative size", "INVALID_DETECTION", 2, r"size\[2\] is -0.5", "above 0", "full edge lengths", '{"center": [0, 0, 0], "size": [1, 1, -0.5]}'),
     Case("brackets without an end", "MALFORMED_JSON", 2, "b.json", "nested|deep", "", "[" * 100_000),
     Case("flat box", "INVALID_DETECTION", 2, r"size\[2\] is 0", "above 0", "thick", '{"center": [0, 0, 0], "size": [1, 1, 0]}'),
@@ -51,7 +51,7 @@ OPTIONS = [
     Case("option of another type", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "valid integer", "regnf manual api", '{"robust": {"rotations": "many"}}'),
     Case("option out of range", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "less than or equal to 20000", "regnf manual api", '{"robust": {"rotations": 1000000}}'),
     Case("misspelled preset", "INVALID_OPTIONS", 2, "o.json: options.preset", "'paper' or 'robust'", "regnf manual api", '{"preset": "papr"}'),
-    Case("options as a list", "MALFORMED_JSON", 2, "o.json", "expected a JSON object", "Write an object", "[]"),
+    Case("options as a list", "MALFORMED_JSON", 2, "o.json", "expected a JSON object", "Write a JSON object", "[]"),
 ]  # fmt: skip
 
 
@@ -88,7 +88,7 @@ def test_swapped_scene_and_object(run: Run, folder: Path) -> None:
     (folder / "far.json").write_text(json.dumps({"center": [1.1, 1.1, 0.0], "size": [0.3, 0.3, 0.3]}))
     outcome = run("register", "chair.safetensors", "room.safetensors", "--detection", "far.json", code=2)
     assert outcome.stderr.startswith("DETECTION_OUTSIDE_SCENE chair.safetensors: the box is")
-    assert "are scene and object swapped?" in outcome.stderr
+    assert "whether scene and object are swapped." in outcome.stderr
 
 
 def test_the_same_file_twice(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

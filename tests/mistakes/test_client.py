@@ -49,11 +49,11 @@ BEFORE: list[tuple[Case, Call]] = [
     (Case("box member misspelled", "INVALID_DETECTION", 0, "detection.cnter", "not a member", "Did you mean `center`"), lambda c: c.register(SCENE, OBJECT, {"cnter": [0, 0, 0], "size": [1, 1, 1]})),
     (Case("option misspelled", "INVALID_OPTIONS", 0, "options.upaxis", "no such option", "did you mean `up_axis`"), lambda c: c.register(SCENE, OBJECT, BOX, {"upaxis": "z"})),
     (Case("text for options", "INVALID_OPTIONS", 0, "options is a str", "expected a dictionary", "up_axis"), lambda c: c.register(SCENE, OBJECT, BOX, "robust")),
-    (Case("no job", "INVALID_JOB", 0, "None names no job", "job", "what `submit` returned"), lambda c: c.wait(None)),
-    (Case("path for a job", "INVALID_JOB", 0, "out/job", "names no job", "`id`"), lambda c: c.result("out/job")),
-    (Case("pair beyond the lists", "PAIR_UNKNOWN", 0, r"no pair \(1, 0\)", "1 detections", "count from 0"), lambda c: c.register_batch(SCENE, [BOX], [OBJECT], [(1, 0)])),
+    (Case("no job", "INVALID_JOB", 0, "None is no job", "job", "return value of `submit`"), lambda c: c.wait(None)),
+    (Case("path for a job", "INVALID_JOB", 0, "out/job", "is no job", "`id`"), lambda c: c.result("out/job")),
+    (Case("pair beyond the lists", "PAIR_UNKNOWN", 0, r"no pair \(1, 0\)", "1 detections", "start at 0"), lambda c: c.register_batch(SCENE, [BOX], [OBJECT], [(1, 0)])),
     (Case("one object for a search", "INVALID_INPUT", 0, "objects", "must be a list", r"\[object\]"), lambda c: c.search(SCENE, OBJECT, BOX)),
-    (Case("search among nothing", "LIBRARY_EMPTY", 0, "objects", "is empty", "choose among"), lambda c: c.search(SCENE, [], BOX)),
+    (Case("search among nothing", "LIBRARY_EMPTY", 0, "objects", "is empty", "Give the candidates"), lambda c: c.search(SCENE, [], BOX)),
     (Case("file that is no field", "FORMAT_NOT_RECOGNIZED", 0, "photo.png", "picture|image|PNG", "docs/import-gate.md|checkpoint"), lambda c: c.upload("photo.png")),
 ]  # fmt: skip
 AFTER: list[tuple[Case, Call]] = [
@@ -62,7 +62,7 @@ AFTER: list[tuple[Case, Call]] = [
     (Case("result too early", "JOB_NOT_READY", 409, "result", "no result yet", "client.wait"), lambda c: c.result(c.submit(SCENE, OBJECT, BOX))),
     (Case("box in millimeters", "DETECTION_OUTSIDE_SCENE", 422, "units from the scene", "the scene reaches from|center is", "millimeters"), lambda c: c.register(SCENE, OBJECT, {"center": [300, 400, 500], "size": [100, 100, 100]})),
     (Case("webhook that is not allowed", "WEBHOOK_NOT_ALLOWED", 422, "webhook|host", "allow", "allow|operator"), lambda c: c.submit(SCENE, OBJECT, BOX, more={"webhook": {"url": "https://example.org/x"}})),
-    (Case("member that is not known", "INVALID_REQUEST", 422, "sede", "not known", "Did you mean `seed`"), lambda c: c.submit(SCENE, OBJECT, BOX, more={"sede": 3})),
+    (Case("member that is not known", "INVALID_REQUEST", 422, "sede", "unknown", "Did you mean `seed`"), lambda c: c.submit(SCENE, OBJECT, BOX, more={"sede": 3})),
 ]  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def test_a_service_that_does_not_run_or_is_another() -> None:
     case = Case("", "SERVICE_UNAVAILABLE", 0, "http://127.0.0.1:1", "does not answer", "regnf serve")
     with Client("http://127.0.0.1:1", retries=0) as client:
         assert_refused(case, client.jobs)
-    case = Case("", "SERVICE_ERROR", 0, "the answer is no Job", "id", "another service's")
+    case = Case("", "SERVICE_ERROR", 0, "the response is not a valid Job", "id", "another service")
     assert_refused(case, lambda: pretended(lambda _: httpx.Response(200, json={"status": "fine"})).job("j"))
     case = Case(
         "", "SERVICE_ERROR", 0, "HTTP status 200 from http://service/jobs/j", "no regnf service", "Check address"

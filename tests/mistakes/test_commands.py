@@ -14,7 +14,7 @@ from tests.cli.conftest import Answers, Run, Serve, field, service, without_work
 from tests.mistakes.case import Case, parametrized
 
 REGISTER = ["register", "room.safetensors", "chair.safetensors", "--detection", "box.json"]
-HELP = "--help` shows"
+HELP = "--help` lists"
 CASES = [
     Case("unknown command", "USAGE", 2, "regster", "No such command", "register", ["regster"]),
     Case("unknown option", "USAGE", 2, "--detectin", "No such option", "--detection", ["register", "--detectin", "x"]),
@@ -24,7 +24,7 @@ CASES = [
     Case("negative seed", "USAGE", 2, "--seed", "greater than or equal to 0", "regnf register " + HELP, [*REGISTER, "--seed=-1"]),
     Case("seed of letters", "USAGE", 2, "--seed", "integer", HELP, [*REGISTER, "--seed", "abc"]),
     Case("typo in the preset", "USAGE", 2, "'papr'", "not one of", "Did you mean paper", [*REGISTER, "--preset", "papr"]),
-    Case("JSON for a file", "FILE_NOT_FOUND", 2, r'\{"min"', "no such file", "write the JSON into a file", [*REGISTER[:4], '{"min": [0, 0, 0]}']),
+    Case("JSON for a file", "FILE_NOT_FOUND", 2, r'\{"min"', "no such file", "Write the JSON into a file", [*REGISTER[:4], '{"min": [0, 0, 0]}']),
     Case("detection missing", "FILE_NOT_FOUND", 2, "bx.json", "no such file", "Did you mean box.json", [*REGISTER[:4], "bx.json"]),
     Case("detection a folder", "FILE_IS_FOLDER", 2, "nothing", "expected a file", "Give a file", [*REGISTER[:4], "nothing"]),
     Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON is expected", [*REGISTER[:4], "chair.safetensors"]),
@@ -35,15 +35,15 @@ CASES = [
     Case("recording of a service's job", "INVALID_OPTIONS", 2, "--recording", "", "", [*REGISTER, "--recording", "chair.rrd", "--server", "http://127.0.0.1:1"]),
     Case("output below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json/out"]),
     Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--ground-truth", "box.json"]),
-    Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected safe fields", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
+    Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected regnf field files", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
     Case("library missing", "FILE_NOT_FOUND", 2, "nowhere", "no such file", "Check the path", ["search", "room.safetensors", "nowhere", *REGISTER[3:]]),
-    Case("library of a run's folder above", "FILE_TRUNCATED", 2, "step-000030000.ckpt", "cut short", "Copy or download", ["search", "room.safetensors", "run", *REGISTER[3:]]),
-    Case("converting to an unknown format", "INVALID_OPTIONS", 2, "out.xyz", "expected a name that ends in", "ending", ["convert", "chair.safetensors", "out.xyz"]),
+    Case("library of a run's folder above", "FILE_TRUNCATED", 2, "step-000030000.ckpt", "truncated", "Copy or download", ["search", "room.safetensors", "run", *REGISTER[3:]]),
+    Case("converting to an unknown format", "INVALID_OPTIONS", 2, "out.xyz", "expected a name that ends in", "suffix", ["convert", "chair.safetensors", "out.xyz"]),
     Case("converting into no folder", "INVALID_OPTIONS", 2, "there", "no such folder", "mkdir", ["convert", "chair.safetensors", "there/out.ply"]),
     Case("picture of no PNG", "INVALID_OPTIONS", 2, "a.jpg", "ends in .png", "--picture field.png", ["inspect", "chair.safetensors", "--picture", "a.jpg"]),
     Case("server without scheme", "INVALID_ADDRESS", 2, "localhost:8080", "http://", "Did you mean http://localhost:8080", [*REGISTER, "--server", "localhost:8080"]),
     Case("server of another scheme", "INVALID_ADDRESS", 2, "ftp://host", "http:// or https://", "regnf serve", [*REGISTER, "--server", "ftp://host"]),
-    Case("worker without Redis", "REDIS_URL_MISSING", 3, "REGNF_REDIS_URL", "no Redis is named", "redis://|regnf serve", ["worker"]),
+    Case("worker without Redis", "REDIS_URL_MISSING", 3, "REGNF_REDIS_URL", "no address of a Redis", "redis://|regnf serve", ["worker"]),
     Case("Redis that is no address", "INVALID_SETTINGS", 2, "--redis-url", "expected redis://", "Write for example", ["worker", "--redis-url", "localhost"]),
     Case("Redis that does not run", "REDIS_UNAVAILABLE", 3, "127.0.0.1:9", "does not answer", "Start Redis", ["worker", "--redis-url", "redis://127.0.0.1:9/0"]),
     Case("port out of range", "USAGE", 2, "--port", "65535", "regnf serve " + HELP, ["serve", "--port", "70000"]),
@@ -90,7 +90,7 @@ def test_two_services_on_one_state_folder(run: Run, folder: Path) -> None:
     [
         ("REGNF_WORKERS", "many", "REGNF_WORKERS: .*integer.*hint: Correct the environment variable"),
         ("REGNF_REDIS_URL", "localhost:6379", "REGNF_REDIS_URL: .*expected redis://.*hint: Write for example"),
-        ("REGNF_API_TOKENS", '["a:"]', "TOKENS_UNUSABLE .*holds no token.*hint: Write entries as NAME:TOKEN"),
+        ("REGNF_API_TOKENS", '["a:"]', "TOKENS_UNUSABLE .*has no token.*hint: Write entries as NAME:TOKEN"),
     ],
 )
 def test_wrong_settings(
@@ -107,7 +107,7 @@ def test_an_output_that_cannot_be_written(run: Run, folder: Path) -> None:
     (folder / "closed").mkdir(mode=0o500)
     outcome = run(*REGISTER, "--output", "closed/out")
     assert outcome.code == 2, outcome.stderr
-    Case("", "", 2, "closed/out", "Permission denied", "Check who may write").check(outcome.stderr)
+    Case("", "", 2, "closed/out", "Permission denied", "Check the permissions").check(outcome.stderr)
 
 
 def test_a_server_that_does_not_run(run: Run, folder: Path) -> None:
@@ -171,7 +171,7 @@ def test_an_interrupted_job_goes_on_or_is_cancelled_on_request(
     outcome = run(*REGISTER, "--server", address, *(["--cancel-on-interrupt"] if cancel else []))
     assert (outcome.code, ("POST", "/jobs/j/cancel") in calls) == (130, cancel)
     told = (f"{address}/jobs/j/view", f"curl -X POST {address}/jobs/j/cancel")
-    said = ("canceled the job j", "", "") if cancel else ("the job j goes on", *told)
+    said = ("canceled the job j", "", "") if cancel else ("the job j continues", *told)
     Case("", "", 130, *said).check(outcome.stderr)
 
 

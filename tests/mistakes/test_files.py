@@ -10,7 +10,7 @@ from tests.cli.conftest import DATA, Run
 from tests.core.importing.archives import zip_bytes
 from tests.mistakes.case import Case, parametrized
 
-FIELD = "expected a f|field is expected|not a field|not the file|cut short|empty|no bytes|unpack"
+FIELD = "expected a f|not a field|not the file|truncated|empty|unpack"
 
 
 def write(name: str, content: bytes) -> Callable[[Path], object]:
@@ -35,7 +35,7 @@ CASES = [
     Case("another ending", "FILE_NOT_FOUND", 2, "room.ckpt", "no such file", "Did you mean room.safetensors", "room.ckpt"),
     Case("folder missing", "FILE_NOT_FOUND", 2, "exports/room.ckpt", "no such file", "There is no folder exports", "exports/room.ckpt"),
     Case("empty folder", "RUN_WITHOUT_CHECKPOINT", 2, "nothing", "checkpoint", "Give the folder of one training run", "nothing"),
-    Case("folder of a run cut short", "FILE_TRUNCATED", 2, "run/sdfstudio_models/step-000030000.ckpt", "cut short|too early|ends", "again", "run"),
+    Case("folder of a run cut short", "FILE_TRUNCATED", 2, "run/sdfstudio_models/step-000030000.ckpt", "truncated|too early|ends", "again", "run"),
     Case("config of a run", "FORMAT_NOT_RECOGNIZED", 2, "run/config.yml", FIELD, "mean run/sdfstudio_models/step-000030000.ckpt", "run/config.yml"),
     Case("detection as scene", "FORMAT_NOT_RECOGNIZED", 2, "box.json", FIELD, "mean run/|checkpoint", "box.json"),
     Case("empty file", "FILE_EMPTY", 2, "a.ckpt", FIELD, "again", "a.ckpt", write("a.ckpt", b"")),
@@ -43,13 +43,13 @@ CASES = [
     Case("photo", "FORMAT_NOT_RECOGNIZED", 2, "a.jpg: a JPEG", FIELD, "checkpoint", "a.jpg", write("a.jpg", b"\xff\xd8\xff\xe0000")),
     Case("web page", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt: an HTML page", FIELD, "download", "a.ckpt", write("a.ckpt", b"<!DOCTYPE html><html>")),
     Case("Git LFS pointer", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt", FIELD, "git lfs pull", "a.ckpt", write("a.ckpt", b"version https://git-lfs.github.com/spec/v1\n")),
-    Case("gzip archive", "FILE_TRUNCATED", 2, "a.tar.gz", "cut short", "again", "a.tar.gz", write("a.tar.gz", b"\x1f\x8b\x08\0\0\0")),
+    Case("gzip archive", "FILE_TRUNCATED", 2, "a.tar.gz", "truncated", "again", "a.tar.gz", write("a.tar.gz", b"\x1f\x8b\x08\0\0\0")),
     Case("notes", "FORMAT_NOT_RECOGNIZED", 2, "notes.txt", FIELD, "checkpoint|mean", "notes.txt", write("notes.txt", b"to do")),
     Case("bare pickle", "RAW_PICKLE", 2, "a.pkl", "torch.save", "Save it again", "a.pkl", write("a.pkl", b"\x80\x04\x95\0\0\0\0}.")),
     Case("zip of other things", "RUN_WITHOUT_CHECKPOINT", 2, "a.zip", "checkpoint", "regnf manual import-gate", "a.zip", write("a.zip", zip_bytes([("a.txt", b"to do")]))),
-    Case("truncated checkpoint", "FILE_TRUNCATED", 2, "cut.ckpt", "cut short", "again", "cut.ckpt", cut_checkpoint),
+    Case("truncated checkpoint", "FILE_TRUNCATED", 2, "cut.ckpt", "truncated", "again", "cut.ckpt", cut_checkpoint),
     Case("truncated safe field", "SAFE_FORMAT_INVALID", 2, "a.safetensors", "safetensors", "again|docs", "a.safetensors", lambda folder: (folder / "a.safetensors").write_bytes((DATA / "armchair.safetensors").read_bytes()[:3000])),
-    Case("checkpoint of another network", "FIELD_NOT_RECOGNIZED", 2, "other.ckpt.*encoder", "no known", "regnf manual import-gate", "other.ckpt", foreign_checkpoint),
+    Case("checkpoint of another network", "FIELD_NOT_RECOGNIZED", 2, "other.ckpt.*encoder", "family of the field is unknown", "regnf manual import-gate", "other.ckpt", foreign_checkpoint),
 ]  # fmt: skip
 
 

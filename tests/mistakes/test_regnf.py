@@ -38,21 +38,21 @@ CASES = [
     Case("option misspelled", "INVALID_OPTIONS", 0, "options.upaxis", "no such option", "did you mean `up_axis`", registered(options={"upaxis": "z"})),
     Case("option in the wrong group", "INVALID_OPTIONS", 0, "options.rotations", "no such option", "did you mean `robust.rotations`", registered(options={"rotations": 100})),
     Case("axis in upper case", "INVALID_OPTIONS", 0, "options.up_axis", "'x', 'y' or 'z'", "docs/api.md", registered(options={"up_axis": "Z"})),
-    Case("start under another preset", "PRESET_UNSUITABLE", 0, "given transform", "only the preset `robust`", "paper", registered(room(chair_pose()), chair(), options={"preset": "paper"}, initial_transform=chair_pose())),
+    Case("start under another preset", "PRESET_UNSUITABLE", 0, "initial transform", "only the preset `robust`", "paper", registered(room(chair_pose()), chair(), options={"preset": "paper"}, initial_transform=chair_pose())),
     Case("no box", "INVALID_DETECTION", 0, "detection is null", "expected an object with a box", '"min"', registered(detection=None)),
     Case("JSON text for a box", "INVALID_DETECTION", 0, "detection is a text", "expected an object", '"min"', lambda: wrong.OrientedBox.from_dict('{"min": [0, 0, 0]}')),
     Case("a point for a box", "INVALID_DETECTION", 0, "detection", "expected", '"min"', registered(detection=[0.1, 0.2, 0.3])),
-    Case("corners swapped", "INVALID_DETECTION", 0, r"detection\[1\]\[0\]", "expected more than min", "look swapped", registered(detection=([1, 1, 1], [0, 0, 0]))),
+    Case("corners swapped", "INVALID_DETECTION", 0, r"detection\[1\]\[0\]", "expected more than min", "are swapped", registered(detection=([1, 1, 1], [0, 0, 0]))),
     Case("box in millimeters", "DETECTION_OUTSIDE_SCENE", 0, "units from the scene", "the scene reaches from", "millimeters", registered(detection={"center": [-560, -280, -240], "size": [550, 600, 510]})),
     Case("one size for all axes", "INVALID_DETECTION", 0, "detection.size", "expected", "docs/api.md|x, y, z", lambda: wrong.OrientedBox.from_center([0, 0, 0], 1.0)),
     Case("rotation of a plane", "INVALID_DETECTION", 0, "detection.rotation", "expected|3x3", "docs/api.md|xyzw|3x3", lambda: wrong.OrientedBox.from_center([0, 0, 0], [1, 1, 1], np.eye(2))),
-    Case("dictionary for a box of Open3D", "INVALID_DETECTION", 0, "a dict is no box of Open3D", "Give an OrientedBoundingBox", "from_dict", lambda: wrong.OrientedBox.from_open3d(BOX)),
-    Case("one box for a batch", "INVALID_DETECTION", 0, "the detections", "expected a list", r"\[box\]", batch(regnf.OrientedBox.from_dict(BOX))),
-    Case("pair beyond the lists", "PAIR_UNKNOWN", 0, r"no pair \(0, 1\)", "1 objects", "count from 0", batch([BOX], pairs=[(0, 1)])),
-    Case("pairs that are none", "PAIR_UNKNOWN", 0, "0 is no pair", "pair of detection and object", r"Write \[\(0, 0\)", batch([BOX], pairs=[0, 0])),
+    Case("dictionary for a box of Open3D", "INVALID_DETECTION", 0, "a dict is not a box of Open3D", "Give an OrientedBoundingBox", "from_dict", lambda: wrong.OrientedBox.from_open3d(BOX)),
+    Case("one box for a batch", "INVALID_DETECTION", 0, "detections is a single box", "expected a list", r"\[box\]", batch(regnf.OrientedBox.from_dict(BOX))),
+    Case("pair beyond the lists", "PAIR_UNKNOWN", 0, r"no pair \(0, 1\)", "1 objects", "start at 0", batch([BOX], pairs=[(0, 1)])),
+    Case("pairs that are none", "PAIR_UNKNOWN", 0, "0 is not a pair", "pair of detection and object", r"Write for example \[\(0, 0\)", batch([BOX], pairs=[0, 0])),
     Case("batch by the other preset", "INVALID_OPTIONS", 0, "`paper`", "only the preset `robust`", "docs/api.md", batch([BOX], options={"preset": "paper"})),
     Case("search among nothing", "LIBRARY_EMPTY", 0, "library", "no objects", "at least one", lambda: wrong.search(ROOM, [], BOX)),
-    Case("search in an empty folder", "LIBRARY_EMPTY", 0, "nothing", "no fields in it", "Give the folder", lambda: wrong.search(ROOM, "nothing", BOX)),
+    Case("search in an empty folder", "LIBRARY_EMPTY", 0, "nothing", "it has no fields", "Give the folder", lambda: wrong.search(ROOM, "nothing", BOX)),
     Case("search by the other preset", "PRESET_UNSUITABLE", 0, "`paper`", "only the preset `robust`", "robust", lambda: wrong.search(ROOM, [CHAIR], BOX, {"preset": "paper"})),
     Case("search among a number", "NO_FIELD", 0, "the objects are a int", "list of fields", "Give a folder", lambda: wrong.search(ROOM, 3, BOX)),
     Case("fit into a mesh file", "INVALID_OPTIONS", 0, "chair.glb", "ends in .safetensors", "Write chair.safetensors", lambda: wrong.fit(CHAIR, "chair.glb")),
@@ -82,4 +82,4 @@ def test_results_that_cannot_be_saved(folder: Path) -> None:
     result = regnf.register(ROOM, CHAIR, box, {"up_axis": "z"}, clouds=False)
     with pytest.raises(regnf.RegnfError, match="no point clouds") as caught:
         result.save("out")
-    assert "clouds=False" in str(caught.value.hint)
+    assert "clouds=True" in str(caught.value.hint)

@@ -327,7 +327,7 @@ def test_without_a_map_the_camera_is_the_world(monkeypatch: pytest.MonkeyPatch, 
     robot = Robot(monkeypatch, Answers(bounds=None), map_frame=map_frame, up_axis="z")
     array = robot.see(boxes(12.5, BOX))
     assert array.header.frame_id == "camera"
-    assert ("tf knows no 'camera' in 'map'" in robot.said) == bool(map_frame)
+    assert ("tf has no transform from 'camera' to 'map'" in robot.said) == bool(map_frame)
     assert "up_axis" not in robot.answers.json("request")["options"]
     wanted = T_CAMERA_OBJECT.matrix().numpy()
     np.testing.assert_allclose(matrix(robot.node.pose_out.sent[0].pose.pose, 0.001), wanted, atol=1e-6)
@@ -401,7 +401,7 @@ def test_images_that_are_of_no_use_are_said(robot: Robot, given: dict[str, Any],
 
 def test_depth_of_another_frame_than_the_color_is_said(robot: Robot) -> None:
     robot.see(boxes(12.5, BOX), color=image(12.5, np.zeros((H, W), np.uint8), "mono8", frame="color"))
-    assert "depth is of 'camera', color of 'color': is the depth aligned?" in robot.said
+    assert "depth is of 'camera', color of 'color'. Check that the depth is aligned to the color image." in robot.said
 
 
 def test_equal_warnings_are_said_once(robot: Robot) -> None:
@@ -472,17 +472,17 @@ def test_detections_that_match_nothing_are_dropped_and_said(monkeypatch: pytest.
     stream = Stream()
     stream.depth(1.0, 3.0)
     assert stream.boxes(2.0) == []
-    assert "no depth image lies within 0.1 s" in stream.said[-1]
+    assert "no depth image is within 0.1 s" in stream.said[-1]
     assert stream.boxes(0.5) == []
-    assert "too late: the oldest depth image kept is 0.5 s newer" in stream.said[-1]
+    assert "too late: the oldest stored depth image is 0.5 s newer" in stream.said[-1]
     assert stream.boxes(0.0) == []
     assert "without a time stamp" in stream.said[-1]
     stream.boxes(*(4.0 + n for n in range(part("matching").MOST_WAITING + 1)))
-    assert "no later depth image has come" in stream.said[-1]
+    assert "no later depth image has arrived" in stream.said[-1]
     monkeypatch.setattr(part("matching"), "MOST_BYTES", 3 * MILLIMETERS.nbytes)
     stream.depth(*(30.0 + n for n in range(9)))
     stream.boxes(35.0)
-    assert "the oldest depth image kept is 1.0 s newer" in stream.said[-1]
+    assert "the oldest stored depth image is 1.0 s newer" in stream.said[-1]
 
 
 def test_detections_wait_for_the_camera() -> None:
@@ -493,7 +493,7 @@ def test_detections_wait_for_the_camera() -> None:
     assert stream.depth(1.1) == [(1.0, 1.0)]
     stream = Stream(info=False)
     stream.boxes(*(4.0 + n for n in range(part("matching").MOST_WAITING + 1)))
-    assert "no camera_info has come" in stream.said[-1]
+    assert "no camera_info has arrived" in stream.said[-1]
 
 
 def test_a_recording_that_starts_again_is_matched_again() -> None:

@@ -156,7 +156,7 @@ def test_objects_in_meters_bound_the_scale(monkeypatch: pytest.MonkeyPatch, tmp_
     )
     _, free = answered(monkeypatch, object_unit="free", scale_tolerance="0.1")
     assert free["options"]["robust"] == {"object_unit": "free"}
-    with pytest.raises(ValueError, match="object_unit: 'ft' is none of auto, free, m, cm, mm, in"):
+    with pytest.raises(ValueError, match="object_unit: 'ft' is not one of auto, free, m, cm, mm, in"):
         make_node(monkeypatch, Answers(result()), object_unit="ft")
     for wrong in ("-0.1", "1", "nan", "little"):
         with pytest.raises(ValueError, match=r"scale_tolerance|could not convert"):
@@ -304,13 +304,13 @@ def test_axes_and_shares_arrive_whatever_yaml_makes_of_them(passed: Callable[[st
     for said in ("x", "y", "z", "X", "Y", "Z", "+y", "axis_y", "y-axis"):
         assert axis_of("up_axis", passed(said)) == re.sub("axis|[-+_]", "", said).lower()
     for said in ("n", "no", "off", "null", "~", "1", "-y", "up", "nan"):
-        with pytest.raises(ValueError, match=r"up_axis: .* is none of x, y and z"):
+        with pytest.raises(ValueError, match=r"up_axis: .* is not x, y or z"):
             axis_of("up_axis", passed(said))
     for said, share in {"0.03": 0.03, "1e-3": 0.001, "0": 0.0, "3e-2": 0.03, ".5": 0.5}.items():
         assert share_of("scale_tolerance", passed(said)) == share
     said = ("1", "-0.1", "3%", "true", "y", "no", "nan", ".nan", ".inf", "inf", "0,03")
     for value in ([0.1], *map(passed, said)):
-        with pytest.raises(ValueError, match=r"scale_tolerance: .* is no number"):
+        with pytest.raises(ValueError, match=r"scale_tolerance: .* is not a number"):
             share_of("scale_tolerance", value)
 
 

@@ -41,7 +41,7 @@ def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: s
     if private:
         check_access(settings)
         return
-    with pytest.raises(StartError, match=f"^{re.escape(publish)} can be reached by others") as caught:
+    with pytest.raises(StartError, match=f"^{re.escape(publish)} can be reached from other machines") as caught:
         check_access(settings)
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
     check_access(settings.model_copy(update={"api_tokens": frozenset({"lab:a-long-random-string"})}))
@@ -50,7 +50,7 @@ def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: s
 def test_beyond_loopback_a_proxy_stands_before_it() -> None:
     """And behind one the service is open to others, whatever its own address is."""
     tokens = frozenset({"lab:a-long-random-string"})
-    with pytest.raises(StartError, match=r"^0\.0\.0\.0 can be reached by others"):
+    with pytest.raises(StartError, match=r"^0\.0\.0\.0 can be reached from other machines"):
         check_access(Settings(host="0.0.0.0", api_tokens=tokens))
     with pytest.raises(StartError) as caught:
         check_access(Settings(behind_proxy=True))
@@ -129,10 +129,10 @@ def test_a_folder_that_takes_nothing_is_refused_and_nothing_is_left(
     state = tmp_path / "made" / "here"
     if full:
         monkeypatch.setattr(os, "posix_fallocate", _refusing(errno.ENOSPC))
-        named, hint = state, "Make room on the disk"
+        named, hint = state, "Free space on the disk"
     else:
         (state / "blobs" / ".tmp").mkdir(parents=True)
-        named, hint = state / "blobs" / ".tmp", "Give a folder that can be written"
+        named, hint = state / "blobs" / ".tmp", "Give a writable folder"
         usual: Any = tempfile.TemporaryFile
         refuse = _refusing(errno.EROFS)
         monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: refuse() if dir == named else usual(dir=dir))  # noqa: A006

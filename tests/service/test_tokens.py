@@ -58,7 +58,7 @@ def test_a_file_without_secrets_is_refused(tmp_path: Path, content: str | None, 
     [
         ("REGNF_API_TOKENS_FILE", "did you mean REGNF_API_TOKENS=@"),
         ("REGNF_STORAGE_CAP_BYTES", "did you mean REGNF_MAX_STORED_BYTES"),
-        ("REGNF_HEARTBEAT_S", "is gone: the value is fixed"),
+        ("REGNF_HEARTBEAT_S", "does not exist: the value is fixed"),
     ],
 )
 def test_variables_of_earlier_versions_are_refused(monkeypatch: pytest.MonkeyPatch, variable: str, said: str) -> None:

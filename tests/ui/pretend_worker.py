@@ -105,7 +105,7 @@ class PretendWorker:
         result: dict[str, Any] = {
             "verdict": "registered",
             "verdict_reason": "SURFACES_AGREE",
-            "verdict_detail": "Object and scene match on held-out points.",
+            "verdict_detail": "Object and scene match on the verification samples.",
             "object": found,
             "candidates": candidates and [{"object": one, "stage": "refined", "score": 0.1} for one in candidates],
             "T_object_scene": _transform(np.linalg.inv(scene_object)),

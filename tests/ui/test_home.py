@@ -136,7 +136,7 @@ def test_the_page_asks_again_while_the_store_is_busy_and_says_that_it_stays_so(
 ) -> None:
     page = visit.page
     asked: list[str] = []
-    problem = '{"reason": "STORAGE_UNAVAILABLE", "detail": "The record store does not answer. Retry later."}'
+    problem = '{"reason": "STORAGE_UNAVAILABLE", "detail": "The job store does not respond. Retry later."}'
 
     def busy(route: Route) -> None:
         asked.append(route.request.url)
@@ -150,4 +150,4 @@ def test_the_page_asks_again_while_the_store_is_busy_and_says_that_it_stays_so(
         assert len(asked) > 3
         expect(page.locator("#tip")).to_be_hidden()
     else:
-        expect(page.locator("#tip")).to_contain_text("The record store does not answer.")
+        expect(page.locator("#tip")).to_contain_text("The job store does not respond.")

@@ -37,7 +37,7 @@ def test_the_card_of_a_search_says_what_was_found_where_and_its_page_leads_on(
     page.goto(f"{service}/jobs")
     expect(page.locator(".tile h2")).to_have_text(title)
     expect(page.locator(".tile .word")).to_have_text("Registered")
-    expect(page.locator(".tile")).to_contain_text("the likeliest of 2 objects")
+    expect(page.locator(".tile")).to_contain_text("the most probable of 2 objects")
     box = re.compile(r"box [\d.]+ × [\d.]+ × [\d.]+ at [−\d.]+, [−\d.]+, [−\d.]+")
     expect(page.locator(".tile")).to_contain_text(box)
     page.get_by_role("link", name="Open").click()
@@ -119,7 +119,7 @@ def test_rooms_are_no_candidates_unless_a_person_says_so(visit: Visit, service: 
     open_page(page, service)
     page.locator("#all-objects").check()
     expect(page.locator("label:has(input:checked)")).to_have_count(3)
-    chosen = ["All of them: find out which it is", "chair.glb", "stool.glb"]
+    chosen = ["All objects: find out which one it is", "chair.glb", "stool.glb"]
     assert sorted(page.locator("label:has(input:checked)").all_inner_texts()) == chosen
     page.goto(f"{service}/fields")
     page.get_by_label("What stool.glb is").select_option("scene")
@@ -285,7 +285,7 @@ def test_handles_leave_the_thing_in_sight_on_a_phone(visit: Visit, service: str,
 def test_an_object_from_its_file_to_the_library_and_out_again(visit: Visit, service: str, files: Files) -> None:
     page = visit.page
     open_page(page, f"{service}/library")
-    expect(page.locator("#note")).to_have_text(re.compile("Nothing in the library yet"))
+    expect(page.locator("#note")).to_have_text(re.compile("The library is empty"))
     page.get_by_role("button", name="Add objects").click()
     page.set_input_files("#entry-file", files[1])
     expect(page.locator("#entry-name")).to_have_value("chair")
@@ -296,7 +296,7 @@ def test_an_object_from_its_file_to_the_library_and_out_again(visit: Visit, serv
     assert in_both_themes(page) == NONE
     page.get_by_role("button", name="Save").click()
     expect(page.locator(".tile h2")).to_have_text("chair")
-    expect(page.locator(".tile")).to_contain_text("4 turns about 0, 0, 1 (as said)")
+    expect(page.locator(".tile")).to_contain_text("4 rotations about 0, 0, 1 (as given)")
     page.get_by_role("button", name="Edit chair").click()
     expect(page.locator("#entry-tags")).to_have_value("oak, seat")
     page.fill("#entry-name", "a/b")
@@ -306,7 +306,7 @@ def test_an_object_from_its_file_to_the_library_and_out_again(visit: Visit, serv
     page.select_option("#entry-symmetry", "detected")
     page.get_by_role("button", name="Save").click()
     expect(page.locator(".tile h2")).to_have_text("armchair")
-    expect(page.locator(".tile")).not_to_contain_text("as said")
+    expect(page.locator(".tile")).not_to_contain_text("as given")
     page.get_by_role("button", name="Show the tag seat").click()
     expect(page.locator("#tag")).to_have_value("seat")
     page.locator("#search").fill("table")

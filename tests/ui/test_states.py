@@ -26,14 +26,14 @@ def test_running_shows_phase_and_progress_and_cancel_ends_the_job(visit: Visit) 
     page.locator("#cancel").click()
     page.wait_for_selector("text=The job was dismissed")
     expect(page.locator("#status")).to_have_text("Dismissed")
-    expect(page.locator("#message-text")).to_contain_text("Run again starts it anew.")
+    expect(page.locator("#message-text")).to_contain_text("Press Run again to start it again.")
     expect(page.locator("#run-again")).to_be_visible()
     assert visit.complaints == []
 
 
 def test_queued_tells_the_place(visit: Visit) -> None:
     visit.page.goto(visit.server.view("queued"))
-    visit.page.wait_for_selector("text=3 jobs are before it.")
+    visit.page.wait_for_selector("text=3 jobs are ahead of it.")
     expect(visit.page.locator("#message-title")).to_have_text("In the queue")
 
 
@@ -42,10 +42,10 @@ def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
     """Where there is no stream of events, also past a connection that was lost."""
     page = visit.page
     page.goto(visit.server.view(story))
-    page.wait_for_selector("text=2 jobs are before it.")
+    page.wait_for_selector("text=2 jobs are ahead of it.")
     if story == "polled":
         page.context.set_offline(True)
-        page.wait_for_selector("text=The service does not answer")
+        page.wait_for_selector("text=The service does not respond")
         visit.server.stage.advance()
         page.context.set_offline(False)
         # only the refused stream and what was lost with the connection may be complained about
@@ -98,13 +98,13 @@ def test_failure_tells_reason_and_detail_as_text_under_the_versioned_address_too
 
 def test_unknown_job_says_so(visit: Visit) -> None:
     page = visit.open("unheard_of")
-    expect(page.locator("#message-title")).to_have_text("There is no such job")
+    expect(page.locator("#message-title")).to_have_text("This job does not exist")
     expect(page.locator("#message-facts")).to_contain_text("JOB_NOT_FOUND")
 
 
 def test_a_result_without_pictures_says_so_and_has_its_numbers(visit: Visit) -> None:
     page = visit.open("numbers")
-    expect(page.locator("#message")).to_contain_text("without pictures")
+    expect(page.locator("#message")).to_contain_text("has no pictures")
     expect(page.locator("#tools")).to_be_hidden()
     expect(page.locator("#matrix")).to_be_visible()
     assert not [one for one in visit.requests if one.endswith(".ply")]
@@ -165,10 +165,15 @@ def test_the_picture_is_made_once_somebody_asks(visit: Visit) -> None:
 
 def test_a_rendering_that_fails_says_why(visit: Visit) -> None:
     page = visit.open("ambiguous")
-    failed = {"id": "x", "kind": "render", "status": "failed", "error": {"detail": "the camera at (1, 2) is in matter"}}
+    failed = {
+        "id": "x",
+        "kind": "render",
+        "status": "failed",
+        "error": {"detail": "the camera at (1, 2) is inside solid matter"},
+    }
     page.route("**/render", lambda route: route.fulfill(status=200, json=failed))
     page.locator("#render-in-scene").click()
-    expect(page.locator("#in-scene-note")).to_have_text("the camera at (1, 2) is in matter.")
+    expect(page.locator("#in-scene-note")).to_have_text("the camera at (1, 2) is inside solid matter.")
 
 
 def test_the_page_of_a_rendering_shows_its_strip(visit: Visit) -> None:

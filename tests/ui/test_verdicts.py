@@ -103,7 +103,9 @@ def test_what_is_known_of_a_pose_is_told(visit: Visit) -> None:
         expect(page.locator("#verdict-reason")).to_contain_text(part)
     expect(page.locator("#figures")).to_contain_text("± 0.5 %")
     expect(page.locator("#warnings li")).to_have_text([f"Scene: {WARNING}"])
-    expect(page.locator("#certainty-words")).to_contain_text("If the pose is right, it is known: its center to ± ")
+    expect(page.locator("#certainty-words")).to_contain_text(
+        "If the pose is correct, it is known: its center within ± "
+    )
     shown = numbers(page.locator("#sigmas .mono:last-child").all_inner_texts())
     assert shown == [0.003, 0.001, 0.002, 0.4, 0.8, 0.2, 0.5]
     widths = page.locator("#sigmas .track span").evaluate_all("all => all.map(one => parseFloat(one.style.width))")
@@ -153,11 +155,11 @@ def test_every_alternative_moves_the_object_and_the_result_comes_back(visit: Vis
     page.keyboard.press("ArrowDown")
     expect(page.locator("#pose-list input").nth(1)).to_be_checked()
     expect(note).to_have_text(f"An alternative: {relations[0]}")
-    expect(caption).to_contain_text("of the result’s pose, not of the one shown")
+    expect(caption).to_contain_text("for the result’s pose, not for the displayed one")
     page.locator("#iteration").fill("3")  # the path leads to the result: choosing it again
     expect(page.locator("#pose-list input").first).to_be_checked()
     expect(page.locator("#matrix")).to_have_text(matrix, use_inner_text=True)
-    expect(caption).to_contain_text("of the result’s pose")
+    expect(caption).to_contain_text("for the result’s pose")
 
 
 def test_a_search_shows_its_ranking(visit: Visit) -> None:
@@ -168,14 +170,14 @@ def test_a_search_shows_its_ranking(visit: Visit) -> None:
     assert shown[:3] == [
         ["field a0a0a0a0", "Registered, 99.0 %, strict", "0.021"],
         ["field a1a1a1a1", "Rejected, 30.0 %, below both levels", "0.34",
-         "told apart from the first by 3.7 % of the surface, which was seen"],
-        ["field b0b0b0b0", "searched coarsely", "0.4"],
+         "distinguished from the first by 3.7 % of the surface, which was observed"],
+        ["field b0b0b0b0", "coarse search", "0.4"],
     ]  # fmt: skip
     assert len(shown) == 8
     page.locator("#ranking-more summary").click()
     expect(page.locator("#ranking-rest li").last).to_contain_text("field d0d0d0d0")
     rest = [text.split("\n") for text in page.locator("#ranking-rest li").all_inner_texts()]
-    assert [len(rest), rest[-1]] == [4, ["field d0d0d0d0", "no object", "–"]]
+    assert [len(rest), rest[-1]] == [4, ["field d0d0d0d0", "unusable", "–"]]
     expect(page.locator("#job-facts [title]", has_text="field a0a0a0a0")).to_have_attribute("title", "a0" * 32)
 
 
@@ -188,7 +190,7 @@ def test_a_rejected_pose_is_shown_with_what_speaks_against_it(visit: Visit) -> N
     page = visit.open("judged")
     poses = page.locator("#considered-list label")
     expect(poses).to_contain_text(["97.0 %, default", "2.0 %, below both levels"])
-    expect(poses).to_contain_text(["The surfaces agree.", "<b>FREE_SPACE_VIOLATED</b>"])
+    expect(poses).to_contain_text(["The surfaces match.", "<b>FREE_SPACE_VIOLATED</b>"])
     before = page.locator("#matrix").inner_text()
     red = red_share(page)
     poses.nth(1).locator("input").check()

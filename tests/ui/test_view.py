@@ -185,7 +185,7 @@ def test_the_fields_pictures_are_shown_and_every_artifact_can_be_downloaded(visi
 
 def test_token_opens_page_and_downloads(visit: Visit, tmp_path: Path) -> None:
     page = visit.open("locked")
-    expect(page.locator("#message-title")).to_have_text("This service asks for a token")
+    expect(page.locator("#message-title")).to_have_text("This service needs a token")
     page.locator("#token").fill("wrong")
     page.keyboard.press("Enter")
     page.wait_for_selector("#token-form:not([hidden])")
@@ -199,7 +199,7 @@ def test_token_opens_page_and_downloads(visit: Visit, tmp_path: Path) -> None:
 
 def test_what_is_missing_or_damaged_leaves_the_numbers(visit: Visit) -> None:
     page = visit.open("broken")
-    expect(page.locator("#message-title")).to_have_text("The 3D view cannot be shown")
+    expect(page.locator("#message-title")).to_have_text("The 3D view cannot be displayed")
     expect(page.locator("#verdict-word")).to_have_text("Registered")
     page.route("**/preview.png", lambda route: route.fulfill(status=404, json={"reason": "NONE"}))
     with page.expect_response("**/preview.png"):

@@ -156,7 +156,7 @@ def test_a_job_that_takes_too_long_is_ended(table: Bench, do: str) -> None:
     failed = table.finished()
     assert failed.error is not None
     assert (failed.status, failed.error["reason"]) == ("failed", "JOB_TIMEOUT")
-    assert failed.error["detail"] == "the job took longer than the 1 s that it may (REGNF_JOB_TIMEOUT_S)"
+    assert failed.error["detail"] == "the job took longer than the allowed 1 s (REGNF_JOB_TIMEOUT_S)"
     assert_next_job_runs(table)
 
 

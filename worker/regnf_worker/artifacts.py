@@ -42,7 +42,7 @@ def keep_edited_field(context: Context, owner: str, manifest: Manifest) -> None:
             writer.commit(original_key(reference))
         _import(context, reference, artifact.bytes)
     except (FileNotFoundError, UnreadableRecordError) as error:
-        logger.warning("the edited scene of job %s is no field: %s", manifest.job_id, error)
+        logger.warning("the edited scene of job %s is not a valid field: %s", manifest.job_id, error)
 
 
 def _import(context: Context, reference: str, size: int) -> None:
@@ -52,7 +52,7 @@ def _import(context: Context, reference: str, size: int) -> None:
         record, _ = context.records.create_field(field, quota_of(context.settings))
     except QuotaError as error:
         delete_upload(context.blobs, field)
-        logger.info("the edited scene %s is no field: %s", reference, error.reason)
+        logger.info("the edited scene %s is not a valid field: %s", reference, error.reason)
         return
     if record.state == "validating":
         context.queue.enqueue_import(reference, record.attempt)

@@ -73,7 +73,7 @@ class Heartbeat:
     """Beats in a thread of its own while the job runs, and writes the job's progress to its record.
 
     Use as a context manager. ``report`` is the registration's progress callback: it raises CancelledError once the job
-    was cancelled or another attempt has taken over (``superseded``). A job that does not come back to ``report`` within
+    was canceled or another attempt has taken over (``superseded``). A job that does not come back to ``report`` within
     five seconds of that is killed: native code receives no exception.
     """
 
@@ -112,7 +112,7 @@ class Heartbeat:
     def check(self) -> None:
         """Raises CancelledError when the job shall stop."""
         if self._stop.is_set():
-            raise CancelledError("the job was cancelled" if not self.superseded else "another attempt has taken over")
+            raise CancelledError("the job was canceled" if not self.superseded else "another attempt has taken over")
 
     def confirm(self) -> None:
         """Ask the record, as soon as it answers, whether this attempt counts. Raises CancelledError, RedisError."""
@@ -127,7 +127,7 @@ class Heartbeat:
             self._ask(lambda: self._records.heartbeat(self._job_id, self._attempt))
             if self._stop.is_set():
                 if not self._ended.wait(STOP_WITHIN_S):
-                    logger.warning("job %s attempt %d does not stop: killed", self._job_id, self._attempt)
+                    logger.warning("job %s attempt %d did not stop and was killed", self._job_id, self._attempt)
                     os.kill(os.getpid(), signal.SIGKILL)
                 return
 
@@ -137,7 +137,7 @@ class Heartbeat:
         except RedisError as error:
             logger.warning("job %s attempt %d: Redis does not answer: %s", self._job_id, self._attempt, error)
         except MemoryError:
-            logger.warning("job %s attempt %d: no memory is left for a heartbeat", self._job_id, self._attempt)
+            logger.warning("job %s attempt %d: there is no memory left for a heartbeat", self._job_id, self._attempt)
 
     def _note(self, change: Any, *arguments: Any) -> None:
         try:
@@ -176,7 +176,7 @@ class Fields:
         return fields
 
     def file(self, sha256: str) -> Path:
-        """The safe field file of a field that is ready."""
+        """The regnf field file of a field that is ready."""
         return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
 
     def _checked(self, field: FieldRecord | None, name: str) -> FieldRecord:
@@ -215,7 +215,7 @@ def register(
         models = ObjectModels(context, engine, options, folder)
         candidates = [_candidate(models, one, fields, heartbeat) for one in objects]
         if all(one.model is None for one in candidates):
-            raise NoSurfaceError("none of the candidates is usable as an object", reason="NO_SURFACE_IN_OBJECT")
+            raise NoSurfaceError("no candidate is usable as an object", reason="NO_SURFACE_IN_OBJECT")
         return engine.search(scene_file, candidates, request, heartbeat.report, folder, notes)
     (one,) = objects
     object_file, model = fields.file(one.sha256), None
@@ -242,7 +242,7 @@ logger = logging.getLogger(__name__)
 def run_attempt(context: Context, job_id: str, attempt: int, worker: str, make_engine: Callable[[], Engine]) -> None:
     """Claim the attempt, do its work with the engine, write down how it ended.
 
-    Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Writes that Redis
+    Does nothing when the attempt is not to be had: claimed already, canceled, or an older one. Writes that Redis
     refuses for a while are waited for, until the job's time is over. Raises RedisError, StorageUnavailableError and
     OSError when the end cannot be written down, or a volume is away; the worker's parent process then sees to it.
     """
@@ -314,7 +314,7 @@ def _end(context: Context, job_id: str, attempt: int, **changes: Any) -> None:
     try:
         _update(context, job_id, attempt, **changes)
     except StaleAttemptError as error:
-        logger.info("job %s attempt %d is no longer current: %s", job_id, attempt, error)
+        logger.info("job %s attempt %d is not current: %s", job_id, attempt, error)
     else:
         logger.info("job %s attempt %d ended: %s", job_id, attempt, changes["status"])
 
@@ -330,7 +330,7 @@ def _give_back(context: Context, job_id: str, attempt: int) -> None:
             f"the record of job {job_id}", lambda: context.records.requeue_job(job_id, attempt, lost=False)
         )
         context.queue.enqueue_registration(job_id, again.attempt, again.owner, again.is_of_batch)
-        logger.info("job %s attempt %d given back: its fields are still being imported", job_id, attempt)
+        logger.info("job %s attempt %d put back into the queue: its fields are still being imported", job_id, attempt)
 
 
 def _work(

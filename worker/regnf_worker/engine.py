@@ -52,7 +52,7 @@ Model = Any
 
 @dataclass(frozen=True)
 class Candidate:
-    """One object of a search: its field's SHA-256, what opens the safe field file, and its model.
+    """One object of a search: its field's SHA-256, what opens the regnf field file, and its model.
 
     An object without a model is unusable, for ``fault``, a reason.
     """
@@ -65,7 +65,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Engine:
-    """Registers and renders safe field files on one device. Everything may raise RegnfError."""
+    """Registers and renders regnf field files on one device. Everything may raise RegnfError."""
 
     device: str
 
@@ -171,7 +171,7 @@ class Engine:
         report: Report,
         folder: Path,
     ) -> list[str]:
-        """The same for a rendering. objects: what opens the safe field file of each object that edits name."""
+        """The same for a rendering. objects: what opens the regnf field file of each object that edits name."""
         import torch
 
         from regnf_core.fields.build import open_field
@@ -188,7 +188,7 @@ class Engine:
         return write_result(folder, request, made, self.describe())
 
     def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
-        """Write the model of a safe field as an object."""
+        """Write the model of a regnf field file as an object."""
         from regnf_core.fields.build import open_field
         from regnf_core.library import model_object, write_object_model
 
@@ -220,7 +220,7 @@ def _fields(notes: Notes, obj: str | None, told: Sequence[str]) -> dict[str, Fie
 
 
 def core_importer(limits: ImportLimits) -> Importer:
-    """The import gate of regnf_core within ``limits``, and of regnf_data for recordings."""
+    """The importer of regnf_core within ``limits``, and of regnf_data for recordings."""
 
     def run(
         upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None

@@ -1,4 +1,4 @@
-"""One attempt at importing an upload: a safe field and a report, or a reason why not."""
+"""One attempt at importing an upload: a regnf field file and a report, or a reason why not."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
 
 
 def _retire(context: Context, sha256: str, attempt: int, error: StaleAttemptError) -> None:
-    logger.info("import %s attempt %d is no longer current: %s", sha256, attempt, error)
+    logger.info("import %s attempt %d is not current: %s", sha256, attempt, error)
     if context.records.get_field(sha256) is None:
         context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
 
@@ -184,7 +184,7 @@ def _beside(context: Context, field: FieldRecord, came: SettingsFile | None) -> 
 
 
 def _require_current(context: Context, field: FieldRecord) -> None:
-    """Somebody may have deleted the field, and uploaded it anew: what lies there now is no longer ours to touch."""
+    """Somebody may have deleted the field, and uploaded it again: what lies there now is no longer ours to touch."""
     now = context.records.get_field(field.sha256)
     if now is None or now.attempt != field.attempt or now.state != "validating":
-        raise StaleAttemptError("the field was deleted or is imported anew")
+        raise StaleAttemptError("the field was deleted, or is imported again")

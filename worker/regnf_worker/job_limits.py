@@ -170,7 +170,7 @@ def refusal(error: RegnfError) -> dict[str, Any]:
 def timeout(reason: str, limit_s: float) -> dict[str, Any]:
     """The problem of work that the worker stopped: JOB_TIMEOUT or IMPORT_TIMEOUT."""
     what = "job" if reason == "JOB_TIMEOUT" else "import"
-    detail = f"the {what} took longer than the {limit_s:g} s that it may ({_SETTING_OF[reason]})"
+    detail = f"the {what} took longer than the allowed {limit_s:g} s ({_SETTING_OF[reason]})"
     return problem_document(reason, detail)
 
 
@@ -188,7 +188,9 @@ def fault(error: Exception, what: str, limits: JobLimits | None = None) -> dict[
         return over_limit("JOB_DISK_LIMIT", limits)
     if isinstance(error, StorageFullError) or (isinstance(error, OSError) and error.errno in _FULL):
         return problem_document("STORAGE_FULL")
-    return problem_document("INTERNAL", f"Internal error. The log has it under incident {incident}.", incident=incident)
+    return problem_document(
+        "INTERNAL", f"Internal error. The log has the details under the incident {incident}.", incident=incident
+    )
 
 
 def over_limit(reason: str, limits: JobLimits) -> dict[str, Any]:

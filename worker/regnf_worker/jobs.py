@@ -88,7 +88,7 @@ def draw_field(context: Context, reference: str, draw: Callable[[Path], FieldVie
     if field is None or field.state != "ready" or field.views != "pending":
         return
     if field.drawings >= _MOST_DRAWINGS:
-        logger.warning("field %s is not drawn: it was begun %d times", reference, field.drawings)
+        logger.warning("field %s is not drawn: drawing was started %d times", reference, field.drawings)
         _note(context, field, views="none")
         return
     if not _note(context, field, drawings=field.drawings + 1):
@@ -104,7 +104,7 @@ def draw_field(context: Context, reference: str, draw: Callable[[Path], FieldVie
         now = context.records.get_field(reference)
         if now is not None and now.attempt == field.attempt:
             raise
-        return  # it was deleted, or is imported anew, while it was opened
+        return  # it was deleted, or is imported again, while it was opened
     _keep(context, field, made)
 
 
@@ -123,7 +123,7 @@ def _keep(context: Context, field: FieldRecord, made: FieldViews) -> None:
 
 
 def _note(context: Context, field: FieldRecord, **changes: Any) -> bool:
-    """Write it down; False when the field was deleted, or is imported anew."""
+    """Write it down; False when the field was deleted, or is imported again."""
     with suppress(StaleAttemptError):
         context.records.update_field(field.sha256, attempt=field.attempt, **changes)
         return True
@@ -133,7 +133,7 @@ def _note(context: Context, field: FieldRecord, **changes: Any) -> bool:
 # The worker's spare time: fields that nobody has drawn yet, one at a time on a machine.
 #
 # A drawing begins only when no work waits, and runs beside the jobs that come later, in a process of lower priority.
-# It ends with its worker; what it had not finished is begun anew by any worker.
+# It ends with its worker; what it had not finished is begun again by any worker.
 
 Draw = Callable[[str], None]
 """(field's reference); runs in a process of its own."""

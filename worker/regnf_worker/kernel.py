@@ -81,7 +81,7 @@ def forked(work: Callable[[], object]) -> int:
     finally:
         if os.getpid() != parent:
             os._exit(status)
-    raise AssertionError("a forked process goes on")
+    raise AssertionError("a forked process continues")
 
 
 def in_child(work: Callable[[], object]) -> bool:
@@ -89,7 +89,7 @@ def in_child(work: Callable[[], object]) -> bool:
     try:
         child = forked(work)
     except OSError as error:
-        logger.error("no process could be made: %s", error)
+        logger.error("no process could be started: %s", error)
         return False
     return os.waitpid(child, 0)[1] == 0
 
@@ -181,7 +181,7 @@ class Scratch:
             if not self.folder.exists():  # the volume is away, and comes back with what is on it
                 self._left.append(folder)
         except OSError as error:
-            logger.warning("temporary files stay for now: %s", error)
+            logger.warning("temporary files are not deleted yet: %s", error)
             self._left.append(folder)
 
     def drop_left(self) -> bool:

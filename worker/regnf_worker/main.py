@@ -74,7 +74,7 @@ def preload() -> None:
     RegistrationOptions.from_dict({"preset": "robust"})  # makes the validator that every job needs
     tasks = Path("/proc/self/task")
     if tasks.exists() and len(list(tasks.iterdir())) > 1:
-        raise PreloadError("a library that was loaded has started threads; unset REGNF_PRELOAD")
+        raise PreloadError("a preloaded library has started threads; unset REGNF_PRELOAD")
     gc.enable()
     gc.freeze()  # a collection in a child would otherwise copy the pages of everything that was loaded
 
@@ -124,7 +124,7 @@ logger = logging.getLogger(__name__)
 
 def run_worker(settings: Settings) -> None:
     """Work until told to stop (SIGTERM, SIGINT). It is a program's last call: it lowers the process's priority, and may
-    begin the program anew.
+    begin the program again.
 
     Raises NoRedisError when no Redis is configured, redis' ConnectionError or TimeoutError when it does not answer,
     PreloadError, StorageMismatchError.
@@ -146,7 +146,7 @@ def run_worker(settings: Settings) -> None:
 
 
 def _preload(environment: MutableMapping[str, str]) -> None:
-    """Load the engine. Where that starts threads, begin this process anew without it, unless somebody asked for it.
+    """Load the engine. Where that starts threads, begin this process again without it, unless somebody requested it.
 
     What is loaded cannot be unloaded. Raises PreloadError.
     """
@@ -155,7 +155,9 @@ def _preload(environment: MutableMapping[str, str]) -> None:
     except PreloadError as error:
         if _ASKED in environment:
             raise
-        logger.warning("%s: %s. The worker starts without it: every job loads the engine itself", error.reason, error)
+        logger.warning(
+            "%s: %s. The worker starts without preloading: every job loads the engine itself", error.reason, error
+        )
         os.execve(sys.executable, sys.orig_argv, {**environment, _ASKED: "false"})  # noqa: S606 -- this program again
 
 

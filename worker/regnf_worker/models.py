@@ -88,7 +88,7 @@ class ObjectModels:
             try:
                 return self._engine.read_model(path)
             except RegnfError as error:
-                logger.warning("the model of %s is made again: %s", field.sha256, error)
+                logger.warning("the model of %s is computed again: %s", field.sha256, error)
                 self._context.blobs.delete(model_key(field.sha256))
         return None
 

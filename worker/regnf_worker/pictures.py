@@ -85,7 +85,7 @@ def give_up_rest(context: Context, job_id: str) -> None:
     """Say that what is still to come of a job's result is missing: its process is gone. Nothing if there is none."""
     manifest = read_manifest(context.blobs, job_id)
     if manifest is not None and manifest.pending and context.records.get_job(job_id) is not None:
-        logger.warning("job %s: its pictures are missing, their process is gone", job_id)
+        logger.warning("job %s: its pictures are missing, because their process died", job_id)
         publish_rest(context.blobs, job_id, Rest((), manifest.pending))
 
 

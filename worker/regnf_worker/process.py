@@ -133,7 +133,7 @@ class RegnfWorker(ResilientWorker):
                 self._prepare_import()
                 taken = self._until_available("waiting for a job", partial(self._taking.pop, _MONITOR_S))
             if taken is not None:
-                work = self._until_available("looking at what was taken", partial(self._taking.accept, taken))
+                work = self._until_available("checking the job that was taken", partial(self._taking.accept, taken))
                 if work is not None:
                     return made(work, self.connection), Queue(work.queue_name, connection=self.connection)
         return None
@@ -174,7 +174,7 @@ class RegnfWorker(ResilientWorker):
         try:
             return work.kind == "import" and is_unmodeled_entry(self._taking.records, work.argument, work.attempt)
         except (RedisError, UnreadableRecordError) as error:
-            logger.warning("whether %s is an entry without a model is not known: %s", work.argument, error)
+            logger.warning("it is not known whether %s is an entry without a model: %s", work.argument, error)
             return otherwise
 
     def _prepare_import(self) -> None:
@@ -197,7 +197,7 @@ class RegnfWorker(ResilientWorker):
         try:
             child, ended = self._start_child(work, folder)
         except OSError as error:
-            logger.error("job %s: no process could be made for it: %s", work.name, error)
+            logger.error("job %s: no process could be started for it: %s", work.name, error)
             self._because = start_refused(error)
             return kernel.Exit(None)
         with suppress(OSError):
@@ -313,4 +313,4 @@ class RegnfWorker(ResilientWorker):
         if self._context.settings.storage_url is None:
             write_down()
         elif not kernel.in_child(write_down):  # a client of an object store does not survive the forks to come
-            logger.error("job %s could not be settled: the process that should have has died", work.name)
+            logger.error("job %s could not be settled: the process for it died", work.name)

@@ -39,10 +39,10 @@ def joined_recordings(first: Path, added: Path, name: str, target: Path) -> None
 
     held, one = read_stored(first, "the recording"), read_stored(added, name)
     if any(frame.name == name for frame in held.frames):
-        raise DatasetError(f"the recording has a frame {name} already", reason="DATASET_FRAMES_INVALID")
+        raise DatasetError(f"the recording already has a frame {name}", reason="DATASET_FRAMES_INVALID")
     whole = replace(held, frames=(*held.frames, replace(one.frames[0], name=name)))
     if len(write_recording(whole, range(len(whole)), target)["frames"]) < len(whole):
-        message = f"frame {name} has another size than the frames before"
+        message = f"frame {name} has another size than the previous frames"
         raise DatasetError(message, reason="DATASET_SIZES_DIFFER")
 
 

@@ -74,7 +74,7 @@ def retry_until_available(what: str, do: Callable[[], _Value], stopped: Callable
             if stopped():
                 raise StopRequested from error
             if not refusals:
-                logger.warning("%s: Redis refuses, trying until it does not: %s", what, error)
+                logger.warning("%s: Redis refuses the command; trying again: %s", what, error)
             refusals += 1
             time.sleep(wait_s)
             wait_s = min(2 * wait_s, MAX_WAIT_S)
@@ -153,7 +153,7 @@ class ResilientWorker(Worker):
                 if self._horse_pid:
                     kernel.kill_group(self._horse_pid)
             case _:
-                self.log.info("a command that is not for the job of this worker is ignored")
+                self.log.info("a command for another job than that of this worker is ignored")
 
     def teardown(self) -> None:
         """A worker that cannot sign off is not counted any more once its last report has expired."""

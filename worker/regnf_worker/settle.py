@@ -21,7 +21,7 @@ _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
 """Signals from outside. Others, for example of a segmentation fault, would come again in the next attempt."""
 _DETAILS = {
     "WORKER_LOST": "The process that did the work was killed. Send the request again.",
-    "INTERNAL": "Internal error: the process of the job ended without a report. The log has more under its id.",
+    "INTERNAL": "Internal error: the process of the job ended without a report. See the log entries of the job's id.",
 }
 
 
@@ -100,16 +100,16 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
     elif end.given_back or (end.worth_another_try and record.requeues == 0):
         again = context.records.requeue_job(job_id, attempt, lost=not end.given_back)
         context.queue.enqueue_registration(job_id, again.attempt, again.owner, again.is_of_batch)
-        logger.warning("job %s attempt %d is to be run again", job_id, attempt)
+        logger.warning("job %s attempt %d is run again", job_id, attempt)
         return
     else:
         changes = {"status": "failed", "error": _problem(context, end)}
     context.records.update_job(job_id, attempt, **changes)
-    logger.warning("job %s attempt %d: its process is gone (%s): %s", job_id, attempt, end, changes["status"])
+    logger.warning("job %s attempt %d: its process died (%s): %s", job_id, attempt, end, changes["status"])
 
 
 def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: ChildExit) -> None:
-    """The same for an import: one that was given back, killed, or ended by itself starts anew; others are rejected."""
+    """The same for an import: one that was given back, killed, or ended by itself starts again; others are rejected."""
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
         return
@@ -122,7 +122,7 @@ def settle_import(context: Context, sha256: str, attempt: int, worker: str, end:
             return
         context.queue.enqueue_import(sha256, again.attempt)
         return
-    logger.warning("import %s attempt %d: its process is gone (%s)", sha256, attempt, end)
+    logger.warning("import %s attempt %d: its process died (%s)", sha256, attempt, end)
     late = timeout("IMPORT_TIMEOUT", context.settings.import_timeout_s)
     reject(context, sha256, attempt, late if end.late else _problem(context, end))
 

@@ -97,7 +97,9 @@ def stored_weights(weights: Float32Array) -> npt.NDArray[np.float16]:
 Float64Array = npt.NDArray[np.float64]
 _T = TypeVar("_T", bound=np.generic)
 
-PROJECTIVE = "the values are larger than the distance to the surface, as along a camera's axis: cut to that distance"
+PROJECTIVE = (
+    "the values are larger than the distance to the surface (projective distances); they were reduced to that distance"
+)
 """Said of a file whose values were changed."""
 _NEIGHBORS = 12
 """Crossings that a plane is laid through."""

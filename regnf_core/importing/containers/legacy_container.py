@@ -87,9 +87,9 @@ def _below_one_folder(members: list[Member]) -> dict[str, Member]:
     """Entries by their name below the one folder all of them share."""
     parts = [(member.name.partition("/"), member) for member in members]
     if not all(name for (_, _, name), _ in parts):
-        raise malformed("an entry lies in no folder", "ARCHIVE_ENTRY_NAME")
+        raise malformed("an entry is not in a folder", "ARCHIVE_ENTRY_NAME")
     if len({folder for (folder, _, _), _ in parts}) != 1:
-        raise malformed("entries lie in several folders", "ARCHIVE_ENTRY_NAME")
+        raise malformed("the entries are in several folders", "ARCHIVE_ENTRY_NAME")
     return {name: member for (_, _, name), member in parts}
 
 
@@ -112,7 +112,7 @@ def read_legacy(data: memoryview) -> tuple[Any, TorchArchive]:
     protocol, at, _ = _leading(data, at, _SMALL)
     machine, at, _ = _leading(data, at, _SMALL)
     if magic != _MAGIC or protocol != _PROTOCOL or not isinstance(machine, dict):
-        raise _malformed("the file's head is not torch.save's")
+        raise _malformed("the beginning of the file was not written by torch.save")
     if machine.get("little_endian") is not True:
         raise FieldFormatError("the tensors are not little-endian", reason="ARCHIVE_BYTE_ORDER")
     values, at, storages = _leading(data, at, PickleLimits())
@@ -123,7 +123,7 @@ def read_legacy(data: memoryview) -> tuple[Any, TorchArchive]:
 def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[Any, int, dict[str, StorageRef]]:
     """The value of the pickle at ``at``, where it ends, and the storages it names."""
     if at >= len(data):
-        raise FieldFormatError("the file was cut short", reason="FILE_TRUNCATED")
+        raise FieldFormatError("the file is truncated", reason="FILE_TRUNCATED")
     value, length, storages = read_leading_pickle(data[at : at + MAX_PICKLE_BYTES], limits)
     return value, at + length, storages
 
@@ -143,13 +143,13 @@ def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, 
     for key in keys:
         storage = storages.get(key)
         if storage is None:
-            raise FieldFormatError("a storage that no tensor names", reason="TENSOR_STORAGE_MISSING")
+            raise FieldFormatError("a storage that no tensor uses", reason="TENSOR_STORAGE_MISSING")
         element = _ELEMENT_BYTES.get(storage.dtype or "")
         if element is None:
             raise FieldFormatError(f"a storage of {storage.type_name}, of unknown size", reason="TENSOR_DTYPE")
         size = storage.count * element
         if at + _COUNT_BYTES + size > len(data):
-            raise FieldFormatError("the file was cut short", reason="FILE_TRUNCATED")
+            raise FieldFormatError("the file is truncated", reason="FILE_TRUNCATED")
         count = int.from_bytes(data[at : at + _COUNT_BYTES], "little")
         if count != storage.count:
             message = f"a storage of {storage.count} elements has {count} in the file"
@@ -158,7 +158,7 @@ def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, 
         entries[f"data/{key}"] = Member(f"data/{key}", STORED, at, size, size, crc32=None)
         at += size
     if at != len(data):
-        raise FieldFormatError("something lies behind the last storage", reason="ARCHIVE_TRAILING_DATA")
+        raise FieldFormatError("the file has data after the last storage", reason="ARCHIVE_TRAILING_DATA")
     return entries
 
 

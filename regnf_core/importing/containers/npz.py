@@ -57,7 +57,7 @@ def _header(name: str, data: memoryview) -> tuple[np.dtype[np.generic], tuple[in
     if dtype.names is not None or not sound:
         raise malformed_header
     if dtype.str not in _PLAIN_TYPES:
-        raise FieldFormatError(f"{name} is stored as {dtype.str}; plain numbers are needed", reason="TENSOR_DTYPE")
+        raise FieldFormatError(f"{name} is stored as {dtype.str}; plain numbers are required", reason="TENSOR_DTYPE")
     return dtype, shape, fortran_order, file.tell()
 
 
@@ -104,7 +104,7 @@ class ArraySource:
         """The whole numbers of an array. Raises what :meth:`array` raises."""
         values = self._read(name, "iu", "whole numbers")
         if values.dtype == np.uint64:
-            raise tensor_error(f"{name} holds uint64; whole numbers are needed", "TENSOR_DTYPE")
+            raise tensor_error(f"{name} holds uint64; whole numbers are required", "TENSOR_DTYPE")
         return np.ascontiguousarray(values, dtype=np.int64)
 
     def weights(self, name: str) -> Float32Array:
@@ -138,6 +138,6 @@ class ArraySource:
         if len(raw) - data_at != count * dtype.itemsize:
             raise tensor_error(f"{name} has another size than its shape {shape}", "TENSOR_STORAGE_MISMATCH")
         if dtype.kind not in kinds:
-            raise tensor_error(f"{name} holds {dtype.name}; {needed} are needed", "TENSOR_DTYPE")
+            raise tensor_error(f"{name} holds {dtype.name}; {needed} are required", "TENSOR_DTYPE")
         flat = np.frombuffer(raw[data_at:], dtype)
         return flat.reshape(shape, order="F" if fortran_order else "C")

@@ -40,7 +40,7 @@ def read_header(data: memoryview) -> dict[str, StoredTensor]:
         raise FieldFormatError("the file ends within its header", reason="FILE_TRUNCATED")
     length = int.from_bytes(data[:8], "little")
     if length > MAX_HEADER_BYTES:
-        raise FieldFormatError(f"a header of {length} bytes", reason="SAFETENSORS_HEADER_TOO_LARGE")
+        raise FieldFormatError(f"the header has {length} bytes", reason="SAFETENSORS_HEADER_TOO_LARGE")
     if 8 + length > len(data):
         raise FieldFormatError("the file ends within its header", reason="FILE_TRUNCATED")
     header = _parse(bytes(data[8 : 8 + length]))
@@ -89,7 +89,7 @@ def _tensor(name: str, entry: object, base: int) -> StoredTensor:
                 if end - begin == math.prod(shape) * _ITEM_BYTES[dtype]:
                     return StoredTensor(dtype, tuple(shape), base + begin, end - begin)
                 raise FieldFormatError(f"{name[:80]} has another size than its shape", reason="SAFETENSORS_LAYOUT")
-    raise _malformed(f"the entry of {name[:80]} makes no sense")
+    raise _malformed(f"the entry of {name[:80]} is invalid")
 
 
 def _check_tiling(tensors: dict[str, StoredTensor], start: int, end: int) -> None:
@@ -102,4 +102,4 @@ def _check_tiling(tensors: dict[str, StoredTensor], start: int, end: int) -> Non
     if expected > end:
         raise FieldFormatError("the file ends within a tensor", reason="FILE_TRUNCATED")
     if expected < end:
-        raise FieldFormatError("bytes that belong to no tensor", reason="SAFETENSORS_LAYOUT")
+        raise FieldFormatError("the file has bytes that belong to no tensor", reason="SAFETENSORS_LAYOUT")

@@ -138,20 +138,20 @@ RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
 """Formats in which a whole training run may be given."""
 _PACKED = ((b"\x1f\x8b\x08", "gzip"), (b"BZh", "bzip2"), (b"\xfd7zXZ\x00", "xz"))
 _TAR_MAGIC, _TAR_MAGIC_AT, _OLD_TORCH_TAR = b"ustar", 257, b"sys_info\0"
-_PICTURE = "picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"
+_PICTURE = "picture; expected a field: a checkpoint, a regnf field file, a mesh or a grid"
 _PAGE = "an HTML page, not a field; the download failed, or it needs a login"
 BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n")
 """How recordings of robots begin, beside those that are SQLite databases."""
 RECORDINGS = (*BAGS, _ZIP_LOCAL_HEADER)
 """How files begin that may be recordings, whatever else they look like."""
 _OTHER_FILES = (
-    *((magic, "a recording of a robot, not a field; a service takes it at POST /recordings") for magic in BAGS),
-    (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
+    *((magic, "a recording of a robot, not a field; upload it with POST /recordings") for magic in BAGS),
+    (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, then give it again"),
     *((b"<!doctype html", _PAGE), (b"<html", _PAGE)),
     (b"<?xml", "an XML document, not a field; export a model as .glb, .ply, .obj or .stl"),
     *((b"\x89PNG", f"a PNG {_PICTURE}"), (b"\xff\xd8\xff", f"a JPEG {_PICTURE}")),
-    *((b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"), (b"%PDF", "a PDF document, not a field")),
-    (b"\x89HDF", "an HDF5 file, as Keras writes it; export the network as ONNX, or save its arrays by numpy.savez"),
+    *((b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file in it"), (b"%PDF", "a PDF document, not a field")),
+    (b"\x89HDF", "an HDF5 file, as Keras writes it; export the network as ONNX, or save its arrays with numpy.savez"),
     (b"\x08\x01\x12", "a TensorFlow model; export the network as ONNX"),
 )
 """Files that people give by mistake: their first bytes, and what they are."""
@@ -204,15 +204,15 @@ def sniff_format(head: bytes) -> str | None:
 def explain_refusal(head: bytes) -> tuple[str, str]:
     """The reason and a sentence for a file that ``sniff_format`` does not name."""
     if not head:
-        return "FILE_EMPTY", "the file holds no bytes"
+        return "FILE_EMPTY", "the file is empty"
     if head.startswith(_OLD_TORCH_TAR):
-        return "LEGACY_TORCH_FILE", "a tar archive, as PyTorch wrote before version 0.1.10; save it again"
+        return "LEGACY_TORCH_FILE", "a tar archive of PyTorch before version 0.1.10; save it again"
     if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
-        return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
+        return "RAW_PICKLE", "a plain pickle; only files written by torch.save (1.6 or later) are supported"
     if head.startswith(_VDB_MAGICS):
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head) in _KERAS_MEMBERS:
-        return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays by numpy.savez"
+        return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays with numpy.savez"
     if _OFF.match(head.lstrip(_BLANK)):
         return "FORMAT_NOT_SUPPORTED", "an OFF mesh; export it as .glb, .ply, .obj or .stl"
     begin = b" ".join(head[:_SHAPE_WITHIN].lstrip(_BLANK).lower().split())
@@ -222,7 +222,10 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
     if head.startswith(_ZIP_LOCAL_HEADER) and (package := _package(_first_name(head))):
         return "FORMAT_NOT_SUPPORTED", f"{package}; export it as .glb, .ply, .obj or .stl"
     if head.startswith(b"\x93NUMPY"):
-        message = "a single numpy array; a grid needs its place: numpy.savez(file, sdf=array, origin=..., spacing=...)"
+        message = (
+            "a single numpy array; a grid also needs its origin and spacing: numpy.savez(file, sdf=array, "
+            "origin=..., spacing=...)"
+        )
         return "FORMAT_NOT_SUPPORTED", message
     if head[4:8] == b"TFL3":
         return "FORMAT_NOT_SUPPORTED", "a TensorFlow Lite model; export the network as ONNX"
@@ -231,7 +234,8 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
             return "FORMAT_NOT_RECOGNIZED", what
     return (
         "FORMAT_NOT_RECOGNIZED",
-        "none of the formats taken: torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of a run",
+        "not a supported format; supported are torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of "
+        "a run",
     )
 
 

@@ -116,7 +116,7 @@ class TableSource:
             quoted = str(name).replace('"', '""')
             columns = [row[1] for row in self._connection.execute(f'PRAGMA index_xinfo("{quoted}")')]
             if partial or _COMPUTED in columns:
-                raise _not_plain("an index of what is computed")
+                raise _not_plain("an index of a computed expression")
 
     def _too_much_work(self) -> bool:
         self._work -= 1
@@ -134,10 +134,10 @@ def _check_header(data: memoryview) -> None:
     if bytes(data[:16]) != _MAGIC or page < 512 or page & (page - 1):
         raise _malformed("the header is malformed")
     if data[18] != 1 or data[19] != 1:
-        raise _malformed("part of it may lie in a write-ahead log; set PRAGMA journal_mode = DELETE and save it again")
+        raise _malformed("part of it may be in a write-ahead log; set PRAGMA journal_mode = DELETE, and save it again")
     pages = int.from_bytes(data[28:32], "big")
     if len(data) % page or pages > len(data) // page:
-        raise FieldFormatError("the database was cut short", reason="FILE_TRUNCATED")
+        raise FieldFormatError("the database is truncated", reason="FILE_TRUNCATED")
 
 
 def _allow_reading(action: int, first: str | None, *_: str | None) -> int:
@@ -147,7 +147,7 @@ def _allow_reading(action: int, first: str | None, *_: str | None) -> int:
 
 
 def _not_plain(what: str) -> FieldFormatError:
-    return FieldFormatError(f"the file holds more than plain tables: {what}", reason="SQLITE_NOT_PLAIN")
+    return FieldFormatError(f"the file has more than plain tables: {what}", reason="SQLITE_NOT_PLAIN")
 
 
 def _malformed(cause: object) -> FieldFormatError:

@@ -69,7 +69,7 @@ def _directory_end(data: memoryview) -> _Directory:
     at = len(data) - END_SIZE
     _, disk, start_disk, here, count, size, offset, _ = _END.unpack_from(data, at)
     if disk or start_disk or here != count:
-        raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
+        raise malformed("the archive is one part of a split archive", "ARCHIVE_MULTI_DISK")
     locator_at = at - _LOCATOR64.size
     if locator_at >= 0 and data[locator_at : locator_at + 4] == _LOCATOR64_SIGNATURE:
         wide = start, end, entries = _directory_end64(data, locator_at)
@@ -80,28 +80,28 @@ def _directory_end(data: memoryview) -> _Directory:
     if count == _MAX16 or _MAX32 in (size, offset):
         raise malformed("the zip64 directory record is missing")
     if offset + size != at:
-        raise malformed("the central directory does not end where the record says")
+        raise malformed("the end of the central directory contradicts its record")
     return offset, at, count
 
 
 def _directory_end64(data: memoryview, locator_at: int) -> _Directory:
     _, disk, end64_at, disks = _LOCATOR64.unpack_from(data, locator_at)
     if disk or disks != 1:
-        raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
+        raise malformed("the archive is one part of a split archive", "ARCHIVE_MULTI_DISK")
     if end64_at + _END64.size != locator_at or data[end64_at : end64_at + 4] != _END64_SIGNATURE:
-        raise malformed("the zip64 directory record is not where its locator says")
+        raise malformed("the zip64 directory record is not at the place that its locator gives")
     _, record, _, _, disk, start_disk, here, count, size, offset = _END64.unpack_from(data, end64_at)
     if disk or start_disk or here != count:
-        raise malformed("the archive is one part of several", "ARCHIVE_MULTI_DISK")
+        raise malformed("the archive is one part of a split archive", "ARCHIVE_MULTI_DISK")
     if record != _END64.size - 12 or offset + size != end64_at:
-        raise malformed("the central directory does not end where the zip64 record says")
+        raise malformed("the end of the central directory contradicts the zip64 record")
     return offset, end64_at, count
 
 
 def _central_header(data: memoryview, at: int, limit: int) -> Header:
     """The central header at ``at``; nothing of it may reach past ``limit``."""
     if at + _CENTRAL.size > limit or data[at : at + 4] != _CENTRAL_SIGNATURE:
-        raise malformed("the central directory holds something that is not an entry")
+        raise malformed("the central directory has something that is not an entry")
     values = _CENTRAL.unpack_from(data, at)
     flags, method, crc32, packed, size = values[3], values[4], values[7], values[8], values[9]
     name_length, extra_length, comment_length, disk, offset = *values[10:14], values[16]
@@ -110,7 +110,7 @@ def _central_header(data: memoryview, at: int, limit: int) -> Header:
     name_at = at + _CENTRAL.size
     end = name_at + name_length + extra_length
     if comment_length or disk or end > limit:
-        raise malformed("a central header is not one that torch.save writes")
+        raise malformed("a central header was not written by torch.save")
     wide = _zip64_values(data[name_at + name_length : end])
     size, packed, offset = (_widened(value, wide) for value in (size, packed, offset))
     name, mode = bytes(data[name_at : name_at + name_length]), values[15] >> 16
@@ -120,12 +120,12 @@ def _central_header(data: memoryview, at: int, limit: int) -> Header:
 def _local_header(data: memoryview, at: int, limit: int) -> Header:
     """The local header at ``at``; sizes and CRC are zero where a descriptor after the data carries them."""
     if at + _LOCAL.size > limit or data[at : at + 4] != LOCAL_SIGNATURE:
-        raise malformed("no local header where the central directory says", "ARCHIVE_HEADER_MISMATCH")
+        raise malformed("no local header at the place that the central directory gives", "ARCHIVE_HEADER_MISMATCH")
     _, _, flags, method, _, _, crc32, packed, size, name_length, extra_length = _LOCAL.unpack_from(data, at)
     name_at = at + _LOCAL.size
     end = name_at + name_length + extra_length
     if end > limit:
-        raise malformed("a local header reaches past the directory", "ARCHIVE_HEADER_MISMATCH")
+        raise malformed("a local header extends beyond the directory", "ARCHIVE_HEADER_MISMATCH")
     wide = _zip64_values(data[name_at + name_length : end])
     size, packed = (_widened(value, wide) for value in (size, packed))
     return Header(bytes(data[name_at : name_at + name_length]), flags, method, crc32, packed, size, at, end)
@@ -138,11 +138,11 @@ def _zip64_values(extra: memoryview) -> list[int]:
     while at < len(extra):
         fields += 1
         if at + 4 > len(extra) or fields > _MAX_EXTRA_FIELDS:
-            raise malformed("an extra field is cut short, or there are too many")
+            raise malformed("an extra field is truncated, or there are too many")
         kind, length = struct.unpack_from("<HH", extra, at)
         at += 4
         if at + length > len(extra):
-            raise malformed("an extra field is cut short")
+            raise malformed("an extra field is truncated")
         if kind == _ZIP64_EXTRA:
             if found is not None or length > 28:
                 raise malformed("the zip64 field occurs twice or is too long")
@@ -201,7 +201,9 @@ class Member:
     def _inflated(self, packed: memoryview) -> Iterator[bytes]:
         """Piece by piece; never more than the archive claims."""
         inflater, left, at = zlib.decompressobj(-zlib.MAX_WBITS), self.size, 0
-        faulty = malformed(f"{self.name} does not inflate to what the archive claims", "ARCHIVE_DEFLATE_MALFORMED")
+        faulty = malformed(
+            f"{self.name} has another uncompressed size than the archive states", "ARCHIVE_DEFLATE_MALFORMED"
+        )
         waiting: bytes | memoryview = b""
         while not inflater.eof:
             if not waiting:
@@ -238,21 +240,21 @@ def read_members(
 def _check_ends(data: memoryview) -> None:
     """The file begins with an entry and ends with the directory's end record."""
     if bytes(data[:4]) != LOCAL_SIGNATURE[: len(data[:4])]:
-        raise malformed("something lies before the archive", "ARCHIVE_PREFIXED_DATA")
+        raise malformed("the file has data before the archive", "ARCHIVE_PREFIXED_DATA")
     at = len(data) - END_SIZE
     if at > 0 and data[at : at + 4] == END_SIGNATURE and bytes(data[-2:]) == b"\0\0":
         return
     tail = bytes(data[-(END_SIZE + 0xFFFF) :])
     found = tail.rfind(END_SIGNATURE)
     if 0 <= found <= len(tail) - END_SIZE:
-        raise malformed("something lies behind the archive", "ARCHIVE_TRAILING_DATA")
-    raise FieldFormatError("the archive's end is missing: the file was cut short", reason="FILE_TRUNCATED")
+        raise malformed("the file has data after the archive", "ARCHIVE_TRAILING_DATA")
+    raise FieldFormatError("the archive's end is missing: the file is truncated", reason="FILE_TRUNCATED")
 
 
 def _central_headers(data: memoryview, directory: _Directory, methods: Collection[int], most: int) -> list[Header]:
     at, end, count = directory
     if not 0 < count <= most:
-        raise malformed(f"{count} entries; at most {most} are read", "ARCHIVE_TOO_MANY_ENTRIES")
+        raise malformed(f"{count} entries; at most {most} are allowed", "ARCHIVE_TOO_MANY_ENTRIES")
     headers = []
     for _ in range(count):
         header = _central_header(data, at, end)
@@ -260,7 +262,7 @@ def _central_headers(data: memoryview, directory: _Directory, methods: Collectio
         headers.append(header)
         at = header.end
     if at != end:
-        raise malformed("the central directory holds more than its entries")
+        raise malformed("the central directory has more data than its entries")
     if len({header.name for header in headers}) != len(headers):
         raise malformed("two entries share a name", "ARCHIVE_DUPLICATE_ENTRY")
     return headers
@@ -270,18 +272,18 @@ def _check_header(header: Header, data_end: int, methods: Collection[int]) -> No
     if header.flags & _ENCRYPTION_FLAGS:
         raise malformed("an entry is encrypted", "ARCHIVE_ENCRYPTED")
     if stat.S_ISLNK(header.mode):
-        raise malformed("the archive holds a link; pack what it leads to (zip without -y)", "ARCHIVE_LINK")
+        raise malformed("the archive has a link; pack the file to which it points (zip without -y)", "ARCHIVE_LINK")
     if stat.S_IFMT(header.mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
-        raise malformed("the archive holds something else than plain files", "ARCHIVE_SPECIAL_FILE")
+        raise malformed("the archive has something other than plain files", "ARCHIVE_SPECIAL_FILE")
     if header.method not in methods:
-        raise malformed("an entry is compressed in a way that is not taken", "ARCHIVE_COMPRESSED_ENTRY")
+        raise malformed("the compression of an entry is not supported", "ARCHIVE_COMPRESSED_ENTRY")
     # A deflated entry may tell how hard the packer tried, in two flags.
     if header.flags & ~(_DESCRIPTOR_FLAG | _UTF8_FLAG | (0x0006 if header.method == DEFLATED else 0)):
-        raise malformed("an entry has flags that no trainer's library sets")
+        raise malformed("an entry has unexpected flags")
     if header.method == STORED and header.compressed_size != header.size:
-        raise malformed("a stored entry has two sizes", "ARCHIVE_HEADER_MISMATCH")
+        raise malformed("the two sizes of an uncompressed entry differ", "ARCHIVE_HEADER_MISMATCH")
     if header.compressed_size > data_end or header.local_offset >= data_end:
-        raise malformed("an entry claims bytes beyond the file's", "ARCHIVE_ENTRY_OUT_OF_BOUNDS")
+        raise malformed("an entry extends beyond the end of the file", "ARCHIVE_ENTRY_OUT_OF_BOUNDS")
 
 
 def _tile(data: memoryview, headers: list[Header], data_end: int, folders: bool) -> list[Member]:
@@ -310,7 +312,9 @@ def _member(header: Header, offset: int, folders: bool) -> Member:
         raise malformed("an entry's name is not UTF-8", "ARCHIVE_ENTRY_NAME") from error
     path = name.removesuffix("/") if folders and header.size == 0 else name
     if not all(_PART.fullmatch(part) and part not in (".", "..") for part in path.split("/")):
-        raise malformed("an entry's name leaves the archive's folder or is not a valid name", "ARCHIVE_ENTRY_NAME")
+        raise malformed(
+            "an entry's name is invalid, or its path leads out of the archive's folder", "ARCHIVE_ENTRY_NAME"
+        )
     return Member(name, header.method, offset, header.compressed_size, header.size, header.crc32)
 
 
@@ -318,7 +322,7 @@ def _gap(expected: int, found: int) -> FieldFormatError:
     if found < expected:
         return malformed("two entries overlap", "ARCHIVE_OVERLAP")
     if expected == 0:
-        return malformed("something lies before the archive", "ARCHIVE_PREFIXED_DATA")
+        return malformed("the file has data before the archive", "ARCHIVE_PREFIXED_DATA")
     return malformed("bytes that belong to no entry", "ARCHIVE_HIDDEN_DATA")
 
 
@@ -342,4 +346,4 @@ def _descriptor_size(data: memoryview, central: Header, at: int, limit: int) -> 
         wanted = struct.pack(layout, DESCRIPTOR_SIGNATURE, central.crc32, central.compressed_size, central.size)
         if bytes(data[at : at + length]) == wanted:
             return length
-    raise malformed("the descriptor behind an entry contradicts the central directory", "ARCHIVE_HEADER_MISMATCH")
+    raise malformed("the descriptor after an entry contradicts the central directory", "ARCHIVE_HEADER_MISMATCH")

@@ -16,7 +16,7 @@ from regnf_core.schema.description import COLOR, FieldDescription, NetworkColor
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.kinds import NeuralPointsDescription
 
-# How many points the gate evaluates a field at: the checks of plausibility, and the trials of several readings.
+# How many points the importer evaluates a field at: the checks of plausibility, and the trials of several readings.
 
 SAMPLES = 16_384
 """Points that a field is checked at."""
@@ -83,7 +83,7 @@ _Array = npt.NDArray[np.float64]
 
 def mesh_work(vertices: npt.NDArray[Any], faces: npt.NDArray[Any], calls: Calls) -> float:
     """Seconds that the field's evaluation takes on one core. vertices: (V, 3) · faces: (F, 3)."""
-    # The gradient comes with the distance, and is asked for at the surface.
+    # The gradient comes with the distance, and is requested at the surface.
     return mesh_seconds(vertices, faces, sum(calls.values), sum(calls.gradients))
 
 
@@ -172,7 +172,10 @@ _LIBRARIES = 3 << 29
 def require_within(seconds: float, work_s: float) -> None:
     """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more seconds are estimated than allowed."""
     if seconds > work_s:
-        message = f"the field's checks would take an estimated {seconds:.0f} s of a core; {work_s:g} s are allowed"
+        message = (
+            f"the checks of the field would take an estimated {seconds:.0f} s of processor time; {work_s:g} s are "
+            f"allowed"
+        )
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
 
 
@@ -184,14 +187,16 @@ def free_room(memory_bytes: int) -> int:
 def require_room(needed: int, room: int) -> None:
     """Raise FieldFormatError (IMPORT_TOO_COSTLY) when more bytes are estimated than there are."""
     if needed > room:
-        message = f"the field's values would take an estimated {needed >> 20} MiB at once; {room >> 20} MiB are free"
+        message = (
+            f"the values of the field would need an estimated {needed >> 20} MiB of memory; {room >> 20} MiB are free"
+        )
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
 
 
 # How fine a surface through points can be afforded: it takes time by the cells with points.
 
 _CLOUD_CELL_S = 2.5e-4
-"""Seconds for a cell of the octree with points in it: .1 to .29 ms, by spheres and noise of up to 300,000 points."""
+"""Seconds for a cell of the octree with points in it: 0.1 to 0.29 ms, by spheres and noise of up to 300,000 points."""
 FINEST, _COARSEST = 8, 5
 SPAN = 1.1
 """The octree's cube is so many times as wide as the points."""

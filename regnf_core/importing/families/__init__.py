@@ -1,4 +1,4 @@
-"""The families of checkpoints that the gate recognizes: one module a family, listed in ``FAMILIES``."""
+"""The families of checkpoints that the importer recognizes: one module a family, listed in ``FAMILIES``."""
 
 from __future__ import annotations
 
@@ -47,19 +47,21 @@ def convert_checkpoint(checkpoint: Any, source: TensorSource, description: Uploa
     raises.
     """
     if isinstance(checkpoint, (Placeholder, GlobalRef)):
-        message = f"the file holds an object of {checkpoint.full_name}, not weights; save its state_dict() instead"
+        message = f"the file has an object of {checkpoint.full_name} instead of weights; save its state_dict()"
         raise FieldFormatError(message, reason="UNSAFE_GLOBAL_IN_WEIGHTS")
     if isinstance(checkpoint, dict):
         for family in FAMILIES:
             converted = family(checkpoint, source, description)
             if converted is not None:
                 return converted
-    raise FieldFormatError(f"no known family of fields; {_contents(checkpoint)}", reason="FIELD_NOT_RECOGNIZED")
+    raise FieldFormatError(
+        f"the family of the field is unknown; {_contents(checkpoint)}", reason="FIELD_NOT_RECOGNIZED"
+    )
 
 
 def _contents(checkpoint: object) -> str:
     """A few words on what is there instead, never a value's own text."""
     if not isinstance(checkpoint, dict):
-        return f"the file holds a {type(checkpoint).__name__}"
+        return f"the file has a {type(checkpoint).__name__}"
     keys = [key[:40] for key in checkpoint if isinstance(key, str) and key.isprintable()][:_SHOWN_KEYS]
     return f"its first keys are {keys}"

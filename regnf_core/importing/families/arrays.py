@@ -1,4 +1,4 @@
-"""The families of .npz files that the gate recognizes: one module a family, listed in ``ARRAY_FAMILIES``."""
+"""The families of .npz files that the importer recognizes: one module a family, listed in ``ARRAY_FAMILIES``."""
 
 from __future__ import annotations
 
@@ -28,5 +28,5 @@ def convert_arrays(arrays: ArraySource, description: UploadDescription) -> Conve
         if converted is not None:
             return converted
     names = [name[:40] for name in arrays.names if name.isprintable()][:_SHOWN_NAMES]
-    message = f"no known family of fields; the first arrays are {names}"
+    message = f"the family of the field is unknown; the first arrays are {names}"
     raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")

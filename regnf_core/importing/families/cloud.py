@@ -39,7 +39,7 @@ _APART = 0.7
 _BORDERS, _WRONG_EDGES, _BOTH_WAYS = 0.01, 0.2, 0.5
 """Shares of the points, of those at edges and of the points. Chosen on the same clouds as measured on: 22 shapes,
 1,000 and 30,000 points, noise of 0, 0.3 and 1 spacings. At edges whole clouds reached 0.17. Refused in vain were 1,000
-points of a sheet of 0.5 mm and of 200 blades; patches on thin things with few points are often missed."""
+points of a sheet of 0.5 mm and of 200 blades; patches on thin objects with few points are often missed."""
 _FEWEST, _ALL, _FEWEST_EDGES = 3, 0.9, 50
 """A point at an edge has so many neighbors across it; so many of them agree; so many such points are enough."""
 _NO_THICKNESS = 0.01
@@ -72,14 +72,17 @@ def convert_cloud(
     near = tree.query(vertices, distance_upper_bound=reach)[0] < reach
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
-        raise malformed("no surface passes near the points: are the normals theirs?")
+        raise malformed("no surface passes near the points. Check that the normals belong to the points.")
     surface = Geometry(vertices * diagonal + low, faces, left_out=(*geometry.left_out, *dropped))
     width = f"{1 << depth} cells wide"
     found = mesh_field(surface, f"their screened Poisson surface, {width}", overrides, "point_cloud", work_s)
     beside = 100.0 * np.quantile(cKDTree(vertices[near]).query(_some(unit))[0], 0.95)
     normals = "with" if given.normals is not None else "without"
     why = (f"{origin}: {len(geometry.vertices)} points {normals} normals", *found.why)
-    text = f"what lies between the points is a guess; 19 of 20 points are within {beside:.2g} % of the diagonal of it"
+    text = (
+        f"the surface between the points is interpolated; 95 % of the points are within {beside:.2g} % of the "
+        f"diagonal of it"
+    )
     if depth < FINEST:
         text += f"; it is {width} instead of {1 << FINEST}, because its points fill too many cells"
     return replace(found, why=why, warnings=(*found.warnings, *warnings, f"SURFACE_RECONSTRUCTED: {text}"))
@@ -92,15 +95,15 @@ def _oriented(
     within = None if overrides.as_ is None else overrides.as_ == "scene"
     if normals is not None and not fit_their_points(points, normals):
         made = oriented(points, None, sensor, within)
-        lost = "the file's normals do not stand on the surface of its points and were replaced"
-        return made, (f"NORMALS_ESTIMATED: {lost}; they look to {made.towards}",)
+        lost = "the normals of the file do not fit its points and were replaced"
+        return made, (f"NORMALS_ESTIMATED: {lost}; they point to {made.towards}",)
     if normals is None:
         made = oriented(points, None, sensor, within)
-        text = f"the points have no normals; they were estimated, and look to {made.towards}"
+        text = f"the points have no normals; normals were estimated, and point to {made.towards}"
         return made, (f"NORMALS_ESTIMATED: {text}",)
     if not overrides.accept_implausible and (found := _turned(points, normals)):
         made = oriented(points, normals, sensor, within)
-        return made, (f"NORMALS_TURNED: neighbors contradict each other ({found}); they look to {made.towards}",)
+        return made, (f"NORMALS_TURNED: normals contradicted each other ({found}); they now point to {made.towards}",)
     return Oriented(normals, False, ""), ()
 
 
@@ -111,7 +114,7 @@ def _usable(geometry: Geometry) -> tuple[Geometry, tuple[str, ...]]:
     """
     points, normals = geometry.vertices, geometry.normals
     placed = np.isfinite(points).all(axis=1) & (np.abs(points) < 1e30).all(axis=1)
-    lost = [(~placed, "points that are no finite numbers")]
+    lost = [(~placed, "points with NaN or infinity")]
     if normals is not None:
         with np.errstate(all="ignore"):
             length = np.linalg.norm(normals, axis=1)
@@ -120,7 +123,7 @@ def _usable(geometry: Geometry) -> tuple[Geometry, tuple[str, ...]]:
         if (placed & turned).sum() < placed.sum() * _WITH_NORMALS:
             normals = None
         else:
-            lost.append((placed & ~turned, "points whose normals are zero or no finite numbers"))
+            lost.append((placed & ~turned, "points whose normals are zero, NaN or infinity"))
             placed &= turned
     dropped = tuple(f"{int(mask.sum())} {what}" for mask, what in lost if mask.any())
     if placed.sum() < _MIN_POINTS:
@@ -137,11 +140,11 @@ def _usable(geometry: Geometry) -> tuple[Geometry, tuple[str, ...]]:
 def _require_surface(places: Float64Array, points: int) -> None:
     """Raise FieldFormatError (POINT_CLOUD_TOO_SMALL) for few places (N, 3), however many points, or those of a line."""
     if len(places) < _MIN_POINTS:
-        message = f"the {points} points lie at {len(places)} places, at least {_MIN_POINTS} are needed"
+        message = f"the {points} points have only {len(places)} different positions, at least {_MIN_POINTS} are needed"
         raise FieldFormatError(message, reason="POINT_CLOUD_TOO_SMALL")
     wide = np.linalg.svd(places - places.mean(axis=0), compute_uv=False, full_matrices=False)
     if wide[1] < _LINE * wide[0]:
-        raise FieldFormatError("the points lie on one line", reason="POINT_CLOUD_TOO_SMALL")
+        raise FieldFormatError("the points are on one line", reason="POINT_CLOUD_TOO_SMALL")
 
 
 def _turned(points: Float64Array, normals: Float64Array) -> str:
@@ -175,7 +178,7 @@ def _disagreement(points: Float64Array, normals: Float64Array) -> str:
         # Where a patch ends, the others lie to one side; those of a board's other side lie behind, all around.
         borders = float((aside > _APART).sum() / len(asked))
         if borders >= _BORDERS and (aside > _APART).mean() >= 0.5:
-            return f"{100.0 * borders:.0f} % of the points lie where one patch meets another"
+            return f"{100.0 * borders:.0f} % of the points are at the border of two patches"
         deep = (
             _mean(height[mixed][..., None], opposite[mixed])[:, 0] - _mean(height[mixed][..., None], same[mixed])[:, 0]
         )
@@ -190,7 +193,7 @@ def _disagreement(points: Float64Array, normals: Float64Array) -> str:
     wrong = (edge & (height * back < 0.0)).sum(axis=1)[told] >= _ALL * beside[told]
     if told.sum() < _FEWEST_EDGES or wrong.mean() < _WRONG_EDGES:
         return ""
-    return f"at {100.0 * wrong.mean():.0f} % of the edges one of two sides looks inward"
+    return f"at {100.0 * wrong.mean():.0f} % of the edges one of the two faces points inward"
 
 
 def _mean(values: Float64Array, chosen: npt.NDArray[np.bool_]) -> Float64Array:
@@ -208,7 +211,7 @@ def _some(points: Float64Array) -> Float64Array:
 
 def _poisson(points: Float64Array, normals: Float64Array, depth: int) -> tuple[Float64Array, Int64Array]:
     """The closed surface (V, 3), (F, 3) through the points, faces outward."""
-    mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the gate's process may not
+    mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the importer's process may not
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

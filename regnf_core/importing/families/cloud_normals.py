@@ -80,9 +80,7 @@ def oriented(
         lines = _planes(points, points)[0]
     if sensor is not None:
         looks = ((sensor - points) * lines).sum(axis=1)
-        return Oriented(
-            np.where(looks[:, None] >= 0.0, lines, -lines), None, "the sensor's place, which the file states"
-        )
+        return Oriented(np.where(looks[:, None] >= 0.0, lines, -lines), None, "the position of the sensor")
     few = _few(len(points))
     some, along = points[few], lines[few]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -98,8 +96,12 @@ def oriented(
         _, nearest = cKDTree(some).query(points, k=4)
         agree = np.einsum("nki,ni->n", sided[nearest], lines)
         normals = np.where(agree[:, None] >= 0.0, lines, -lines)
-    seen_from = "within the cloud, as a scene" if within else "outside of the cloud, as an object"
-    return Oriented(normals, bool(within), f"where the points can be seen from, {seen_from}")
+    where = "inside the cloud, as for a scene" if within else "outside of the cloud, as for an object"
+    other = "object" if within else "scene"
+    towards = (
+        f"positions {where}, from which the points are visible; if this is wrong, give the import option as: {other}"
+    )
+    return Oriented(normals, bool(within), towards)
 
 
 def _few(count: int) -> Int64Array:

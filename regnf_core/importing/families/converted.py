@@ -75,8 +75,8 @@ class ConvertedField:
     tensors: Mapping[str, StoredArray]
     warnings: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
-    """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
-    one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
+    """Where shapes leave the function open: every possible one, the most usual first. The importer tries them and keeps
+    the one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
     assumed: Assumed | None = None
     untold: tuple[Variant, ...] = ()
     """Functions between which no behavior decides: a person is asked, once the readings are settled."""
@@ -99,7 +99,7 @@ class OpenCandidate:
 
 
 class AmbiguousError(FieldFormatError):
-    """The evidence leaves several functions; ``asked`` holds those that are shown, the likeliest first."""
+    """The evidence leaves several functions; ``asked`` holds those that are shown, the most probable first."""
 
     reason = "LAYOUT_AMBIGUOUS"
 
@@ -116,7 +116,7 @@ def untold_error(converted: ConvertedField, variants: Sequence[Variant], what: s
     """The refusal of a field that is one of ``variants``, because of ``what``."""
     asked = [OpenCandidate(one.name, one.say, partial(one.of, converted.reading)) for one in variants]
     lines = " or ".join(json.dumps(one.say) for one in asked[:MOST_CANDIDATES])
-    return AmbiguousError(f"{what}; add to the description {lines}", asked)
+    return AmbiguousError(f"{what}; add to the import options {lines}", asked)
 
 
 def converted_of(

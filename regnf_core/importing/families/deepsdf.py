@@ -57,8 +57,8 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     require_family(overrides, FAMILY)
     if overrides.family is None and not norms and all(f"{name}.weight" in state for name in names[:-1]):
         message = (
-            "a DeepSDF without weight normalization, or IGR's network, which has the same names: say"
-            ' {"family": "deepsdf"} if it is the first; of the other give the mesh'
+            "a DeepSDF without weight normalization, or IGR's network, which has the same names; for DeepSDF"
+            ' give the import option {"family": "deepsdf"}, for IGR give the mesh'
         )
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
     width = layers.input_width - 3
@@ -71,7 +71,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     why = (
         f"keys model_state_dict.{prefix}*, {len(names)} layers",
         whence,
-        "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
+        "bounds [-1, 1]: the cube around the unit sphere, into which shapes are scaled",
     )
     folded = Network(at_code(layers, latent, (0, *whole)), tuple(seeing), norms)
     entries, form = shared_entries(overrides, UNIT_CUBE), Form("relu", output_tanh=1).said(overrides)
@@ -86,7 +86,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
 def _refuse_codes_alone(checkpoint: dict[Any, Any]) -> None:
     """Raise FieldFormatError (FIELD_NOT_RECOGNIZED) if the checkpoint is the half of a DeepSDF without the network."""
     if checkpoint.get("model_state_dict") is None and _CODES in checkpoint:
-        message = "DeepSDF's latent codes without its network; upload both in one file"
+        message = "these are DeepSDF's latent codes without its network; give both in one file"
         raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")
 
 
@@ -98,13 +98,14 @@ def latent_code(
         if overrides.latent_index is not None or len(overrides.latent) != width:
             message = f"description.latent: expected {width} numbers, and no latent_index beside them"
             raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
-        return np.array(overrides.latent, dtype=np.float32), "latent code from the description"
+        return np.array(overrides.latent, dtype=np.float32), "latent code from the import options"
     if width == 0:
         return np.zeros(0, dtype=np.float32), "no latent code: a network of one shape"
     if _CODES not in checkpoint:
         message = (
-            f"DeepSDF's network alone: put its latent_codes into the same file, or give the shape's {width} numbers"
-            " as latent in the description"
+            f"DeepSDF's network without latent codes: put its latent_codes into the same file, or give "
+            f"the {width} numbers"
+            " of the shape as the import option latent"
         )
         raise FieldFormatError(message, reason="LATENT_MISSING")
     codes = _all_codes(checkpoint[_CODES], source, width)
@@ -149,7 +150,7 @@ def at_code(layers: Layers, latent: Float32Array, whole: tuple[int, ...]) -> Lay
     return Layers(tuple(weights), tuple(biases))
 
 
-# DeepSDF as widespread later code writes it: blocks ``net.*.0`` of a layer and ReLU, ``final_layer.0`` and one tanh.
+# DeepSDF as widespread later code writes it: blocks ``net.*0.0`` of a layer and ReLU, ``final_layer.0`` and one tanh.
 #
 # A narrower ``skip_layer.0``, behind which the network sees its input again, is in the file even where it is not used,
 # and nothing says behind which block it is: if several places fit, it is asked.
@@ -187,11 +188,11 @@ def convert_blocks(
         for place, layers, skips in _places(state, plain, source, overrides)
     ]
     if not places:
-        raise FieldFormatError("description.skip_layer: there is no such place", reason="INVALID_DESCRIPTION")
+        raise FieldFormatError("description.skip_layer: there is no such layer", reason="INVALID_DESCRIPTION")
     why = (
         f"keys net.*.0 and final_layer.0, {len(blocks)} blocks",
         whence,
-        "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
+        "bounds [-1, 1]: the cube around the unit sphere, into which shapes are scaled",
     )
     converted = network_field(places[0][1], form, BLOCKS, entries, why)
     if len(places) == 1:

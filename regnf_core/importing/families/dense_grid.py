@@ -38,7 +38,7 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     values = arrays.array(name)
     require_shape(name, values, (None, None, None))
     if min(values.shape) < 2:
-        raise tensor_error(f"{name} has shape {values.shape}, expected two nodes an axis at least", "TENSOR_SHAPE")
+        raise tensor_error(f"{name} has shape {values.shape}, expected at least two nodes per axis", "TENSOR_SHAPE")
     weights = _weights(arrays, values.shape)
     origin, spacing, told = _placement(arrays, np.array(values.shape))
     why = (f"array {name}, {' x '.join(map(str, values.shape))} nodes", f"placed by {told}; the first axis is x")
@@ -58,7 +58,7 @@ def grid_field(
     Raises FieldFormatError (BOUNDS_INVALID).
     """
     if not (np.isfinite(origin).all() and np.isfinite(spacing).all() and (spacing > 0.0).all()):
-        raise _invalid("the grid's spacing is not above zero along every axis, or its origin is no place")
+        raise _invalid("the spacing of the grid must be positive along every axis, and its origin must be finite")
     tensors: dict[str, StoredArray] = {"values": values}
     if weights is not None:
         tensors["weights"] = stored_weights(weights)
@@ -77,7 +77,10 @@ def grid_field(
             why = (*why, PROJECTIVE)
     if weights is not None and not weights.all():
         tensors["values"] = filled_nodes(bounded, weights > 0, spacing, overrides.sign or 1)
-        why = (*why, f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were seen, the rest is free space")
+        why = (
+            *why,
+            f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were observed; the others are free space",
+        )
     return ConvertedField(FAMILY, why, description, tensors, sign_is_open=True)
 
 
@@ -89,7 +92,7 @@ def _weights(arrays: ArraySource, shape: tuple[int, ...]) -> Float32Array | None
     weights = arrays.weights(name)
     require_shape(name, weights, shape)
     if not weights.any():
-        raise tensor_error(f"no node was ever seen: all of {name} is zero", "TENSOR_SHAPE")
+        raise tensor_error(f"no node was observed: all of {name} is zero", "TENSOR_SHAPE")
     return weights
 
 

@@ -1,7 +1,7 @@
 """On which side of a mesh's faces space is free: outside an object, inside a room that was scanned from within.
 
 Across a face the generalized winding number (Jacobson et al. 2013) rises by one from front to back, whatever else of
-the surface is missing. So its values just before the faces tell what free space has: 0 round a closed object, -1 in a
+the surface is missing. So its values just before the faces tell what free space has: 0 around a closed object, -1 in a
 closed room whose faces look inward, in between where parts are missing. Halfway to the values just behind is the level
 that parts free space from matter.
 """
@@ -63,9 +63,9 @@ def _crossed(vertices: Float64Array, faces: Int64Array) -> Float64Array:
 
 
 SAMPLES = 2_000
-"""Places on the faces, and as many in the volume, where the winding number is asked for."""
+"""Places on the faces, and as many in the volume, where the winding number is requested."""
 _CLOSED = 0.1
-"""Free space this near to 0 counts as that round a closed mesh."""
+"""Free space this near to 0 counts as that around a closed mesh."""
 INWARD = -0.6
 """Below this, most faces look into a hollow: sheets that are open on one side have -0.5."""
 _FILLED, _WITHIN = 0.45, 0.05
@@ -95,18 +95,30 @@ def facing_of(vertices: Float64Array, faces: Int64Array, asked: Asked) -> Facing
     if asked == "scene" and (shell := _outer_shell(vertices, faces, before)) is not None:
         faces = np.where(shell[:, None], faces[:, ::-1], faces)
         before = _winding_before(vertices, faces)
-        return _seen_from_within(faces, before, "its outermost part encloses the rest and was turned to face it")
+        return _seen_from_within(
+            faces, before, "its outermost part encloses the rest, and its faces were flipped towards it"
+        )
     free = float(np.median(before.values))
     if free > INWARD:
         return _outward(faces, free)
     if asked == "object" or (asked is None and not _is_room(vertices, faces, before, free + 0.5)):
-        turned = "its faces look inward and were turned round; if it is a room seen from within, say as: scene"
+        turned = (
+            "its faces pointed inward and were flipped. If it is a room seen from inside, give the import option "
+            "as: scene"
+        )
         found = _outward(faces[:, ::-1], float(np.median(_winding_before(vertices, faces[:, ::-1]).values)))
         return Facing(found.faces, found.level, found.free, found.why, (f"MESH_INSIDE_OUT: {turned}",))
-    told = "the description says scene" if asked == "scene" else "they enclose most of the mesh's box, and things in it"
-    found = _seen_from_within(faces, before, f"its faces look inward, and {told}")
+    told = (
+        "the import option is scene"
+        if asked == "scene"
+        else "they enclose most of the mesh's box, and other parts in it"
+    )
+    found = _seen_from_within(faces, before, f"its faces point inward, and {told}")
     if asked is None:
-        text = "taken for a room seen from within; if it is an object with its faces turned round, say as: object"
+        text = (
+            "it was imported as a room seen from inside. If it is an object with flipped faces, give the import "
+            "option as: object"
+        )
         return Facing(found.faces, found.level, found.free, found.why, (f"SCENE_ASSUMED: {text}",))
     return found
 
@@ -132,14 +144,14 @@ def _outward(faces: Int64Array, free: float) -> Facing:
     """Faces that look outward, or to one side: free space is what they look at."""
     if free > -_CLOSED:
         return Facing(faces, 0.5, free, ())
-    why = f"parts of the surface are missing: free space before it has the winding number {free:.2f}, not 0"
+    why = f"parts of the surface are missing: free space in front of it has the winding number {free:.2f}, not 0"
     return Facing(faces, _level(free), free, (why,))
 
 
 def _seen_from_within(faces: Int64Array, before: _Before, why: str) -> Facing:
     free = float(np.median(before.values))
     missing = 100.0 * min(max(1.0 + free, 0.0), 1.0)
-    seen = f"seen from within: {why}; {missing:.2g} % of what encloses it is missing"
+    seen = f"seen from inside: {why}; {missing:.2g} % of what encloses it is missing"
     return Facing(faces, _level(free), free, (seen,))
 
 

@@ -46,7 +46,7 @@ def find_spaces(parameters: int, width: int, habits: GridHabits, given: GridDesc
     said = {name: value for name, value in vars(given).items() if value is not None and name != "interpolation"}
     if said:
         raise contradiction("hash", said, f"{parameters} numbers and {width} columns")
-    message = f"no hash grid has {parameters} parameters and {width} features"
+    message = f"no hash grid with {parameters} parameters and {width} features exists"
     raise FieldFormatError(message, reason="HASH_GRID_NOT_RECOGNIZED")
 
 

@@ -125,13 +125,15 @@ def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
     """Linear layers have the even numbers; activations between them have the odd ones, and no parameters."""
     count = len({key.split(".")[2] for key in state if key.startswith("network.layers.")})
     if count < 2:
-        message = "instant-nsr-pl without plain layers: a NeRF, or a network of tiny-cuda-nn's own (FullyFusedMLP)"
+        message = "instant-nsr-pl without plain layers: it is a NeRF, or it uses tiny-cuda-nn's FullyFusedMLP"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
     names = [f"network.layers.{2 * i}" for i in range(count)]
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)
     if len(names) > 4:
-        raise FieldFormatError(f"a geometry network of {len(names)} layers", reason="FAMILY_NOT_SUPPORTED")
+        raise FieldFormatError(
+            f"a geometry network with {len(names)} layers is not supported", reason="FAMILY_NOT_SUPPORTED"
+        )
     return layers
 
 
@@ -146,15 +148,15 @@ def _untold(
     """Both activations where neither the description nor the weights tell which it is; what they tell goes to
     ``why``, and what holds for the trainer as it is published alone, to ``warnings``."""
     if overrides.output_bias is None and overrides.output_scale is None:
-        why.append("nothing is said of sdf_bias and sdf_activation: none is assumed")
+        why.append("sdf_bias and sdf_activation are not given: none is assumed")
     if overrides.activation is not None:
         return ()
     if not began_as_a_sphere(folded_weight(state, f"network.layers.{2 * len(layers.weights) - 2}", source)):
         return _ACTIVATIONS
-    why.append("softplus: the last layer's weights have one sign, as those that begin as a sphere")
+    why.append("softplus: the weights of the last layer have one sign, as after initialization as a sphere")
     warnings.append(
-        "ACTIVATION_ASSUMED: the trainer puts softplus into networks that begin as a sphere; say activation relu of a"
-        " changed one that does not"
+        "ACTIVATION_ASSUMED: the trainer uses softplus in networks that are initialized as a sphere; if this one "
+        "does not, give the import option activation: relu"
     )
     return ()
 
@@ -162,7 +164,7 @@ def _untold(
 def _said(layers: Layers, overrides: UploadDescription) -> Layers:
     """The layers with what the settings say of them: (result + output_bias) output_scale."""
     if overrides.activation not in (None, "softplus", "relu"):
-        message = f"description.activation: {overrides.activation} means nothing for {FAMILY}: softplus or relu"
+        message = f"description.activation: {overrides.activation} is not possible for {FAMILY}: softplus or relu"
         raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
     scale = np.float32(overrides.output_scale or 1.0)
     (*weights, last), (*biases, last_bias) = layers.weights, layers.biases
@@ -192,7 +194,7 @@ def _scene_cube(state: dict[Any, Any], source: TensorSource) -> tuple[list[list[
     require_shape("model.scene_aabb", box, (6,))
     radius = float(box.max())
     if radius <= 0.0 or not np.array_equal(box, np.repeat(np.array((-radius, radius), dtype=np.float32), 3)):
-        raise FieldFormatError("the scene_aabb is not a cube round the origin", reason="BOUNDS_INVALID")
+        raise FieldFormatError("the scene_aabb is not a cube around the origin", reason="BOUNDS_INVALID")
     return [[-radius] * 3, [radius] * 3], radius
 
 
@@ -200,7 +202,7 @@ def _open_levels(checkpoint: dict[Any, Any], levels: int, why: list[str], warnin
     """How many levels the progressive grid had opened by its last step."""
     step = step_of(checkpoint, "global_step")
     if step is None:
-        warnings.append("LEVEL_MASK_ASSUMED: the checkpoint has no global_step; all levels are taken to be in use")
+        warnings.append("LEVEL_MASK_ASSUMED: the checkpoint has no global_step; all levels are assumed to be in use")
         return None
     opened = min(_FIRST_LEVELS + step // _STEPS_A_LEVEL, levels)
     why.append(f"progressive grid, step {step}: {opened} of {levels} levels are in use")

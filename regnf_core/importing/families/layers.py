@@ -39,7 +39,7 @@ _SHARED = frozenset(
 
 
 def shared_entries(overrides: UploadDescription, bounds: Sequence[Sequence[float]]) -> dict[str, Any]:
-    """The entries of a safe field's description that all kinds share.
+    """The entries of a regnf field file's description that all kinds share.
 
     bounds: lowest and highest corner in the coordinates of the checkpoint's function. What ``overrides`` says goes
     before.
@@ -75,19 +75,19 @@ def refuse_other_entries(overrides: UploadDescription, family: str, meant: Seque
     """Raise FieldFormatError (INVALID_DESCRIPTION) for an entry that neither all families share nor is ``meant``."""
     others = [name for name, value in overrides.non_default().items() if name not in _SHARED and name not in meant]
     if others:
-        raise FieldFormatError(f"description.{others[0]} means nothing for {family}", reason="INVALID_DESCRIPTION")
+        raise FieldFormatError(f"description.{others[0]} is not possible for {family}", reason="INVALID_DESCRIPTION")
 
 
 def require_family(overrides: UploadDescription, family: str) -> None:
     """Raise FieldFormatError (FAMILY_NOT_SUPPORTED) if ``overrides`` names another family than the file's."""
     if overrides.family not in (None, family):
-        message = f"the file is {family}, the description says {overrides.family}"
+        message = f"the file is {family}, the import options have {overrides.family}"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
 
 
 def contradiction(name: str, said: object, found: object) -> FieldFormatError:
     """The error for an entry of the settings or the description that the tensors exclude: both values, by name."""
-    message = f"{name}: the settings or the description say {said}, the tensors have {found}"
+    message = f"{name}: the config file or the import options have {said}, the tensors have {found}"
     return FieldFormatError(message, reason="SETTINGS_CONTRADICT_TENSORS")
 
 
@@ -122,7 +122,7 @@ class Layers:
         )
 
     def tensors(self) -> dict[str, Float32Array]:
-        """The layers under the names of the safe field file."""
+        """The layers under the names of the regnf field file."""
         named = {f"layers.{i}.weight": weight for i, weight in enumerate(self.weights)}
         return named | {f"layers.{i}.bias": bias for i, bias in enumerate(self.biases)}
 
@@ -137,7 +137,9 @@ def layer_names(state: Mapping[str, Any], prefix: str, minimum: int = 2) -> list
     if layers > MAX_LAYERS or numbers != {str(i) for i in range(layers)}:
         raise FieldFormatError("the geometry network's layers are not numbered from 0 on", reason="TENSOR_MISSING")
     if layers < minimum:
-        raise FieldFormatError(f"a geometry network of {layers} layers", reason="FAMILY_NOT_SUPPORTED")
+        raise FieldFormatError(
+            f"a geometry network with {layers} layers is not supported", reason="FAMILY_NOT_SUPPORTED"
+        )
     return [f"{prefix}{i}" for i in range(layers)]
 
 
@@ -193,7 +195,7 @@ def folded_weight(state: Mapping[str, Any], name: str, source: TensorSource) -> 
     require_shape(f"{name}.{g}", length, (direction.shape[0], 1))
     norm = np.linalg.norm(direction.astype(np.float64), axis=1, keepdims=True)
     if not norm.all():
-        raise FieldFormatError(f"a row of {name}.{v} is zero and has no direction", reason="TENSOR_NOT_FINITE")
+        raise FieldFormatError(f"a row of {name}.{v} is zero, so it has no direction", reason="TENSOR_NOT_FINITE")
     return np.asarray(length * (direction / norm), dtype=np.float32)
 
 

@@ -34,6 +34,6 @@ def convert_mesh(
     if len(geometry.faces) > 0:
         return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
     if format_ not in CLOUD_FORMATS or len(geometry.vertices) == 0:
-        raise malformed(f"the {format_} file holds no triangles")
+        raise malformed(f"the {format_} file has no triangles")
 
     return convert_cloud(geometry, f"a {format_} file", overrides, work_s)

@@ -82,13 +82,13 @@ class Form:
         if overrides.skip_order is not None:
             form = replace(form, input_first=overrides.skip_order == "input_first")
         if form.activation not in _USUAL_SCALES and form.activation_scale is not None:
-            raise _invalid("activation_scale", f"means nothing for {form.activation}")
+            raise _invalid("activation_scale", f"is not possible for {form.activation}")
         if form.activation != "sine" and form.first_activation_scale is not None:
-            raise _invalid("first_activation_scale", f"means nothing for {form.activation}")
+            raise _invalid("first_activation_scale", f"is not possible for {form.activation}")
         if form.activation == "leaky_relu" and form.scale > 1.0:
             raise _invalid("activation_scale", "a slope of leaky_relu is at most 1")
         if form.output_tanh and (form.output_scale != 1.0 or form.output_bias):
-            raise _invalid("output_scale", "and output_bias mean nothing behind a tanh")
+            raise _invalid("output_scale", "and output_bias are not possible after a tanh")
         return form
 
 

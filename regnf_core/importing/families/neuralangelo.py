@@ -92,7 +92,9 @@ def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)
     if len(names) > 4:
-        raise FieldFormatError(f"a geometry network of {len(names)} layers", reason="FAMILY_NOT_SUPPORTED")
+        raise FieldFormatError(
+            f"a geometry network with {len(names)} layers is not supported", reason="FAMILY_NOT_SUPPORTED"
+        )
     return layers
 
 
@@ -114,7 +116,7 @@ def _open_levels(
     """How many levels coarse-to-fine training had opened by its last iteration, by the number of levels there are."""
     iteration = step_of(checkpoint, "iteration")
     if iteration is None:
-        warnings.append("LEVEL_MASK_ASSUMED: the checkpoint has no iteration; all levels are taken to be in use")
+        warnings.append("LEVEL_MASK_ASSUMED: the checkpoint has no iteration; all levels are assumed to be in use")
         return {}
     by_step = (iteration - _WARM_UP) // _STEPS_A_LEVEL
     opened, is_open = {}, False
@@ -125,8 +127,8 @@ def _open_levels(
     if is_open:
         by_table = " or ".join(map(str, dict.fromkeys(opened.values())))
         warnings.append(
-            f"LEVEL_MASK_ASSUMED: coarse to fine from {_FIRST_LEVELS[0]} or {_FIRST_LEVELS[1]} levels on; by the table"
-            f" {by_table} are in use; say level_mask if not"
+            f"LEVEL_MASK_ASSUMED: coarse to fine from {_FIRST_LEVELS[0]} or {_FIRST_LEVELS[1]} levels on; by the "
+            f"table, {by_table} are in use; if not, give the import option level_mask"
         )
     told = " or ".join(f"{number} of {levels}" for levels, number in opened.items())
     why.append(f"coarse to fine, iteration {iteration}: {told} levels are in use")

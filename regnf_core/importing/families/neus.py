@@ -68,8 +68,8 @@ def _with_color(
     is_softplus = overrides.activation in (None, "softplus")
 
     def read() -> ReadColor:
-        understood(not overrides.output_column, "the distance is not the first of the network's results")
-        understood(last not in converted.description["input_at"], "the last layer sees the position again")
+        understood(not overrides.output_column, "the distance is not the first output of the network")
+        understood(last not in converted.description["input_at"], "the last layer uses the position again")
         return color.read_color(colors, state, f"lin{last}", source, overrides.color)
 
     # Softplus of another factor is stored as that of the usual one, of other numbers.

@@ -59,7 +59,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
     }
     why: tuple[str, ...] = (
         f"tables {layer}{_DATA} and {layer}{_SETTINGS}: {len(blocks)} blocks of {_EDGE}^3 voxels",
-        "values belong to the voxels' middles, in meters",
+        "values are at the centers of the voxels, in meters",
     )
     if projective:
         why = (*why, PROJECTIVE)
@@ -73,7 +73,7 @@ def _layer(tables: TableSource) -> str:
     layers = [name.removesuffix(_DATA) for name in tables.tables if name.endswith(_DATA)]
     layers = sorted(layer for layer in layers if layer + _SETTINGS in tables.tables)
     if not layers:
-        raise FieldFormatError("a database, but not one of layers of voxels", reason="FIELD_NOT_RECOGNIZED")
+        raise FieldFormatError("a database without voxel layers", reason="FIELD_NOT_RECOGNIZED")
     found = [layer for layer in layers if "tsdf" in layer.lower()]
     if len(found) != 1:
         message = f"a map with {len(found)} layers of truncated distances; its layers are {layers[:8]}"
@@ -106,7 +106,7 @@ def _read(tables: TableSource, layer: str, tensor_bytes: int) -> tuple[IntArray,
             indices.append(tuple(index))
             parts.append(voxels)
     if not parts:
-        raise tensor_error("no voxel was ever seen: there are no blocks, or all weights are zero", "TENSOR_SHAPE")
+        raise tensor_error("no voxel was observed: there are no blocks, or all weights are zero", "TENSOR_SHAPE")
     voxels = np.stack(parts).reshape(-1, _EDGE, _EDGE, _EDGE)
     seen: BoolArray = np.asarray(voxels["weight"] > 0)
     values = finite_float32("the map", np.where(seen, voxels["distance"], np.float32(0.0)))

@@ -57,7 +57,11 @@ def convert_onnx(data: memoryview, tensor_bytes: int, overrides: UploadDescripti
         "opset": model.opset,
     }
     why = (f"an ONNX model: {len(read.nodes)} nodes, operator set {read.opset}", told)
-    warnings = () if overrides.bounds else ("BOUNDS_ASSUMED: [-1, 1]^3; say bounds if the field's region is another",)
+    warnings = (
+        ()
+        if overrides.bounds
+        else ("BOUNDS_ASSUMED: [-1, 1]^3; if the field's region is another, give the import option bounds",)
+    )
     converted = ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
     if column is None or overrides.output_column is not None:
         return converted
@@ -85,13 +89,13 @@ def _batch(given: Port, made: Port, wide: bool = False) -> tuple[int, str]:
         if port.element_type not in _REAL_TYPES:
             raise unsupported(f"{port.name[:40]} does not hold real numbers")
         if port.shape is not None and not any(_fits(port.shape, shape) for shape in shapes):
-            raise unsupported(f"the model maps {_shown(given)} to {_shown(made)}: (N, 3) to (N,) or (N, 1) is needed")
+            raise unsupported(f"the model maps {_shown(given)} to {_shown(made)}: (N, 3) to (N,) or (N, 1) is required")
     fixed = given.shape[0] if given.shape is not None else None
     if fixed is None:
         return _BATCH, f"any number of points; evaluated {_BATCH} at a time"
     if _MIN_FIXED_BATCH <= fixed <= MAX_BATCH:
         return fixed, f"exactly {fixed} points at a time"
-    return _BATCH, f"made for {fixed} points, evaluated for {_BATCH} at a time: export with an open number of points"
+    return _BATCH, f"made for {fixed} points, evaluated for {_BATCH} at a time: export with a dynamic number of points"
 
 
 def _fits(shape: tuple[int | None, ...], overrides: tuple[int | None, ...]) -> bool:
@@ -120,7 +124,7 @@ class _Parts:
         for number, node in enumerate(model.nodes):
             self._add_node(number, node)
         if model.output.name not in self.names:
-            raise unsupported("the model's output is made by no node")
+            raise unsupported("no node makes the model's output")
 
     def add_choice(self, name: str, column: int) -> str:
         """One more node that keeps one column of a value; the name of what it gives."""
@@ -137,7 +141,7 @@ class _Parts:
 
     def _add_node(self, number: int, node: Node) -> None:
         if node.op not in OPERATORS:
-            raise unsupported(f"the operator {node.op} is not taken; docs/families.md lists those that are")
+            raise unsupported(f"the operator {node.op} is not supported; docs/families.md lists the supported ones")
         attributes = dict(node.attributes)
         value = attributes.pop("value", None) if node.op in ("Constant", "ConstantOfShape") else None
         inputs = list(node.inputs)
@@ -149,7 +153,7 @@ class _Parts:
             self._keep(inputs[-1], value)
         unknown = [name for name in inputs if name not in self.names]
         if unknown:
-            raise unsupported(f"node {number} ({node.op}) needs {unknown[0][:40]}, which nothing before it makes")
+            raise unsupported(f"node {number} ({node.op}) needs {unknown[0][:40]}, which no earlier node makes")
         outputs = list(node.outputs)
         while outputs and outputs[-1] == "":
             outputs.pop()
@@ -187,7 +191,7 @@ def _fits_32_bits(values: Array) -> bool:
 
 def _plain(op: str, name: str, value: Attribute) -> Any:
     if isinstance(value, np.ndarray) or (isinstance(value, list) and len(value) > _SMALL):
-        raise unsupported(f"the operator {op} with the attribute {name} of so many numbers")
+        raise unsupported(f"the operator {op} with the attribute {name} with too many numbers")
     numbers = [] if isinstance(value, str) else value if isinstance(value, list) else [value]
     if not all(math.isfinite(number) for number in numbers):
         raise unsupported(f"the operator {op} with the attribute {name} that is not a finite number")

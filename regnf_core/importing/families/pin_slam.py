@@ -79,7 +79,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     order = "blended, then decoded" if settings.blend_first else "decoded, then blended"
     why = (
         f"an object {_OBJECT} under neural_points: {len(tensors['points'])} points, features {order}",
-        f"distances are the decoder's results times {settings.distance_scale:g}",
+        f"distances are the decoder's outputs times {settings.distance_scale:g}",
     )
     converted = ConvertedField(FAMILY, why, description, {**tensors, **layers.tensors()})
     colors = isinstance(checkpoint.get("color"), dict) and overrides.color.keep is not False
@@ -99,7 +99,7 @@ def _settings(attributes: Mapping[Any, Any]) -> _Settings:
         if config.get(name):
             raise FieldFormatError(f"a map made with {name} is not supported", reason="FAMILY_NOT_SUPPORTED")
     if config.get("idw_index", 2) != 2:
-        raise FieldFormatError("blending by another power than 2 is not supported", reason="FAMILY_NOT_SUPPORTED")
+        raise FieldFormatError("blending with a power other than 2 is not supported", reason="FAMILY_NOT_SUPPORTED")
     scale = 1.0
     if config.get("main_loss_type") == "bce":
         scale = _number(config, "logistic_gaussian_ratio") * _number(config, "sigma_sigmoid_m")
@@ -118,7 +118,7 @@ def _settings(attributes: Mapping[Any, Any]) -> _Settings:
 def _number(values: Mapping[Any, Any], name: str) -> float:
     value = values.get(name)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1e15:
-        raise FieldFormatError(f"{name} is missing from the map's settings, or no number", reason="TENSOR_MISSING")
+        raise FieldFormatError(f"{name} is missing in the map's settings, or is not a number", reason="TENSOR_MISSING")
     return float(value)
 
 

@@ -1,4 +1,4 @@
-"""regnf's own safe field file, uploaded again: checked like anything else, then written anew."""
+"""regnf's own regnf field file, uploaded again: checked like anything else, then written again."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, override
     tensors = {name: _array(name, tensor, data) for name, tensor in header.items()}
     why: tuple[str, ...] = ("a regnf field file",)
     if description.get(OBSERVATION) is not None:
-        why += ("it records which parts were observed",)
+        why += ("it has an observation",)
     if overrides.color.keep is False:
         description = {name: value for name, value in description.items() if name != COLOR}
         tensors = split_color(tensors)[0]
     source = dict(description["source"])
-    warnings = kept_warnings(source.pop(WARNINGS, None))  # the import writes them anew
+    warnings = kept_warnings(source.pop(WARNINGS, None))  # the import writes them again
     return ConvertedField(FAMILY, why, description | {"source": source}, tensors, warnings)
 
 
@@ -61,7 +61,10 @@ def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dic
     if placement is None:
         return changed
     if {"bounds", "frame"} & said.keys():
-        message = "the field's place is fixed (its dataset's frame, or far from the origin), and so are its bounds"
+        message = (
+            "the frame of the field is fixed (that of its dataset, or far from the origin), so its bounds cannot "
+            "be changed"
+        )
         raise FieldFormatError(f"description: {message}", reason="INVALID_DESCRIPTION")
     rows = [[*row[:3], ratio * row[3]] for row in placement["transform"][:3]] + [placement["transform"][3]]
     return changed | {"placement": {"transform": rows, "bounds": _times(ratio, placement["bounds"])}}

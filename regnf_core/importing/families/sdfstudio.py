@@ -106,9 +106,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
 def _tell_variant(state: dict[str, Any], layers: int, overrides: UploadDescription) -> tuple[_Variant, str]:
     if overrides.family is not None:
         if overrides.family not in _VARIANTS:
-            message = f"the file is one of {sorted(_VARIANTS)}, the description says {overrides.family}"
+            message = f"the file is one of {sorted(_VARIANTS)}, the import options have {overrides.family}"
             raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
-        return _VARIANTS[overrides.family], "the description or the settings name the family"
+        return _VARIANTS[overrides.family], "the family is from the import options or the config file"
     if not any(key.startswith("laplace_density.") for key in state):
         return _VARIANTS["nerfstudio_neus_facto"], "no laplace_density: nerfstudio, not sdfstudio"
     name = "sdfstudio_neus_facto"

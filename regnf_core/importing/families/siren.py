@@ -56,7 +56,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     network, form, entries = Network(layers), Form("sine").said(overrides), shared_entries(overrides, UNIT_CUBE)
     why = (
         f"keys {_PREFIX}*.0, {len(names)} layers",
-        "bounds [-1, 1]: beyond the cube in which SIREN trains its sines repeat",
+        "bounds [-1, 1]: outside of the cube in which SIREN trains, its sines repeat",
     )
     converted = network_field(network, form, FAMILY, entries, why)
     if overrides.activation_scale is None:

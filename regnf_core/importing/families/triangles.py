@@ -41,7 +41,7 @@ BoolArray = npt.NDArray[np.bool_]
 _MOST = 300
 """Parts that are looked at, the largest ones."""
 _PLACES = 9
-"""On each of them, where the winding number is asked for."""
+"""On each of them, where the winding number is requested."""
 _CLOSED = -0.9
 """A part is closed, or nearly so, and looks into itself, if the median winding number of its own faces, at the places
 before them, is below this."""
@@ -50,7 +50,7 @@ _FEW = 0.002
 _ROUNDS = 2
 """A part within another is told only when the other one is right."""
 PLACES = _MOST * _PLACES * (2 * _ROUNDS + 1)
-"""At most so many winding numbers are asked for."""
+"""At most so many winding numbers are requested."""
 
 
 def facing_outward(vertices: Float64Array, faces: Int64Array, free: float) -> tuple[Int64Array, tuple[str, ...]]:
@@ -83,7 +83,7 @@ def facing_outward(vertices: Float64Array, faces: Int64Array, free: float) -> tu
     share = float(sizes[turned].sum() / sizes.sum())
     if share <= _FEW:
         return faces, ()
-    told = f"{100.0 * share:.2g} % of its surface was turned round: parts whose faces looked into them"
+    told = f"{100.0 * share:.2g} % of its surface was flipped: parts whose faces pointed inward"
     return with_turned(turned), (told,)
 
 
@@ -143,7 +143,7 @@ def agreeing(vertices: Float64Array, faces: Int64Array) -> tuple[Int64Array, tup
     if not turned.any() or _disagreeing(found) > _FEWER * before:
         return faces, ()
     share = 100.0 * float(area[turned].sum() / area.sum())
-    return found, (f"{share:.2g} % of its surface was turned round, to agree with what is beside it",)
+    return found, (f"{share:.2g} % of its surface was flipped to match the neighboring faces",)
 
 
 def _disagreeing(faces: Int64Array) -> float:
@@ -249,7 +249,9 @@ def require_extent(diagonal: float) -> None:
     """Raise FieldFormatError (MESH_INVALID) for lengths whose squares single precision cannot hold."""
     if not _SHORTEST <= diagonal <= 1.0 / _SHORTEST:
         message = f"its diagonal is {diagonal:.3g}, expected {_SHORTEST:g} to {1.0 / _SHORTEST:g}"
-        raise FieldFormatError(message, reason="MESH_INVALID", hint="Give it in another unit, or without stray points.")
+        raise FieldFormatError(
+            message, reason="MESH_INVALID", hint="Give the mesh in another unit, or remove stray points."
+        )
 
 
 def _oriented(vertices: Float64Array, faces: Int64Array, asked: Asked) -> Facing:
@@ -264,15 +266,15 @@ def _sound_faces(geometry: Geometry) -> tuple[Int64Array, tuple[str, ...]]:
     """The faces (F, 3) whose corners are places, and what was left out. Raises FieldFormatError (MESH_INVALID)."""
     faces = geometry.faces
     if faces.min() < 0 or faces.max() >= len(geometry.vertices):
-        raise malformed("a face names a vertex that does not exist")
+        raise malformed("a face refers to a vertex that does not exist")
     with np.errstate(invalid="ignore"):
         sound = np.asarray((np.abs(geometry.vertices) <= _LARGEST).all(axis=1))
     if sound.all():
         return faces, ()
     kept = faces[sound[faces].all(axis=1)]
     if len(kept) == 0:
-        raise malformed("no triangle of the mesh has corners that are finite numbers")
-    ignored = [f"{int((~sound).sum())} vertices that are no finite numbers"]
+        raise malformed("no triangle of the mesh has finite corners")
+    ignored = [f"{int((~sound).sum())} vertices with NaN or infinity"]
     if len(kept) < len(faces):
         ignored.append(f"{len(faces) - len(kept)} triangles with such a corner")
     return kept, tuple(ignored)
@@ -308,12 +310,12 @@ def _once(corners: Int64Array) -> tuple[Int64Array, tuple[str, ...]]:
     ignored: list[str] = []
     found = _first_of(begun)
     if len(found) < len(corners):
-        ignored.append(f"{len(corners) - len(found)} triangles that are there twice")
+        ignored.append(f"{len(corners) - len(found)} duplicate triangles")
         corners, begun = corners[found], begun[found]
     sides = _first_of(np.sort(begun, axis=1))
     twice = len(corners) - len(sides)
     if 2 * twice > _DOUBLED * len(corners):
-        ignored.append(f"the other side of {twice} triangles: the mesh is double-sided")
+        ignored.append(f"{twice} triangles of the other side: the mesh is double-sided")
         corners = corners[sides]
     return corners, tuple(ignored)
 
@@ -336,8 +338,9 @@ def _blunt(corners: Float64Array, box: list[list[float]]) -> tuple[str, ...]:
         return ()
     share = 100.0 * step / diagonal
     text = (
-        f"its places lie {reach:.6g} from the origin in single precision, in steps of {step:.2g}, {share:.2g} % of its"
-        " diagonal: finer parts are lost; write it with double precision, or move it to the origin before writing"
+        f"its vertices are {reach:.6g} from the origin, where single precision has steps of {step:.2g}, {share:.2g} "
+        f"% of its"
+        " diagonal: finer details are lost. Write it with double precision, or move it to the origin before writing"
     )
     return (f"FAR_FROM_ORIGIN: {text}",)
 
@@ -349,7 +352,7 @@ def _scattered(vertices: npt.NDArray[np.float32], faces: Int64Array) -> tuple[st
     graph = coo_array((np.ones(len(edges), np.int8), edges.T), shape=(len(vertices), len(vertices)))
     parts = int(connected_components(graph, directed=False)[0])
     if parts > _MANY_PARTS:
-        text = f"it has {parts} parts that do not touch. Their inside is computed for all together, which takes long"
+        text = f"it has {parts} separate parts. Their inside is computed for all together, which takes long"
         found.append(f"MANY_PARTS: {text}")
     corners = vertices.astype(np.float64)[faces]  # (F, 3, 3)
     area = areas(vertices.astype(np.float64), faces)
@@ -364,7 +367,7 @@ def _scattered(vertices: npt.NDArray[np.float32], faces: Int64Array) -> tuple[st
         size = float(np.linalg.norm(np.ptp(corners[rest].reshape(-1, 3), axis=0)))
         if gaps.max() > _STRAY * size:
             text = f"{len(stray)} of its triangles lie {gaps.max():.3g} from the rest, which is {size:.3g} across"
-            found.append(f"STRAY_PARTS: {text}: remove them if they do not belong to it")
+            found.append(f"STRAY_PARTS: {text}: remove them if they do not belong to the object")
             break
     return tuple(found)
 

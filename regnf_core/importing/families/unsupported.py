@@ -11,7 +11,7 @@ from regnf_core.importing.families.layers import states, strip_prefix
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 
-_MESH = "extract its mesh, and give that"
+_MESH = "extract its mesh, and give the mesh"
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class _Known:
 _KNOWN = (
     _Known("torch-ngp's", _MESH, ("model",), ("encoder.",)),
     _Known("torch-ngp's", _MESH, (), ("encoder.", "backbone.")),
-    _Known("Co-SLAM's", "give the mesh that it writes to the run's folder", ("model",), ("decoder.sdf_net.",)),
+    _Known("Co-SLAM's", "give the mesh in the run's folder", ("model",), ("decoder.sdf_net.",)),
     _Known("IDR's, VolSDF's or MonoSDF's", _MESH, (), ("implicit_network.",)),
     _Known("iSDF's", _MESH, ("model_state_dict",), ("in_layer.", "out_alpha.")),
     _Known("NGLOD's", _MESH, (), ("features.0.fm", "louts.")),
     _Known(
         "SHINE-Mapping's, an octree whose tables are pickled as an object, and its scale in the settings",
-        "give the mesh that it writes to the run's folder mesh",
+        "give the mesh in the run's folder mesh",
         ("feature_octree", "geo_decoder"),
     ),
     _Known("NICE-SLAM's, grids of occupancies", _MESH, ("c", "decoder_state_dict")),
     _Known("nerfstudio's splatfacto, Gaussians without a surface", _MESH, ("pipeline",), ("_model.gauss_params.",)),
     _Known(
         "nerfstudio's nerfacto, a radiance field without distances",
-        "train neus-facto, or export a mesh (ns-export tsdf or poisson), and give that",
+        "train neus-facto, or export a mesh (ns-export tsdf or poisson), and give the mesh",
         ("pipeline",),
         ("_model.field.mlp_base",),
     ),

@@ -90,7 +90,7 @@ def _colors(arrays: ArraySource, blocks: _Blocks) -> npt.NDArray[np.float16] | N
     stored = arrays.weights(_attribute(arrays, "color"))  # 0 to 255
     edge = blocks.tsdf.shape[1]
     if stored.shape != (len(blocks.kept), edge, edge, edge, 3):
-        raise tensor_error(f"the colors have shape {stored.shape}, expected three numbers a voxel", "TENSOR_SHAPE")
+        raise tensor_error(f"the colors have shape {stored.shape}, expected three numbers per voxel", "TENSOR_SHAPE")
     if not stored.any():
         return None
     colors = (stored[blocks.kept].transpose(0, 3, 2, 1, 4) / np.float32(255.0)).clip(0.0, 1.0)
@@ -113,7 +113,7 @@ def _read(arrays: ArraySource) -> _Blocks:
         require_shape_of_blocks(name, voxels, len(keys), int(edge))
     kept = (weights > 0).any(axis=(1, 2, 3))
     if not kept.any():
-        raise tensor_error("no voxel was ever seen: all weights are zero", "TENSOR_SHAPE")
+        raise tensor_error("no voxel was observed: all weights are zero", "TENSOR_SHAPE")
     near, origin = near_blocks(keys[kept], edge * voxel_size)
     return _Blocks(tsdf[kept], weights[kept], near, voxel_size, np.asarray(kept), origin)
 
@@ -129,12 +129,12 @@ def _distances(
     Raises FieldFormatError (TRUNCATION_UNKNOWN).
     """
     size, truncation = blocks.voxel_size, overrides.truncation
-    why = f"truncation {truncation:g}, as the settings or the description say" if truncation is not None else ""
+    why = f"truncation {truncation:g}, from the config file or the import options" if truncation is not None else ""
     if truncation is None:
         largest = float(np.abs(blocks.tsdf[seen]).max())
         if largest > _LARGEST:
             said = f"values up to {largest:.3g}, while values divided by the truncation are at most 1"
-            raise FieldFormatError(f"the map's truncation is not in the file: {said}", reason="TRUNCATION_UNKNOWN")
+            raise FieldFormatError(f"the truncation of the map is not in the file: {said}", reason="TRUNCATION_UNKNOWN")
         if (voxels := length_of_one(blocks.tsdf, seen, blocks.keys)) is not None:
             truncation = voxels * size
             why = f"truncation of {voxels:g} voxels: by the distances to the surface"
@@ -143,10 +143,10 @@ def _distances(
         projective = bound_by_surface(values, seen, blocks.keys, size)
         return values, ((why, PROJECTIVE) if projective else (why,)), ()
     measure_from_surface(blocks.tsdf, seen, blocks.keys, size, _USUAL * size)
-    why = f"truncation of {_USUAL:g} voxels, Open3D's default: the values do not tell it"
-    text = f"the file does not say its truncation: distances are measured from the surface, up to {_USUAL * size:.4g} "
+    why = f"truncation of {_USUAL:g} voxels, Open3D's default: the values do not determine it"
+    text = f"the truncation is not in the file: distances are measured from the surface, up to {_USUAL * size:.4g} "
     text += (
-        f"({_USUAL:g} voxels, Open3D's default); if it was fused with another one, say it in a description: truncation"
+        f"({_USUAL:g} voxels, Open3D's default); if it was fused with another one, give the import option truncation"
     )
     return blocks.tsdf, (why,), (f"TRUNCATION_ASSUMED: {text}",)
 

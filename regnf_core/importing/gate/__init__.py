@@ -1,1 +1,1 @@
-"""The import gate: a throw-away process that turns an upload into a safe field file."""
+"""The import gate: a throw-away process that turns an upload into a regnf field file."""

@@ -52,7 +52,7 @@ _KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 def settled(converted: ConvertedField, share: int = 1) -> ConvertedField:
     """``converted`` as the one function that its weights speak for, with what was decided, and by what, in ``why``.
 
-    share: after the first round the readings are tried at one ``share``-th of the points.
+    share: after the first around the readings are tried at one ``share``-th of the points.
 
     Raises AmbiguousError: readings that differ fit alike.
     """
@@ -73,14 +73,14 @@ def _confirmed(converted: ConvertedField, assumed: Assumed) -> ConvertedField:
     evidence = Evidence(converted.reading, TRIAL_POINTS)
     misfit = evidence.of(converted.reading).misfit_near
     if math.isinf(misfit):
-        raise FieldFormatError("values and gradients are not finite", reason="FIELD_NOT_FINITE")
+        raise FieldFormatError("the field or its gradient evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
     said = json.dumps(assumed.say)
     if misfit < _CONFIRMED and all(misfit <= evidence.of(make()).misfit_near for make in assumed.beside):
         why = f"{said}, as is usual: the gradient's norm at the surface is {misfit:.2f} from 1"
         return replace(converted, why=(*converted.why, why), assumed=None)
     usual = Variant(said, assumed.say, lambda reading: reading)
     raise untold_error(
-        converted, (usual, *assumed.others), "the field does not behave like a distance under the usual number"
+        converted, (usual, *assumed.others), "with the usual number the field does not behave like a distance"
     )
 
 
@@ -223,7 +223,7 @@ def _interpolated(reading: Reading, share: int, why: list[str]) -> tuple[Reading
             return reading, why
         told = told_interpolation(linear, smooth)
         if told is not None:
-            more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
+            more = f"{told} interpolation: with it the gradient's norm does not depend on the cells"
             return _with_interpolation(reading, told), [*why, more]
     habit = reading.description["hash"]["interpolation"]
     asked = [_with_interpolation(reading, kind) for kind in sorted(_KINDS, key=lambda kind: kind != habit)]
@@ -252,7 +252,8 @@ def _ambiguous(readings: Sequence[Reading], whole: bool = False) -> AmbiguousErr
     more = f", or {len(lines) - MOST_CANDIDATES} others" if len(lines) > MOST_CANDIDATES else ""
     shown = " or ".join(lines[:MOST_CANDIDATES])
     return AmbiguousError(
-        f"{len(lines)} readings fit this table alike; add one to the description: {shown}{more}", asked
+        f"{len(lines)} readings fit this table equally well; add one of these to the import options: {shown}{more}",
+        asked,
     )
 
 
@@ -268,7 +269,7 @@ def _said(trials: Sequence[Trial], chosen: Trial) -> str:
     rest = [trial for trial in trials if not trial.is_same(chosen)]
     start = f"hash grid of {chosen.reading.name}: {len(trials)} layouts give a table of this size"
     if not rest:
-        return f"{start}, and all are the same function"
+        return f"{start}, and all give the same function"
     second = min(rest, key=lambda trial: trial.mean)
     by = (f"{trial.mean:.2f}" if math.isfinite(trial.mean) else "any amount" for trial in (chosen, second))
-    return f"{start}, under this one the gradient's norm is {next(by)} from 1; under {second.reading.name}, {next(by)}"
+    return f"{start}; with this one the gradient's norm is {next(by)} from 1; under {second.reading.name}, {next(by)}"

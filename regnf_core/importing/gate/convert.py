@@ -43,8 +43,8 @@ _SEEN = (OBSERVATION, WEIGHTS)
 """Tensors that say how much was seen; they are no parameters of the function."""
 _ALL_ROUND = 0.95
 _SIGN_UNCERTAIN = (
-    "all round the bounds the values are negative: a room seen from within, or an object trained with its sign turned"
-    " round; for the latter say sign -1"
+    "the values are negative everywhere at the bounds: it is a room seen from inside, or an object with inverted "
+    "sign; for the latter give the import option sign: -1"
 )
 _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
@@ -65,7 +65,8 @@ def convert_file(
     picture: bool = False,
     beside: Companions | None = None,
 ) -> dict[str, Any]:
-    """Convert ``upload``, write the safe field, evaluate it once, draw it if asked to. Returns the report's values.
+    """Convert ``upload``, write the regnf field file, evaluate it once, draw it if asked to. Returns the report's
+    values.
 
     beside: what came with it, each the name and the path of one file or of an archive of files. Confines nothing: the
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
@@ -82,7 +83,7 @@ def convert_file(
     )
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
-    # Of warnings with the same word the last: a safe field brings those of its first import.
+    # Of warnings with the same word the last: a regnf field file brings those of its first import.
     latest = {warning.partition(":")[0]: warning for warning in (*warnings, *more)}
     warned = list(kept_warnings(list(latest.values())))
     add_to_source(target, {WARNINGS: warned} if warned else {})
@@ -93,7 +94,7 @@ def convert_file(
 def _stored(
     read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool
 ) -> tuple[dict[str, Any], Sequence[str], int | None, bool, str | None]:
-    """Write the safe field of what was read to ``target``. cameras: whether they came with it.
+    """Write the regnf field file of what was read to ``target``. cameras: whether they came with it.
 
     Returns values of the report, warnings, the sign where nobody has said it, whether the values will tell it, and the
     up axis. Raises FieldFormatError.
@@ -112,7 +113,7 @@ def _stored(
 
         converted = settled(converted, affordable_share(converted, limits))
     if converted.untold:
-        what = "neither the tensors nor how they behave tell which function this is"
+        what = "neither the tensors nor the values of the field determine which function this is"
         raise untold_error(converted, converted.untold, what)
     converted = placed(with_affordable_color(converted, limits), read.description)
     converted = observed(converted, read, limits, required=cameras)
@@ -127,7 +128,7 @@ def _stored(
         "parameters": sum(array.size for name, array in own.items() if name not in _SEEN),
         "label": said["label"],
     }
-    # A mesh's faces say it, and a safe field was imported before.
+    # A mesh's faces say it, and a regnf field file was imported before.
     known = (
         read.description.sign or read.description.as_ or said["kind"] == "mesh" or converted.family == safe_field.FAMILY
     )
@@ -179,11 +180,13 @@ def _require_text(description: dict[str, Any]) -> None:
     from regnf_core.library_entries import LABEL_PATTERN
 
     if not re.fullmatch(LABEL_PATTERN, description.get("label") or ""):
-        raise FieldFormatError("the field's label has control characters", reason="SAFE_FORMAT_INVALID")
+        raise FieldFormatError("the label of the field has control characters", reason="SAFE_FORMAT_INVALID")
     try:
         json.dumps(description, ensure_ascii=False).encode("utf-8")
     except UnicodeEncodeError as error:
-        raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
+        raise FieldFormatError(
+            "the description of the field is not Unicode text", reason="SAFE_FORMAT_INVALID"
+        ) from error
 
 
 def draw_asked(asked: Sequence[OpenCandidate], out_dir: Path, seconds: float) -> None:
@@ -200,7 +203,7 @@ def draw_asked(asked: Sequence[OpenCandidate], out_dir: Path, seconds: float) ->
 
     def look(_: int) -> None:
         if time.process_time() > deadline:
-            raise RegnfError("no time is left for the picture")
+            raise RegnfError("there is no time left for the picture")
 
     for number, candidate in enumerate(asked, 1):
         with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():

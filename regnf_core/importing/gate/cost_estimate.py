@@ -61,7 +61,10 @@ def with_affordable_color(converted: ConvertedField, limits: ImportLimits) -> Co
     seconds += COLOR_POINTS * color_work(color, converted.tensors)
     if seconds <= limits.work_s:
         return converted
-    told = f"{COLOR_POINTS} points would take an estimated {seconds:.0f} s of a core; {limits.work_s:g} s are allowed"
+    told = (
+        f"{COLOR_POINTS} points would take an estimated {seconds:.0f} s of processor time; {limits.work_s:g} s are"
+        f" allowed"
+    )
     return replace(
         converted,
         description={name: value for name, value in converted.description.items() if name != COLOR},

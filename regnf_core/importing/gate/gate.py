@@ -64,7 +64,7 @@ def _candidate(value: Any, folder: Path, number: int) -> Candidate | None:
 __all__ = ["FIELD_NAME", "ImportLimits", "ImportReport", "import_field"]
 
 FIELD_NAME = "field.safetensors"
-"""The name of the safe field file in the output folder."""
+"""The name of the regnf field file in the output folder."""
 
 _ROOT = Path(__file__).resolve().parents[3]
 _ENTRY = """
@@ -139,11 +139,13 @@ def confined(
     try:
         return once()
     except _KilledError:
-        _log.warning("the import's process was killed from outside; it is started once more")
+        _log.warning("the import's process was killed from outside; it is started again")
     try:
         return once()
     except _KilledError as error:
-        raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY") from error
+        raise FieldFormatError(
+            "the import needs more memory than the machine has", reason="IMPORT_OUT_OF_MEMORY"
+        ) from error
 
 
 _early: dict[str, subprocess.Popen[bytes]] = {}
@@ -233,7 +235,7 @@ def _values_of(outcome: ChildOutcome, work: Path, limits: ImportLimits, seconds:
         used = f"stopped after {seconds:.1f} s and {outcome.cpu_seconds:.1f} s of processor time"
         raise FieldFormatError(f"the import took longer than {limits.longest_s:g} s: {used}", reason="IMPORT_TIMEOUT")
     if outcome.stopped == "output":
-        told = f"the import writes more than the {limits.file_bytes >> 20} MiB that it may"
+        told = f"the import writes more than the {limits.file_bytes >> 20} MiB that are allowed"
         raise FieldFormatError(told, reason="IMPORT_OUTPUT_TOO_LARGE")
     if outcome.stopped is None and outcome.signal == signal.SIGKILL:
         raise _KilledError
@@ -308,7 +310,7 @@ def _settings(values: Any) -> dict[str, Any] | None:
     if not all(
         value is None or isinstance(value, (bool, int, str)) or _finite(value) is not None for value in used.values()
     ):
-        raise ValueError("a setting that is no plain value")
+        raise ValueError("a setting that is not a plain value")
     return {"trainer": str(values["trainer"]), "files": [str(name) for name in values["files"]], "used": used}
 
 
@@ -323,14 +325,14 @@ def _finite(value: Any) -> float:
 def _isolation_warnings(isolation: dict[str, bool]) -> list[str]:
     if isolation.get("network_namespace") or isolation.get("system_call_filter"):
         return []
-    return ["NOT_ISOLATED: the kernel granted the import neither a network namespace nor a system call filter"]
+    return ["NOT_ISOLATED: the kernel gave the import neither a network namespace nor a system call filter"]
 
 
 def checked_size(field: Path, most: int) -> int:
     """The file's size, if it is a plain file of its own (no link) with a sound safetensors header."""
     found = field.lstat()
     if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= most:
-        raise ValueError("the import left something else than a plain file")
+        raise ValueError("the import wrote something other than a plain file")
     with open(field, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         data = memoryview(mapped)
         try:

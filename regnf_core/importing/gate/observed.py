@@ -35,9 +35,9 @@ _ASKED = 1 << 14
 
 
 def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, required: bool) -> ConvertedField:
-    """The field with an observation, if anything tells. required: the caller has asked for that of the cameras.
+    """The field with an observation, if anything tells. required: the caller has requested that of the cameras.
 
-    An observation in the file stays, unless cameras were asked for: it was made of the images, which know most, or as
+    An observation in the file stays, unless cameras were requested: it was made of the images, which know most, or as
     here. A map's own weights go before cameras: they know of depths that were missing, through which lines of sight
     would pass. Cameras found beside the file come last, if they can be used. Raises FieldFormatError as
     ``observed_by_cameras`` does, if ``required``.
@@ -47,7 +47,9 @@ def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, 
     found = observed_by_weights(converted.description, converted.tensors)
     if found is not None:
         if required:
-            converted = with_unused_cameras(converted, "the map's weights say what was observed, and they tell more")
+            converted = with_unused_cameras(
+                converted, "the observation is from the map's weights, which have more information"
+            )
         return observed_field(converted, *found, "by the weights of the map")
     if read.cameras is None:
         return converted
@@ -96,7 +98,7 @@ def _points(description: Mapping[str, Any], tensors: Mapping[str, StoredArray], 
     asked = seconds_of(plain, tensors, Calls((_ASKED,), ()))
     points = int(min(_MOST_POINTS, _SHARE * limits.work_s * _ASKED / max(asked, 1e-9)))
     if points < _LEAST_POINTS and math.isfinite(limits.refused_beyond_s):
-        message = f"lines of sight take {_LEAST_POINTS} evaluations at least; there is time for an estimated {points}"
+        message = f"lines of sight need at least {_LEAST_POINTS} evaluations; there is time for an estimated {points}"
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
     return max(points, _LEAST_POINTS)
 

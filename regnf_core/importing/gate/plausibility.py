@@ -15,25 +15,26 @@ from regnf_core.fields.observation import SdfField
 from regnf_core.importing.cost.mesh_work import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
 from regnf_core.surface.result_clouds import newton_step
 
-# How the surface lies in a field's bounds: what tells a room from a thing turned inside out, and from no thing at
+# How the surface lies in a field's bounds: what tells a room from an object turned inside out, and from no object at
 # all.
 #
-# A thing stands in free space. A room's free space is enclosed, and fills most of what its surface encloses; that of
-# a thing turned inside out is the thing itself, which fills little of its own convex hull.
+# An object stands in free space. A room's free space is enclosed, and fills most of what its surface encloses; that of
+# an object turned inside out is the object itself, which fills little of its own convex hull.
 
 _RIM = 0.05
 """This share of each edge of the bounds, at either end, is their rim."""
 _ALL_ROUND = 0.95
 """More than this share of the bounds' faces inside matter: free space is enclosed."""
 _FILLED = 0.4
-"""Free space that fills less of its surface's convex hull is a thing's; of furnished rooms it fills three quarters."""
+"""Free space that fills less of its surface's convex hull is an object's; of furnished rooms it fills three
+quarters."""
 _MOSTLY = 0.9
 """More of the bounds inside matter leaves too little free space for a room."""
 _TOUCHED = 0.02
 """More of the bounds' faces inside matter: the surface may be where the bounds cut it."""
 _NEARER = 0.5
 """A distance below this share of that to the bounds is to a surface that is not at the bounds."""
-INSIST = "with accept_implausible: true in the description it is taken"
+INSIST = "the import option accept_implausible: true accepts it"
 
 
 def measured_enclosure(
@@ -78,20 +79,22 @@ def require_sound_enclosure(measured: dict[str, float], sign: int | None) -> Non
     at_bounds, within = measured["share_inside_at_bounds"], measured["inner_share_inside"]
     if within == 1.0 and at_bounds > 0.5:
         raise _implausible(
-            "everything is inside matter, but for places at the bounds: say bounds that have free space round the"
-            " surface, or the other sign"
+            "everything except places at the bounds is inside solid matter: give bounds with free space around the "
+            "surface, or the other sign"
         )
     if within == 0.0 and at_bounds > _TOUCHED and measured["inner_clearance"] > _NEARER:
-        raise _implausible("it has a surface at its bounds only: scale or bounds may be wrong; say them")
+        raise _implausible("it has a surface only at its bounds. The scale or the bounds may be wrong; give them")
     filled = measured["free_share_of_hull"]
     if sign is None or at_bounds <= _ALL_ROUND:
         return
     if filled < _FILLED or measured["share_inside"] > _MOSTLY:
         share = 100.0 * (1.0 - measured["share_inside"])
+        enclosed = 100.0 * filled
         raise _implausible(
-            f"it is matter all round its bounds, and free space is {share:.0f} % of them and {100.0 * filled:.0f} % of"
-            f" what its surface encloses: a thing turned inside out; say sign {-sign} to turn it round, or sign {sign}"
-            " if it is a room as it should be"
+            f"it is solid matter everywhere at its bounds, and free space is {share:.0f} % of them and "
+            f"{enclosed:.0f} % of"
+            " the volume that its surface encloses: the object may be inside out. Give the import option sign:"
+            f" {-sign} to invert it, or sign: {sign} if it is a correct room"
         )
 
 
@@ -164,14 +167,14 @@ def _no_surface(distance: Tensor, is_mesh: bool) -> FieldFormatError:
     low, high = float(distance.min()), float(distance.max())
     if is_mesh:
         message = (
-            f"the mesh encloses no volume: all {len(distance)} points tested in its bounds are free space. It may be"
-            " flat, double-sided, or very small beside a part far away. Close it, or give it a thickness"
+            f"the mesh encloses no volume: all {len(distance)} tested points in its bounds are free space. It may be "
+            f"flat or double-sided, or very small with a part far away. Close it, or give it a thickness"
         )
         return FieldFormatError(message, reason="NO_ZERO_LEVEL")
-    where = "free" if low > 0 else "inside matter" if high < 0 else "without a sound gradient"
+    where = "free" if low > 0 else "inside matter" if high < 0 else "without a valid gradient"
     message = (
-        f"the field has no surface within its bounds: all is {where}, with values from {low:.3g} to {high:.3g}; say the"
-        " bounds of the region that was trained, if they are others"
+        f"the field has no surface within its bounds: all is {where}, with values from {low:.3g} to {high:.3g}; if"
+        " the trained region has other bounds, give the import option bounds"
     )
     return FieldFormatError(message, reason="NO_ZERO_LEVEL")
 
@@ -184,8 +187,8 @@ def require_plausible(measured: dict[str, float], sign: int | None = None) -> No
     slope = measured["gradient_median"]
     if not _PLAUSIBLE[0] <= slope <= _PLAUSIBLE[1]:
         message = (
-            f"the gradient's norm at the surface is {slope:.3g}, where a signed distance has 1: the settings may be of"
-            f" another file, or the values no distances; {INSIST}"
+            f"the gradient's norm at the surface is {slope:.3g}, where a signed distance has 1: the config file may"
+            f" belong to another file, or the values may not be distances; {INSIST}"
         )
         raise FieldFormatError(message, reason="FIELD_IMPLAUSIBLE")
     require_sound_enclosure(measured, sign)
@@ -196,7 +199,7 @@ def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None
     again = field.signed_distance(points[:ASKED_AGAIN].flip(0)).flip(0)
     _require_finite(again)
     if (again - distance[:ASKED_AGAIN]).abs().max() > _SAME * distance.abs().max():
-        message = "a point's distance depends on which other points are evaluated"
+        message = "the distance at a point depends on the other points of the batch"
         raise FieldFormatError(message, reason="FIELD_NOT_A_FUNCTION")
 
 
@@ -244,16 +247,21 @@ def _evaluate(field: SdfField, points: Tensor) -> tuple[Tensor, Tensor]:
 
 def _require_finite(values: Tensor) -> None:
     if not torch.isfinite(values).all():
-        raise FieldFormatError("the field gives numbers that are not finite", reason="FIELD_NOT_FINITE")
+        raise FieldFormatError("the field evaluates to NaN or infinity", reason="FIELD_NOT_FINITE")
 
 
 def _warnings(measured: dict[str, float]) -> list[str]:
     warnings = []
     median = measured["gradient_median"]
     if not _GRADIENT_RANGE[0] <= median <= _GRADIENT_RANGE[1]:
-        text = f"the gradient's norm at the surface is {median:.2f}, not about 1: the family or the grid may be wrong"
+        text = (
+            f"the gradient's norm at the surface is {median:.2f}, not about 1: the family or the hash grid may be wrong"
+        )
         warnings.append(f"GRADIENT_NOT_UNIT: {text}")
     if measured["share_inside"] > 0.9:
-        text = "over nine tenths of the bounds are inside matter: if the sign is inverted, give sign: -1"
+        text = (
+            "more than 90 % of the bounds are inside solid matter. If the sign is inverted, give the import "
+            "option sign: -1"
+        )
         warnings.append(f"MOSTLY_INSIDE: {text}")
     return warnings

@@ -99,7 +99,7 @@ def _found_cameras(
         return read_trajectory(found, description.cameras), converted
     except FieldFormatError as error:
         if error.reason in ("CAMERAS_NOT_RECOGNIZED", "CAMERAS_INTRINSICS_MISSING"):
-            return None, converted  # the file is there for other things
+            return None, converted  # the file is there for other objects
         return None, with_unused_cameras(converted, str(error))
 
 

@@ -54,7 +54,7 @@ class ImportLimits:
 
     def no_memory(self) -> str:
         """What is said beyond the limit on memory."""
-        return f"the import needs more than the {self.memory_bytes >> 20} MiB of memory that it may have"
+        return f"the import needs more than the {self.memory_bytes >> 20} MiB of memory that are allowed"
 
 
 _WORDS_OF_THE_FILE = """
@@ -123,13 +123,13 @@ class ImportReport:
 def placed(converted: ConvertedField, description: UploadDescription) -> ConvertedField:
     """``converted`` in the frame that the description asks for, and in ``why`` whether the dataset's is known.
 
-    Raises FieldFormatError (INVALID_DESCRIPTION) where the dataset's frame is asked for and not known.
+    Raises FieldFormatError (INVALID_DESCRIPTION) where the dataset's frame is requested and not known.
     """
     rows = description.dataset_transform
     if rows is None:
         if description.frame == "dataset":
             message = (
-                "description.frame: the dataset's frame is not known; put the file that says it into the run's folder,"
+                "description.frame: the dataset's frame is not known. Put the file that has it into the run's folder:"
                 " dataparser_transforms.json (nerfstudio) or the dataset's meta_data.json (sdfstudio), or give"
                 " dataset_transform"
             )
@@ -138,7 +138,10 @@ def placed(converted: ConvertedField, description: UploadDescription) -> Convert
     a, b, c = rows[0][:3]
     unit = (a * a + b * b + c * c) ** 0.5
     if description.frame != "dataset":
-        why = f"the dataset's frame is known, one unit of the field is {unit:g} of it: say frame dataset to have it"
+        why = (
+            f"the dataset's frame is known, and one unit of the field is {unit:g} of it; to use it, give the "
+            f"import option frame: dataset"
+        )
         return replace(converted, why=(*converted.why, why))
     # world_scale is the length of the dataset's unit then: it scales the shift, as it has scaled the field.
     scale = description.world_scale or 1.0

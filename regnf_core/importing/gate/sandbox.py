@@ -22,7 +22,7 @@ from regnf_core.processes import die_with_parent
 # The system calls that a conversion needs, and the arguments that some of them may have. All others are refused.
 #
 # The list was made by watching imports of every family (``strace``, from the moment the filter holds), and by adding
-# the names under which another C library or processor asks for the same thing. It has no processes, no sockets, no
+# the names under which another C library or processor asks for the same object. It has no processes, no sockets, no
 # signals to others, no file's owner, mode, times or attributes, and nothing that one of its members can do instead.
 
 _NEEDED = """

@@ -73,10 +73,10 @@ class Accessors:
             said = accessor["sparse"]
             changed, type_ = _whole(said["count"]), _COMPONENTS.get(said["indices"]["componentType"])
             if type_ is None or type_[1] != "u" or changed > count:
-                raise malformed("a glTF sparse accessor of more items than there are")
+                raise malformed("a glTF sparse accessor has too many items")
             at = self._items(said["indices"], type_, changed, 1).reshape(-1).astype(np.int64)
             if len(at) and at.max() >= count:
-                raise malformed("a glTF sparse accessor of an item that does not exist")
+                raise malformed("a glTF sparse accessor refers to an item that does not exist")
             items[at] = self._items(said["values"], component, changed, width)
         if accessor.get("normalized", False) and component != "<f4":
             items = np.maximum(items / float(np.iinfo(np.dtype(component)).max), -1.0)
@@ -93,7 +93,7 @@ class Accessors:
         data = self._view(view)
         stride, start = _whole(view.get("byteStride", item)), _whole(said.get("byteOffset", 0))
         if stride < item or start + stride * max(count - 1, 0) + item * min(count, 1) > len(data):
-            raise malformed("a glTF accessor reaches beyond its buffer view")
+            raise malformed("a glTF accessor extends beyond its buffer view")
         items = np.ndarray((count, width), component, data, start, (stride, np.dtype(component).itemsize))
         return items.astype(np.float64)
 
@@ -103,7 +103,7 @@ class Accessors:
         data = self._buffer(_whole(view["buffer"]))
         start, size = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])
         if start + size > len(data):
-            raise malformed("a glTF buffer view reaches beyond its buffer")
+            raise malformed("a glTF buffer view extends beyond its buffer")
         return data[start : start + size]
 
     def _buffer(self, number: int) -> memoryview:
@@ -223,7 +223,7 @@ def placed_meshes(document: dict[str, Any], accessors: Accessors) -> Iterator[Pl
         if "mesh" not in node:
             continue
         if type(node["mesh"]) is not int or node["mesh"] < 0:
-            raise malformed("a glTF node of no mesh")
+            raise malformed("a glTF node refers to a mesh that does not exist")
         joints = None if "skin" not in node else _joints(document["skins"][node["skin"]], poses, accessors)
         yield PlacedMesh(node["mesh"], pose @ _instances(node, accessors), node.get("weights"), joints)
 
@@ -237,7 +237,7 @@ def _visited(
     while waiting:
         number, above = waiting.pop()
         if type(number) is not int or not 0 <= number < len(nodes) or number in seen:
-            raise malformed("a glTF node stands in two places, or nowhere")
+            raise malformed("a glTF node has two parents, or none")
         seen.add(number)
         node = nodes[number]
         if not hidden and node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True) is False:
@@ -262,7 +262,7 @@ def _instances(node: dict[str, Any], accessors: Accessors) -> Float64Array:
     read = {name: accessors.array(given[name], width) for name, width in widths.items() if name in given}
     counts = {len(values) for values in read.values()}
     if len(counts) != 1:
-        raise malformed("glTF instances of different counts, or without any place")
+        raise malformed("glTF instances have different counts, or no translation")
     count = counts.pop()
     require_room(0, count)
     matrices = np.tile(np.eye(4), (count, 1, 1))
@@ -278,7 +278,7 @@ def _instances(node: dict[str, Any], accessors: Accessors) -> Float64Array:
 def _joints(skin: dict[str, Any], poses: dict[int, Float64Array], accessors: Accessors) -> Float64Array:
     """(J, 4, 4): what each joint does to a vertex (glTF 2.0, 3.7.3.3): its pose after the inverse bind matrix."""
     if not all(type(joint) is int and joint in poses for joint in skin["joints"]):
-        raise malformed("a glTF skin has a joint that is no node")
+        raise malformed("a glTF skin has a joint that is not a node")
     joints = np.stack([poses[joint] for joint in skin["joints"]])
     if "inverseBindMatrices" not in skin:
         return joints
@@ -308,7 +308,7 @@ def _rotations(quaternions: npt.NDArray[np.float64]) -> Float64Array:
     """(N, 3, 3) of quaternions (N, 4), x, y, z, w, of any length but zero."""
     square = np.square(quaternions).sum(axis=1)
     if not (square > 0.0).all():
-        raise malformed("a glTF node or instance turned by no rotation")
+        raise malformed("a glTF node or instance has an invalid rotation")
     x, y, z, w = (quaternions / np.sqrt(square)[:, None]).T
     return np.array(rotation_rows(x, y, z, w)).transpose(2, 0, 1)
 
@@ -403,7 +403,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
             places = _morphed(primitive, placed.weights or mesh.get("weights"), accessors)
             corners = _triangles(primitive, accessors, len(places))
             if len(corners) and (corners.min() < 0 or corners.max() >= len(places)):
-                raise malformed("a glTF face names a vertex that does not exist")
+                raise malformed("a glTF face refers to a vertex that does not exist")
             painted = _primitive_colors(document, primitive, accessors, len(places))
             count = len(placed.matrices) if placed.joints is None else 1
             require_room(so_far + count * len(places), triangles + count * len(corners))
@@ -441,7 +441,7 @@ def _morphed(primitive: dict[str, Any], weights: list[float] | None, accessors: 
         if weight != 0.0 and "POSITION" in target:
             moved = accessors.array(target["POSITION"], 3)
             if len(moved) != len(places):
-                raise malformed("a glTF morph target of another number of vertices")
+                raise malformed("a glTF morph target has another number of vertices")
             places = places + float(weight) * moved
     return places
 
@@ -459,12 +459,12 @@ def _skinned(
         chosen = accessors.array(attributes[f"JOINTS_{number}"], 4).astype(np.int64)
         weights = accessors.array(attributes[f"WEIGHTS_{number}"], 4)
         if len(chosen) != len(places) or len(weights) != len(places) or (chosen >= len(joints)).any():
-            raise malformed("a glTF skin of another number of vertices, or of a joint that does not exist")
+            raise malformed("a glTF skin has another number of vertices, or a joint that does not exist")
         for column in range(4):
             blended += weights[:, column, None, None] * joints[chosen[:, column]]
         total += weights.sum(axis=1)
     if not (total > 0.0).all():
-        raise malformed("a glTF vertex that no joint of its skin holds")
+        raise malformed("a glTF vertex has no joint in its skin")
     blended /= total[:, None, None]
     moved: Float64Array = np.einsum("vij,vj->vi", blended[:, :3, :3], places) + blended[:, :3, 3]
     return moved

@@ -70,12 +70,12 @@ def _read_header(data: memoryview) -> tuple[ByteOrder | None, tuple[_Element, ..
     head = bytes(data[:_MAX_HEADER])
     end = _END.search(head)
     if end is None:
-        raise malformed("no end of the PLY header in sight")
+        raise malformed("the PLY header has no end")
     lines = head[: end.start()].decode("latin-1").splitlines()
     words = [line.split() for line in lines[1:] if line.strip()]
     words = [line for line in words if line[0] not in ("comment", "obj_info")]
     if not words or words[0][0] != "format" or len(words[0]) != 3 or words[0][1] not in _FORMATS:
-        raise malformed("the PLY header names no known format")
+        raise malformed("the PLY header has an unknown format")
     return _FORMATS[words[0][1]], _elements(words[1:]), end.end()
 
 
@@ -90,14 +90,14 @@ def _elements(lines: list[list[str]]) -> tuple[_Element, ...]:
             case ["property", type_, name] if found and type_ in _TYPES:
                 found[-1][2].append(_Property(name, _TYPES[type_]))
             case _:
-                raise malformed("the PLY header has a line that makes no sense")
+                raise malformed("the PLY header has an invalid line")
     elements = tuple(_Element(name, count, tuple(properties)) for name, count, properties in found)
     if len(elements) > _MAX_PARTS or len({element.name for element in elements}) != len(elements):
-        raise malformed("the PLY header names an element twice, or too many of them")
+        raise malformed("the PLY header has an element twice, or too many elements")
     for element in elements:
         properties = [p.name for p in element.properties]
         if set(properties) >= _SPLAT:
-            message = "Gaussian splats, which have no surface; extract a mesh from them, and give that"
+            message = "Gaussian splats, which have no surface; extract a mesh from them, and give the mesh"
             raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
         if not properties or len(properties) > _MAX_PARTS or len(set(properties)) != len(properties):
             raise malformed(f"the PLY element {element.name[:40]} has no properties, too many, or one twice")

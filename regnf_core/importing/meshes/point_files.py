@@ -53,7 +53,7 @@ def unpack_lzf(packed: memoryview, size: int) -> memoryview:
 
 
 def _faulty() -> Exception:
-    return malformed("the PCD file's compressed points do not unpack to the size that it says")
+    return malformed("the PCD file's compressed points have another uncompressed size than the header states")
 
 
 # Numbers between spaces, as many text formats have them.
@@ -120,7 +120,7 @@ def _header(data: memoryview) -> _Header:
         line, newline, _ = bytes(data[at : at + _MAX_HEADER]).partition(b"\n")
         at += len(line) + 1
         if not newline or at > _MAX_HEADER:
-            raise malformed("no end of the PCD header in sight")
+            raise malformed("the PCD header has no end")
         words = line.decode("latin-1").partition("#")[0].split()
         if words:
             said[words[0]] = words[1:]
@@ -132,14 +132,14 @@ def _header(data: memoryview) -> _Header:
         extents = ("POINTS",) if said.get("POINTS") else ("WIDTH", "HEIGHT")
         points = math.prod(int(said[key][0]) for key in extents)
     except (KeyError, IndexError, ValueError) as error:
-        raise malformed("the PCD header has a line that makes no sense") from error
+        raise malformed("the PCD header has an invalid line") from error
     if len(names) > _MAX_FIELDS or len(types) != len(names) or not types.keys() >= set(_PLACES):
-        raise malformed("the PCD header names a field twice, too many, or not x, y and z")
+        raise malformed("the PCD header has a field twice, too many fields, or no x, y and z")
     singles = {*_PLACES, *_NORMALS} & types.keys()
     if not 0 <= points < 1 << 40 or not all(1 <= count <= _MAX_COLUMNS for count in columns.values()):
-        raise malformed("the PCD header has a count that makes no sense")
+        raise malformed("the PCD header has an invalid count")
     if any(columns[name] != 1 for name in singles) or " ".join(said["DATA"][:1]) not in _FORMS:
-        raise malformed("the PCD header names no known form of its points")
+        raise malformed("the PCD header has an unknown DATA format")
     return _Header(types, columns, points, said["DATA"][0], at, _sensor(said))
 
 
@@ -150,7 +150,7 @@ def _sensor(said: dict[str, list[str]]) -> Float64Array | None:
         place = np.array([float(word) for word in said.get("VIEWPOINT", [])[:3]])
         rows = int(said.get("HEIGHT", ["1"])[0])
     except (IndexError, ValueError) as error:
-        raise malformed("the PCD header has a line that makes no sense") from error
+        raise malformed("the PCD header has an invalid line") from error
     known = len(place) == 3 and np.isfinite(place).all() and (rows > 1 or place.any())
     return place if known else None
 
@@ -158,14 +158,14 @@ def _sensor(said: dict[str, list[str]]) -> Float64Array | None:
 def _row(said: dict[str, list[str]], key: str, count: int) -> list[str]:
     row = said.get(key, ["1"] * count if key == "COUNT" else [])
     if len(row) != count:
-        raise malformed(f"the PCD header's {key} is not of as many parts as its FIELDS")
+        raise malformed(f"the PCD header's {key} has another number of parts than its FIELDS")
     return row
 
 
 def _unpacked(header: _Header, body: memoryview) -> memoryview:
     packed, size = (int.from_bytes(body[at : at + 4], "little") for at in (0, 4))
     if len(body) < 8 or packed > len(body) - 8 or size != header.points * header.row.itemsize:
-        raise malformed("the PCD file's compressed points have another size than the header says")
+        raise malformed("the PCD file's compressed points have another size than the header states")
     return unpack_lzf(body[8 : 8 + packed], size)
 
 
@@ -198,15 +198,15 @@ def read_xyz(data: memoryview) -> Geometry:
         first = text.partition(b"\n")[0]
     columns = len(first.split())
     if not 3 <= columns <= _MOST_COLUMNS:
-        raise malformed(f"lines of {columns} numbers are no points")
+        raise malformed(f"lines of {columns} numbers are not points")
     require_room(text.count(b"\n"), 0)
     numbers = numbers_of(text, "point")
     if len(numbers) % columns:
-        raise malformed("the points' lines are not of one length")
+        raise malformed("the lines of the points have different lengths")
     rows = numbers.reshape(-1, columns)
     require_room(len(rows), 0)
     if _are_poses(rows):
-        raise malformed("these are camera poses (KITTI's or TUM's), not points; give them with --cameras")
+        raise malformed("the lines are camera poses (KITTI or TUM), not points; give camera poses with --cameras")
     return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows))
 
 

@@ -45,7 +45,7 @@ class Geometry:
 def not_numbers(message: str, text: bytes) -> FieldFormatError:
     """The error for words that are no numbers, which says so where the reason is how decimals are written."""
     commas = re.search(rb"\d,\d", text) is not None
-    return malformed(message + (": decimals have points, not commas" if commas else ""))
+    return malformed(message + (": write decimal points, not commas" if commas else ""))
 
 
 def malformed(message: str) -> FieldFormatError:
@@ -66,13 +66,13 @@ def unsupported(message: str) -> FieldFormatError:
 def require_room(vertices: int, triangles: int) -> None:
     """Raise FieldFormatError (MESH_TOO_LARGE) beyond the limits. Ask before arrays of these lengths are made."""
     if vertices > MAX_VERTICES:
-        raise FieldFormatError(f"{vertices} vertices, at most {MAX_VERTICES} are taken", reason="MESH_TOO_LARGE")
+        raise FieldFormatError(f"{vertices} vertices; at most {MAX_VERTICES} are allowed", reason="MESH_TOO_LARGE")
     if triangles > MAX_TRIANGLES:
-        raise FieldFormatError(f"{triangles} triangles, at most {MAX_TRIANGLES} are taken", reason="MESH_TOO_LARGE")
+        raise FieldFormatError(f"{triangles} triangles; at most {MAX_TRIANGLES} are allowed", reason="MESH_TOO_LARGE")
 
 
 def within_unit(colors: Float64Array, top: float = 1.0) -> Float64Array:
-    """Colors of numbers up to ``top`` as such in [0, 1]; what is no number is black."""
+    """Colors of numbers up to ``top`` as such in [0, 1]; what is not a number is black."""
     return np.nan_to_num(colors / top, nan=0.0, posinf=1.0, neginf=0.0).clip(0.0, 1.0)
 
 
@@ -99,7 +99,7 @@ def strips(order: npt.NDArray[Any]) -> Int64Array:
 
 
 def fan(order: npt.NDArray[Any]) -> Int64Array:
-    """(N - 2, 3) triangles of corners (N,) round the first of them."""
+    """(N - 2, 3) triangles of corners (N,) around the first of them."""
     corners = np.asarray(order, dtype=np.int64)
     return fans(corners[None]) if len(corners) >= 3 else np.zeros((0, 3), np.int64)
 
@@ -196,7 +196,7 @@ def read_stl(data: memoryview) -> Geometry:
         require_room(3 * count, count)
         facets = np.frombuffer(data[_FACETS_AT:], dtype=_FACET, count=count)
         found = _loose(facets["corners"].reshape(-1, 3).astype(np.float64))
-        return replace(found, left_out=(f"{behind} bytes behind the triangles",)) if behind else found
+        return replace(found, left_out=(f"{behind} bytes after the triangles",)) if behind else found
     if not is_text:
         raise malformed(f"the STL file ends within its {count} facets")
     return _loose(_corners_of_text(text.partition(b"\n")[2] if b"\n" in text else text))  # its name may say `vertex`

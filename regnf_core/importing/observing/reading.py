@@ -80,7 +80,7 @@ def _frames(keys: Keys) -> Iterator[Keys]:
         raise malformed(f"{keys.file} lists more than {MOST_CAMERAS} cameras")
     for index, value in enumerate(values):
         if not isinstance(value, dict):
-            raise malformed(f"{keys.file}: frames.{index} is no frame")
+            raise malformed(f"{keys.file}: frames.{index} is not a frame")
         yield Keys(keys.file, value, f"frames.{index}.")
 
 
@@ -145,7 +145,7 @@ def _to_dataset(keys: Keys, ours: bool) -> Array | None:
     forward[:3] = np.array(rows)[:3]
     forward[:3] *= scale
     if not is_similarity(forward):
-        raise malformed(f"{keys.file}: applied_transform is no rotation and place")
+        raise malformed(f"{keys.file}: applied_transform is not a rotation and a translation")
     return np.asarray(np.linalg.inv(forward), np.float64)
 
 
@@ -217,7 +217,7 @@ def _number(name: str, word: str) -> float:
             return float(word)
     except ValueError:
         pass
-    raise malformed(f"{name}: {word[:MAX_NUMBER_CHARACTERS]!r} is no number")
+    raise malformed(f"{name}: {word[:MAX_NUMBER_CHARACTERS]!r} is not a number")
 
 
 def _order(name: str) -> tuple[list[int], str]:
@@ -242,7 +242,9 @@ def read_trajectory(files: Sequence[SettingsFile], said: CamerasDescription) -> 
         raise malformed(str(error)) from error
     if found is None:
         names = ", ".join(PurePosixPath(file.name).name[:60] for file in files[:6]) or "no file"
-        message = f"no cameras in {names}: expected transforms.json, meta_data.json, poses of TUM or a matrix a file"
+        message = (
+            f"no cameras in {names}: expected transforms.json, meta_data.json, a TUM trajectory, or one matrix per file"
+        )
         raise FieldFormatError(message, reason="CAMERAS_NOT_RECOGNIZED")
     return found
 
@@ -301,7 +303,7 @@ def _of_arrays(name: str, arrays: ArraySource, said: CamerasDescription) -> Traj
             break
         matrix = arrays.numbers(f"world_mat_{index}")
         if matrix.shape not in ((3, 4), (4, 4)) or not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
-            raise malformed(f"{name}: world_mat_{index} is no camera's projection")
+            raise malformed(f"{name}: world_mat_{index} is not a camera projection")
         K, R = rq(matrix[:3, :3])
         turn = np.diag(np.sign(np.diag(K)))
         K, R = K @ turn, turn @ R

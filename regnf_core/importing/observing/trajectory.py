@@ -76,14 +76,17 @@ class Trajectory:
         inverse = np.linalg.inv(matrices)
         name = "along z (OpenCV's axes)" if self.axes == "opengl" else "against z (OpenGL's axes)"
         flag = "opencv" if self.axes == "opengl" else "opengl"
-        say, invert = f"say --camera-axes {flag} (in a description: cameras.axes)", "invert the matrices of the file"
+        say, invert = f"give --camera-axes {flag} (import option cameras.axes)", "invert the matrices of the file"
         looking, inverted = f"cameras that look {name}", "poses from the world to the camera"
         wrong = {
             looking: (say, matrices @ other),
             inverted: (invert, inverse @ stated),
             f"{inverted} and {looking}": (f"{invert}, and {say}", inverse @ other),
-            "quaternions written w first": ("write quaternions as x y z w", rolled_quaternions(matrices, -1) @ stated),
-            "cameras that look along x (a robot's body)": ("turn the cameras' axes: z is forward", matrices @ BODY),
+            "quaternions with w first": ("write quaternions as x y z w", rolled_quaternions(matrices, -1) @ stated),
+            "cameras that look along x (the body frame of a robot)": (
+                "rotate the axes of the cameras: z is forward",
+                matrices @ BODY,
+            ),
         }
         for words, (mend, poses) in wrong.items():
             yield words, mend, replace(self, poses=poses)
@@ -104,7 +107,7 @@ def trajectory_of(
     kept = np.isfinite(poses).all(axis=(1, 2))
     poses = poses[kept].copy()
     if not len(poses):
-        raise malformed(f"{name} holds no camera's pose")
+        raise malformed(f"{name} has no camera pose")
     poses = poses @ _TURNS[axes or "opencv"]
     _require_rigid(name, poses)
     K = np.array([[one.fx, one.fy, one.cx, one.cy, one.width, one.height] for one in each], np.float64)[kept]
@@ -115,7 +118,7 @@ def trajectory_of(
     sound = (size > 0).all(1) & (focal > low).all(1) & (focal < high).all(1)
     sound &= (np.abs(middle - 0.5) <= 1.0).all(1) & (aspect > 0.05) & (aspect < 20.0)
     if not sound.all():
-        raise malformed(f"{name}: the intrinsics of camera {int(np.flatnonzero(~sound)[0])} are no camera's")
+        raise malformed(f"{name}: the intrinsics of camera {int(np.flatnonzero(~sound)[0])} are invalid")
     return Trajectory(poses, focal, middle, aspect, T_dataset_file, axes)
 
 
@@ -136,7 +139,7 @@ def _require_rigid(name: str, poses: Array) -> None:
         sound = (off <= _NOT_RIGID) & (np.linalg.det(axes) > 0) & (np.abs(poses[:, :3, 3]).max(axis=1) <= _FARTHEST)
         sound &= np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1) <= 1e-6
     if not sound.all():
-        raise malformed(f"{name}: pose {int(np.flatnonzero(~sound)[0])} is no rotation and place")
+        raise malformed(f"{name}: pose {int(np.flatnonzero(~sound)[0])} is not a rotation and a translation")
 
 
 def malformed(message: str) -> FieldFormatError:
@@ -146,5 +149,5 @@ def malformed(message: str) -> FieldFormatError:
 
 def without_intrinsics(name: str) -> FieldFormatError:
     """The error for poses whose file does not say how wide the cameras' view is."""
-    message = f"{name} has no intrinsics: say them, cameras.intrinsics [fx, fy, cx, cy] and cameras.size"
+    message = f"{name} has no intrinsics: give the import options cameras.intrinsics [fx, fy, cx, cy] and cameras.size"
     return FieldFormatError(message, reason="CAMERAS_INTRINSICS_MISSING")

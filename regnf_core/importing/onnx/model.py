@@ -32,13 +32,13 @@ def read_tensor(data: memoryview) -> tuple[str, Array]:
     message = wire.read_message(data)
     name, shape, kind = wire.text(message, _NAME), wire.integers(message, _DIMS), wire.integer(message, _TYPE)
     if message.get(_EXTERNAL) or wire.integer(message, _LOCATION) != 0:
-        text = "the model keeps weights in another file: export it whole (external_data=False)"
+        text = "the model has weights in another file: export it as one file (external_data=False)"
         raise FieldFormatError(text, reason="ONNX_EXTERNAL_DATA")
     # An axis of no length does not make the others harmless: numpy counts it as one.
     if len(shape) > _MAX_DIMENSIONS or any(n < 0 for n in shape) or math.prod(max(n, 1) for n in shape) > _MAX_ITEMS:
-        raise wire.malformed("a tensor of a shape that no weight has")
+        raise wire.malformed("a tensor has an invalid shape")
     if kind not in _RAW_TYPES:
-        raise FieldFormatError(f"an ONNX tensor of type {kind}; real numbers are needed", reason="TENSOR_DTYPE")
+        raise FieldFormatError(f"an ONNX tensor of type {kind}; real numbers are required", reason="TENSOR_DTYPE")
     values = _values(message, kind)
     if values.size != math.prod(shape):
         raise wire.malformed(f"a tensor of {math.prod(shape)} numbers holds {values.size}")
@@ -50,7 +50,7 @@ def _values(message: wire.Message, kind: int) -> Array:
     raw = wire.messages(message, _RAW)
     if raw:
         if len(raw[-1]) % stored.itemsize:
-            raise wire.malformed("a tensor that ends within a number")
+            raise wire.malformed("a tensor ends within a number")
         return np.frombuffer(raw[-1], dtype=stored)
     if kind in _FLOAT_FIELDS:
         whole = b"".join(bytes(value) for value in wire.messages(message, _FLOAT_FIELDS[kind]))
@@ -129,9 +129,9 @@ def read_model(data: memoryview) -> Model:
     message = wire.read_message(data)
     graphs = wire.messages(message, _GRAPH)
     if len(graphs) != 1:
-        raise wire.malformed("no ONNX model, or one without a graph")
+        raise wire.malformed("not an ONNX model, or a model without a graph")
     if message.get(_TRAINING) or message.get(_FUNCTIONS):
-        raise unsupported("the model holds functions of its own or training steps: export it with them inlined")
+        raise unsupported("the model has its own functions or training steps: export it with inlined functions")
     opset = _opset(message)
     graph = wire.read_message(graphs[0])
     if graph.get(_QUANTIZATION) or graph.get(_SPARSE):
@@ -142,12 +142,15 @@ def read_model(data: memoryview) -> Model:
         raise unsupported(f"the model has {len(nodes)} nodes and {len(initializers)} weights")
     weights = dict(map(read_tensor, initializers))
     if len(weights) != len(initializers):
-        raise wire.malformed("two weights of one name")
+        raise wire.malformed("two weights have the same name")
     ports = [_port(data) for data in wire.messages(graph, _INPUTS)]
     inputs = [port for port in ports if port.name not in weights]  # old models list their weights among the inputs
     outputs = [_port(data) for data in wire.messages(graph, _OUTPUTS)]
     if len(inputs) != 1 or len(outputs) != 1:
-        text = f"the model has {len(inputs)} inputs and {len(outputs)} outputs: export points to distances alone"
+        text = (
+            f"the model has {len(inputs)} inputs and {len(outputs)} outputs: export only the mapping from points "
+            f"to distances"
+        )
         raise unsupported(text)
     return Model(opset, tuple(map(_node, nodes)), weights, inputs[0], outputs[0])
 
@@ -156,7 +159,7 @@ def _opset(message: wire.Message) -> int:
     versions = [wire.read_message(data) for data in wire.messages(message, _OPSET_IMPORT)]
     plain = [wire.integer(version, 2) for version in versions if wire.text(version, 1) in _PLAIN_DOMAINS]
     if len(plain) != 1 or plain[0] not in _OPSETS:
-        raise unsupported(f"operator set {plain}: {_OPSETS.start} to {_OPSETS.stop - 1} are taken")
+        raise unsupported(f"operator set {plain}: {_OPSETS.start} to {_OPSETS.stop - 1} are supported")
     return plain[0]
 
 
@@ -164,12 +167,12 @@ def _node(data: memoryview) -> Node:
     message = wire.read_message(data)
     op, domain = wire.text(message, _OP_TYPE), wire.text(message, _DOMAIN)
     if domain not in _PLAIN_DOMAINS:
-        raise unsupported(f"the operator {op[:40]} of {domain[:40]} is none of ONNX's own")
+        raise unsupported(f"the operator {op[:40]} of {domain[:40]} is not a standard ONNX operator")
     inputs = tuple(map(wire.decoded, wire.messages(message, _NODE_IN)))
     outputs = tuple(map(wire.decoded, wire.messages(message, _NODE_OUT)))
     attributes = wire.messages(message, _ATTRIBUTES)
     if max(len(inputs), len(outputs), len(attributes)) > _MAX_NAMES or not op.isalnum() or len(op) > 40:
-        raise wire.malformed("a node with more ends than any operator")
+        raise wire.malformed("a node has too many inputs or outputs")
     return Node(op, inputs, outputs, dict(_attribute(op, data) for data in attributes))
 
 
@@ -188,11 +191,11 @@ def _attribute(op: str, data: memoryview) -> tuple[str, Attribute]:
     }
     reader = readers.get(wire.integer(message, _ATTRIBUTE_TYPE))
     if reader is None:
-        raise unsupported(f"the operator {op} with the attribute {name}: control flow and strings are not taken")
+        raise unsupported(f"the operator {op} with the attribute {name}: control flow and strings are not supported")
     try:
         value: Attribute = reader()
     except IndexError as error:
-        raise wire.malformed(f"the attribute {name} holds nothing") from error
+        raise wire.malformed(f"the attribute {name} is empty") from error
     return name, value
 
 

@@ -62,7 +62,7 @@ def messages(message: Message, number: int) -> list[memoryview]:
     found: list[memoryview] = []
     for value in message.get(number, []):
         if isinstance(value, int):
-            raise malformed(f"field {number} is a number where bytes belong")
+            raise malformed(f"field {number} is a number instead of bytes")
         found.append(value)
     return found
 
@@ -105,7 +105,7 @@ def floats(message: Message, number: int) -> list[float]:
     """A repeated float field, packed or not. Raises FieldFormatError (ONNX_MALFORMED)."""
     raw = b"".join(bytes(value) for value in messages(message, number))
     if len(raw) % 4:
-        raise malformed("a list of floats that ends within one")
+        raise malformed("a list of floats ends within a float")
     return list(struct.unpack(f"<{len(raw) // 4}f", raw))
 
 

@@ -261,7 +261,7 @@ def _reconstructed(function: GlobalRef, args: tuple[Any, ...]) -> Placeholder:
 def dict_key(value: Any, depth: int = 2) -> Any:
     """``value`` if it may be a dictionary's key: a short scalar, an inert object, or a shallow tuple of such."""
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 64:
-        raise pickle_error("a dictionary's key is a giant integer", "PICKLE_INTEGER_TOO_LARGE")
+        raise pickle_error("a dictionary's key is a very large integer", "PICKLE_INTEGER_TOO_LARGE")
     if value is None or isinstance(value, (str, int, float, bytes, GlobalRef, Placeholder, NumpyType)):
         return value
     if isinstance(value, tuple) and depth > 0 and len(value) <= _MAX_DIMENSIONS:
@@ -336,8 +336,10 @@ class PickleMachine:
         if self.budget < 0:
             # Whoever does not know why so large a file is refused is told what object it is about.
             named = next((value.full_name for value in self.stack if isinstance(value, Placeholder)), None)
-            held = f"; it holds an object of {named[:120]}: save plain tensors, or give a mesh of it" if named else ""
-            raise pickle_error(f"the pickle asks for too much work{held}", "PICKLE_TOO_COMPLEX")
+            held = (
+                f"; it contains an object of {named[:120]}: save plain tensors, or give a mesh of it" if named else ""
+            )
+            raise pickle_error(f"the pickle needs too much work{held}", "PICKLE_TOO_COMPLEX")
 
     def finish(self) -> Any:
         """The one value on the stack."""
@@ -350,7 +352,7 @@ class PickleMachine:
     def pop(self) -> Any:
         floor = self.marks[-1] if self.marks else 0
         if len(self.stack) <= floor:
-            raise pickle_error("the pickle takes a value that is not there")
+            raise pickle_error("the pickle uses a value that does not exist")
         return self.stack.pop()
 
     def top(self) -> Any:
@@ -365,7 +367,7 @@ class PickleMachine:
 
     def pop_to_mark(self) -> list[Any]:
         if not self.marks:
-            raise pickle_error("the pickle goes back to a mark that is not there")
+            raise pickle_error("the pickle refers to a mark that does not exist")
         start = self.marks.pop()
         items = self.stack[start:]
         del self.stack[start:]
@@ -378,7 +380,7 @@ class PickleMachine:
 
     def put(self, index: int) -> None:
         if len(self.memo) >= self.limits.memo:
-            raise pickle_error("the pickle remembers too many values", "PICKLE_TOO_COMPLEX")
+            raise pickle_error("the pickle stores too many values", "PICKLE_TOO_COMPLEX")
         self.memo[index] = self.top()
 
     def get(self, index: int) -> None:
@@ -397,7 +399,7 @@ class PickleMachine:
         if isinstance(target, list):
             target.extend(items)
         elif not isinstance(target, Placeholder):
-            raise pickle_error("items for something that is not a list")
+            raise pickle_error("items are added to something that is not a list")
 
     def set_items(self, items: list[Any]) -> None:
         target = self.top()
@@ -408,7 +410,7 @@ class PickleMachine:
                 self.charge(key_work(key))
                 target[dict_key(key)] = value
         elif not isinstance(target, Placeholder):
-            raise pickle_error("keys for something that is not a dictionary")
+            raise pickle_error("keys are added to something that is not a dictionary")
 
     def new_dict(self) -> None:
         items = self.pop_to_mark()
@@ -440,7 +442,7 @@ class PickleMachine:
         state = self.pop()
         target = self.top()
         if not isinstance(target, (dict, Placeholder, NumpyType)):
-            raise pickle_error("state for something that takes none")
+            raise pickle_error("state is given to something that cannot have one")
         if isinstance(target, Placeholder):
             target.state = state
 

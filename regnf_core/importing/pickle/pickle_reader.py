@@ -31,7 +31,7 @@ def read_pickle(data: memoryview, limits: PickleLimits | None = None) -> Any:
     machine = PickleMachine(data, limits or PickleLimits())
     value = _run(machine)
     if machine.stream.remaining:
-        raise pickle_error("bytes behind the pickle's end", "PICKLE_TRAILING_DATA")
+        raise pickle_error("bytes after the end of the pickle", "PICKLE_TRAILING_DATA")
     return value
 
 
@@ -59,7 +59,7 @@ def _run(machine: PickleMachine) -> Any:
             return machine.finish()
         action = _ACTIONS.get(opcode)
         if action is None:
-            raise pickle_error(f"opcode {opcode!r} does not occur in checkpoints", "PICKLE_OPCODE_NOT_ALLOWED")
+            raise pickle_error(f"opcode {opcode!r} is not allowed in checkpoints", "PICKLE_OPCODE_NOT_ALLOWED")
         machine.charge(1)
         action(machine)
         if start < machine.frame_end < stream.position:

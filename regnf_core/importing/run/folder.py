@@ -1,4 +1,4 @@
-"""A training run on the user's own disk: its checkpoint, and the settings beside it, packed for the import gate.
+"""A training run on the user's own disk: its checkpoint, and the settings beside it, packed for the importer.
 
 Nothing is parsed here. Names decide, as in an archive; links that lead out of the run's folder are not followed.
 """
@@ -49,7 +49,7 @@ def find_run(folder: Path) -> Run:
 
 
 def settings_beside(checkpoint: Path) -> tuple[Path, ...]:
-    """The settings that a checkpoint's trainer leaves round it; only their own few folders are looked into."""
+    """The settings that a checkpoint's trainer leaves around it; only their own few folders are looked into."""
     path = checkpoint.resolve(strict=True)
     places = _places_of(path)
     top = places[-1]
@@ -77,7 +77,7 @@ def pack_settings(run: Run, into: Path) -> Path:
     target = into / "settings.tar"
     top = Path(os.path.commonpath([path.parent for path in run.settings] or [run.checkpoint.parent]))
     if sum(path.stat().st_size for path in run.settings) > MAX_SETTINGS_BYTES:
-        message = f"the settings beside {run.checkpoint.name} have more than {MAX_SETTINGS_BYTES} bytes"
+        message = f"the config files next to {run.checkpoint.name} have more than {MAX_SETTINGS_BYTES} bytes"
         raise FieldFormatError(message, reason="SETTINGS_TOO_LARGE")
     with tarfile.open(target, "w", format=tarfile.GNU_FORMAT, dereference=True) as archive:
         for path in run.settings[:MAX_FILES]:
@@ -101,7 +101,7 @@ def _names_below(root: Path) -> Iterator[str]:
             for entry in entries:
                 count += 1
                 if count > _MAX_FILES:
-                    message = f"{root.name} holds more than {_MAX_FILES} files; give the checkpoint by itself"
+                    message = f"{root.name} holds more than {_MAX_FILES} files; give only the checkpoint"
                     raise FieldFormatError(message, reason="RUN_TOO_LARGE")
                 if entry.is_dir(follow_symlinks=False):
                     if depth < _MAX_DEPTH and entry.name not in _SKIPPED:

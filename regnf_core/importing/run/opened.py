@@ -39,7 +39,7 @@ _OTHER_FILES = re.compile(
 )
 _NUMBER = re.compile(r"\d+")
 _OF_TRAINING = re.compile(r"ckpt|checkpoint|model|epoch|step|iter|(?<![a-z])ep(?=[^a-z]*\d)", re.IGNORECASE)
-"""In a name or its folder's: the numbers are steps of a training, and not which of several things it is."""
+"""In a name or its folder's: the numbers are steps of a training, and not which of several objects it is."""
 _STEP_WORD = re.compile(r"(?<![a-z])(epochs?|ep|steps?|iterations?|iters?|it)(?=[^a-z]*#)", re.IGNORECASE)
 _STANDING = {"best": 1, "current": 3, "last": 4, "latest": 4, "final": 5}
 """Words in place of a number: where they stand beside numbered files, which have 2."""
@@ -65,11 +65,11 @@ def choose_checkpoint(names: Iterable[str]) -> str:
     if not tier:
         ends = " ".join(end for ends in _TIERS for end in ends)
         raise FieldFormatError(
-            f"no file of the run is a checkpoint; looked for {ends}", reason="RUN_WITHOUT_CHECKPOINT"
+            f"no file of the run is a checkpoint; the importer looked for {ends}", reason="RUN_WITHOUT_CHECKPOINT"
         )
     if len({candidate.series for candidate in tier}) > 1:
         shown = ", ".join(sorted(shown_path(candidate.name) for candidate in tier)[:_SHOWN])
-        message = f"{len(tier)} files of the run may be the checkpoint: {shown}; give one of them by itself"
+        message = f"{len(tier)} files of the run may be the checkpoint: {shown}; give one of them alone"
         raise FieldFormatError(message, reason="AMBIGUOUS_RUN")
     return max(tier, key=lambda candidate: (candidate.age, candidate.name)).name
 
@@ -110,7 +110,7 @@ class ZipRun:
         self._data, self._most = data, most
         self._members = {member.name: member for member in members if not member.name.endswith("/")}
         if any(name.count("/") >= MAX_PARTS for name in self._members):
-            raise archive_error("a member lies in too many folders", "ARCHIVE_ENTRY_NAME")
+            raise archive_error("a member is in too many nested folders", "ARCHIVE_ENTRY_NAME")
         self.sizes = {name: member.size for name, member in self._members.items()}
         """Each member's size in bytes, as the archive claims it."""
 
@@ -123,7 +123,7 @@ class ZipRun:
         return {m.name: m.content(self._data, lambda pieces, size: kept(pieces, size, folder)) for m in wanted}
 
 
-# Which files of a run are its trainer's settings: known names at known places round the checkpoint, nearest first.
+# Which files of a run are its trainer's settings: known names at known places around the checkpoint, nearest first.
 
 _LEVELS = 4
 """How many folders above the checkpoint's own may be the run's."""
@@ -218,7 +218,7 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     taken = archive.take({name, *settings, *siblings.values()}, folder)
     nested, members = _opened(taken[name], most)
     if nested is not None:
-        raise archive_error(f"{shown_path(name)} is an archive in the archive; give it by itself", "ARCHIVE_NESTED")
+        raise archive_error(f"{shown_path(name)} is an archive in the archive; give it alone", "ARCHIVE_NESTED")
     return OpenedUpload(
         taken[name],
         name,
@@ -241,7 +241,7 @@ def open_settings(
             raise _too_large(f"the settings have {len(data)} bytes")
         return (SettingsFile(name, data),)
     if len(archive.sizes) > files:
-        raise _too_large(f"{len(archive.sizes)} files; at most {files} are read")
+        raise _too_large(f"{len(archive.sizes)} files; at most {files} are allowed")
     _require_few(archive, tuple(archive.sizes))
     return tuple(SettingsFile(each, content) for each, content in archive.take(archive.sizes, folder).items())
 
@@ -261,7 +261,7 @@ def _opened(data: memoryview, most: int) -> tuple[ZipRun | TarRun | None, list[M
 
 
 def _is_run(members: list[Member], kind: str) -> bool:
-    """Whether a zip whose first member's name would fit a checkpoint or arrays holds other things too."""
+    """Whether a zip whose first member's name would fit a checkpoint or arrays holds other objects too."""
     names = [member.name for member in members]
     if kind == "npz":
         return any("/" in name or not name.endswith(".npy") for name in names)

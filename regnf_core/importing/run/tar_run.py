@@ -96,12 +96,12 @@ def _unpacked(data: memoryview, packing: str, most: int) -> Iterator[bytes]:
     except (zlib.error, OSError, EOFError, ValueError, lzma.LZMAError) as error:
         raise archive_error(f"the {packing} file is damaged") from error
     if at != len(data) or unpacker.unused_data:
-        raise archive_error(f"something lies behind the {packing} file's end", "ARCHIVE_TRAILING_DATA")
+        raise archive_error(f"the {packing} file has data after its end", "ARCHIVE_TRAILING_DATA")
 
 
 def truncated() -> FieldFormatError:
     """The error for an archive that ends too early."""
-    return archive_error("the archive ends too early: the file was cut short", "FILE_TRUNCATED")
+    return archive_error("the archive ends too early: the file is truncated", "FILE_TRUNCATED")
 
 
 _MAX_MEMBERS = 16_384
@@ -136,7 +136,7 @@ class _Forward:
     def read(self, size: int) -> bytes:
         """A header, or what one says about the next member."""
         if size > _MAX_RECORDS:
-            raise archive_error("a header says too much", "ARCHIVE_ENTRY_NAME")
+            raise archive_error("a header has too much data", "ARCHIVE_ENTRY_NAME")
         self.last = b"".join(self.pieces(size))
         return self.last
 
@@ -145,7 +145,7 @@ class _Forward:
         return self._at
 
     def seek(self, position: int) -> None:
-        """Go over what nobody asked for."""
+        """Go over what nobody requested."""
         if position < self._at:
             raise archive_error("a header's number is malformed")
         for _ in self.pieces(position - self._at):
@@ -159,7 +159,7 @@ class _Forward:
         for piece in itertools.chain([self._waiting], self._source):
             tail += len(piece)
             if tail > _MAX_TAIL or any(piece):
-                raise archive_error("something lies behind the archive's end", "ARCHIVE_TRAILING_DATA")
+                raise archive_error("the file has data after the archive's end", "ARCHIVE_TRAILING_DATA")
 
 
 class TarRun:
@@ -188,7 +188,7 @@ class TarRun:
                 taken[name] = first if len(first) == size else kept(itertools.chain([first], pieces), size, folder)
             if len(taken) == len(names):
                 return taken
-        raise archive_error("the archive reads otherwise the second time")
+        raise archive_error("the archive has changed while it was read")
 
     def each(self) -> Iterator[tuple[str, bytes]]:
         """Name and content of each plain file, in their order."""
@@ -213,7 +213,7 @@ class TarRun:
         except (tarfile.TarError, ValueError, RecursionError) as error:
             if packing is None:
                 raise archive_error("a header is malformed") from error
-            message = f"a single file packed by {packing}, or a damaged archive: unpack it, and give the file"
+            message = f"a single file compressed with {packing}, or a damaged archive: decompress it, and give the file"
             raise archive_error(message) from error
         stream.require_end()
 
@@ -221,15 +221,15 @@ class TarRun:
 def _checked_name(member: tarfile.TarInfo) -> str:
     """The name below the archive's folder, of a plain file or a folder. Raises FieldFormatError."""
     if member.islnk() or member.issym():
-        message = "the archive holds a link; pack the run with what it leads to (tar --dereference)"
+        message = "the archive has a link; pack the file to which it points (tar --dereference)"
         raise archive_error(message, "ARCHIVE_LINK")
     if member.issparse():
-        raise archive_error("the archive holds a sparse file; pack it without --sparse", "ARCHIVE_SPECIAL_FILE")
+        raise archive_error("the archive has a sparse file; pack it without --sparse", "ARCHIVE_SPECIAL_FILE")
     if member.type not in (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE):
-        message = "the archive holds a device, a sparse file or something else than plain files"
+        message = "the archive has a device, a sparse file or something other than plain files"
         raise archive_error(message, "ARCHIVE_SPECIAL_FILE")
     if not 0 <= member.size <= _MOST_BYTES:
-        raise archive_error("a member claims more bytes than any file has", "ARCHIVE_TOO_LARGE")
+        raise archive_error("a member has an impossible size", "ARCHIVE_TOO_LARGE")
     if member.isdir() and member.size:
         raise archive_error("a folder with a content")
     name = re.sub(r"^(\./)+", "", member.name.removesuffix("/"))
@@ -241,8 +241,10 @@ def _checked_name(member: tarfile.TarInfo) -> str:
     if len(name.encode()) > MAX_NAME_BYTES or len(parts) > MAX_PARTS:
         raise archive_error("a member's name is too long", "ARCHIVE_ENTRY_NAME")
     if not all(_PART.fullmatch(part) and part not in (".", "..") for part in parts):
-        raise archive_error("a member's name leaves the archive's folder or is not a valid name", "ARCHIVE_ENTRY_NAME")
+        raise archive_error(
+            "a member's name is invalid, or its path leads out of the archive's folder", "ARCHIVE_ENTRY_NAME"
+        )
     if name in _OLD_TORCH and not member.isdir():
-        message = "a tar archive, as PyTorch wrote before version 0.1.10; save it again"
+        message = "a tar archive of PyTorch before version 0.1.10; save it again"
         raise archive_error(message, "LEGACY_TORCH_FILE")
     return name

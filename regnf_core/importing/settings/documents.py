@@ -55,7 +55,7 @@ def read_hocon(name: str, data: bytes | memoryview) -> dict[str, Any]:
     reader.entries(values, 1, "}" if reader.take("{") else "")
     reader.match(_LINES)
     if reader.at != len(reader.text):
-        raise reader.fault("something lies behind the settings' end")
+        raise reader.fault("there is data after the end of the settings")
     return values
 
 
@@ -87,7 +87,7 @@ class _HoconReader:
 
     def _entry(self, into: dict[str, Any], depth: int) -> None:
         if _INCLUDE.match(self.text, self.at):
-            raise unsafe(f"{self.name} includes another file; put its settings into this one")
+            raise unsafe(f"{self.name} includes another file; put the content of that file into this one")
         if (quoted := self.match(_QUOTED)) is not None:
             path = [_unescaped(quoted[1])]
         elif (found := self.match(_KEY)) is not None:
@@ -146,7 +146,7 @@ class _HoconReader:
 
     def _unexpected(self, what: str) -> Exception:
         if self.text.startswith("${", self.at):
-            return unsafe(f"{self.name} substitutes a value from elsewhere (${{...}}); write the value itself")
+            return unsafe(f"{self.name} refers to a value elsewhere (${{...}}); write the value itself")
         return self.fault(what)
 
     def fault(self, what: str) -> Exception:
@@ -197,9 +197,9 @@ def read_yaml(name: str, data: bytes | memoryview) -> Any:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
-        raise malformed(f"{name} is no sound YAML{where}") from error
+        raise malformed(f"{name} is not valid YAML{where}") from error
     except (ValueError, RecursionError) as error:
-        raise malformed(f"{name} is no sound YAML") from error
+        raise malformed(f"{name} is not valid YAML") from error
 
 
 class _YamlReader(yaml.SafeLoader):
@@ -251,7 +251,7 @@ class _YamlReader(yaml.SafeLoader):
                 values[key] = value
         for part in merged:
             if not isinstance(part, dict):
-                raise malformed(f"{self._file} merges something that is no mapping")
+                raise malformed(f"{self._file} merges something that is not a mapping")
             values = {**part, **values}
         return values
 

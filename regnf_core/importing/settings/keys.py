@@ -1,4 +1,4 @@
-"""The keys of one settings file, asked for by path and by type. What nobody asks for is never looked at."""
+"""The keys of one settings file, requested by path and by type. What nobody asks for is never looked at."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def unsafe(message: str) -> FieldFormatError:
 def decoded(name: str, data: bytes | memoryview, most: int) -> str:
     """The file as text. Raises FieldFormatError: SETTINGS_TOO_LARGE, SETTINGS_MALFORMED."""
     if len(data) > most:
-        raise too_large(f"{name} has {len(data)} bytes; at most {most} are read")
+        raise too_large(f"{name} has {len(data)} bytes; at most {most} are allowed")
     try:
         return decode_text(data)
     except TextError as error:
@@ -177,7 +177,7 @@ def read_json(name: str, data: bytes | memoryview) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant, parse_int=_whole)
     except (ValueError, RecursionError) as error:
-        raise malformed(f"{name} is no sound JSON") from error
+        raise malformed(f"{name} is not valid JSON") from error
 
 
 def _depth(text: str) -> int:

@@ -85,7 +85,7 @@ class Said:
         if names:
             told = ", ".join(f"{name} {str(keys.find(name))[:40]}" for name in names)
             self.values["color.keep"] = False
-            self.warnings.append(f"COLOR_LEFT_OUT: {keys.file}: {told} is not supported; the geometry is kept")
+            self.warnings.append(f"COLOR_LEFT_OUT: {keys.file}: {told} is not supported; only the geometry is imported")
 
     def refuse(self, keys: Keys, key: str) -> None:
         """Raise FieldFormatError (FAMILY_NOT_SUPPORTED): the value of ``key`` makes another function of the field."""

@@ -22,7 +22,7 @@ from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.library_entries import shown_path
 
-# One shape's latent code out of a file of codes beside the settings, through the gate's own reader of pickles.
+# One shape's latent code out of a file of codes beside the settings, through the importer's own reader of pickles.
 
 _MAX_CODE = 512
 
@@ -41,7 +41,7 @@ def latent_code(file: SettingsFile, index: int) -> tuple[list[float], int]:
         values, legacy = read_legacy(file.data)
         source = TensorSource(legacy, MAX_SETTINGS_BYTES)
     else:
-        raise malformed(f"{shown_path(file.name)}: no file of torch.save")
+        raise malformed(f"{shown_path(file.name)}: not a file of torch.save")
     stored = values.get("latent_codes") if isinstance(values, dict) else None
     if not isinstance(stored, (dict, TensorRef)):
         raise malformed(f"{shown_path(file.name)}: no latent_codes")
@@ -125,7 +125,7 @@ def translate_settings(
             _choose_code(description, said)
             return _settings(said)
     names = ", ".join(PurePosixPath(file.name).name[:60] for file in files[:6])
-    message = f"no known trainer's settings in {names}"
+    message = f"no config file of a known trainer in {names}"
     if required:
         raise FieldFormatError(message, reason="SETTINGS_NOT_RECOGNIZED")
     return Settings(warnings=(f"SETTINGS_NOT_USED: {message}",))

@@ -36,7 +36,7 @@ def offset_prior(partial: bool) -> float:
 
 def facing(r: Residuals) -> Tensor:
     """(H, N + M), 0..1: how well the normals agree: 1 where they are as close as an inlier's, 0 where they are more
-    than 90 degrees apart. Small things have rough normals: how far within 60 degrees tells little of a pose."""
+    than 90 degrees apart. Small objects have rough normals: how far within 60 degrees tells little of a pose."""
     return (r.cosines / EVIDENCE.min_inlier_cosine).clamp(0.0, 1.0)
 
 

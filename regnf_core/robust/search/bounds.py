@@ -161,7 +161,8 @@ def seed_poses(
 def seen_seeds(scene: Tensor, points: Tensor, normals: Tensor, axes: Tensor, rotations: Tensor, scale: float) -> Sim3:
     """Poses T_object_scene (6K,), as those of ``seed_poses``, of an object of known scale that one image shows.
 
-    Its side that faces the camera is laid on what was seen: for every rotation by the middle of that side, and by its
+    Its side that faces the camera is placed on the observed surface: for every rotation by the middle of that side, and
+    by its
     nearest point and, across, the middles or the ends to one of four sides: what hides a part of the object hides it on
     one side. scene: (N, 3) · points, normals: (M, 3) of the object · axes: (3, 3), columns, the camera's, the last one
     away from it.

@@ -1,4 +1,4 @@
-"""Which candidate is the best, which others explain the held-out samples as well, and how likely they are right."""
+"""The best candidate, the alternatives that match the verification samples equally well, and their probabilities."""
 
 from __future__ import annotations
 
@@ -23,38 +23,39 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.search.bounds import turns_about
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR
 
-# By how much a pose is better than the next one that is another answer.
+# The margin of a pose over the best pose that is another answer.
 #
-# Poses are compared by their merits: the log odds say which of them fit at all, the score says which of these fits
-# best. A pose that is right stands out among all that a search found. Where an object is not in the box, or the right
-# pose was lost, several poses are about as likely.
+# Poses are ranked by log-odds minus a multiple of the score. The log-odds separate poses that fit from those that do
+# not, and the score ranks the poses that fit. A correct pose is clearly better than all others of the search. If the
+# object is not in the box, or if the search lost the correct pose, several poses have similar log-odds.
 #
-# An answer may list several poses that fit alike, of which one is right. They are no rivals of the answer as a whole.
+# An answer may list several poses that fit equally well, of which one is correct. They do not compete with the answer
+# as a whole.
 
 
 def merits(log_odds: Tensor, scores: Tensor) -> Tensor:
-    """(H,) in log odds, larger is better: what poses with these log odds (H,) of being right, each alone, and scores
-    (H,), 0..1, smaller is better, are compared by."""
+    """Ranking values (H,) of poses, in log-odds, larger is better. log_odds: (H,), that the pose is correct, without
+    regard to the other poses · scores: (H,), 0..1, smaller is better."""
     return log_odds - VERDICT.log_odds_per_score * scores.to(log_odds)
 
 
 def leads(merits: Tensor, apart: Tensor) -> Tensor:
-    """(H,): each pose's merit (H,) above that of the best of the poses that are ``apart`` (H, H) from it, at most
-    VERDICT.most_lead, which is also the lead of a pose without any."""
+    """Margins (H,): the ranking value (H,) of each pose minus that of the best pose ``apart`` (H, H) from it. At most
+    VERDICT.most_lead, which is also the margin of a pose without such a pose."""
     others = torch.where(apart, merits, -torch.inf).amax(1)
     return (merits - others).clamp(-VERDICT.most_lead, VERDICT.most_lead)
 
 
 def apart_from_answer(apart: Tensor, answer: Sequence[int]) -> Tensor:
-    """(H, H) as ``apart``, but a pose of the ``answer``, given by their numbers, is apart only from poses that are
-    apart from all of them."""
+    """(H, H) as ``apart``, but a pose of the ``answer`` (given by its indices) is apart only from poses that are apart
+    from all poses of the answer."""
     joined = apart.clone()
     joined[list(answer)] = apart[list(answer)].all(0)
     return joined
 
 
 def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:
-    """(H, H) bool: which of the poses T (H,) place the object elsewhere than which, its symmetries allowed for.
+    """(H, H) bool: which pairs of the poses T (H,) place the object differently, up to its symmetries.
 
     points: (E, 3), the object's outermost ones. Two poses are apart if they place one of them more than VERDICT.apart
     diameters apart. The diagonal is False.
@@ -86,16 +87,15 @@ def _alike(symmetry: SelfSymmetry) -> Sim3:
 #
 #     logit P(right) = b + sum_k f_k(x_k),    f_k piecewise linear, increasing or decreasing as SPEAKS_FOR says
 #
-# There are two such sums. One knows the pose ``alone``. The other knows the candidates ``among`` which it is: its
-# further feature is the pose's lead, how far its log odds alone, less the score's share, lie above those of the next
-# other answer (`leads`).
+# There are two such models. The pose model (``alone``) uses only the pose. The decision model (``among``) also
+# compares it with the other candidates: its additional feature is the margin over the best other answer (`leads`).
 #
-# "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make
-# equal. The functions are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).
-# The second sum has several models: one for scenes of which it is known what was seen, one for the others. What a
-# feature tells depends on that: a field has surface that nobody saw, and only an observation says which it is. Where a
-# detection in an image says which surface is the thing's, it has a third one: nothing else is sampled, one side of the
-# thing was seen, and depths of one image are noisier than a map.
+# "Right" means within 5 % of the object's diameter of the true pose, or of a symmetry equivalent of it. The functions
+# are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md).
+# There are three decision models: one for scenes with an observation, one for scenes without. The meaning of a feature
+# depends on it: a network invents surface where no camera looked, and only an observation identifies this surface. The
+# third one is for detections in an image, which define the object's surface: only this surface is sampled, only one
+# side of the object is observed, and the depths of one image are noisier than a map.
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
@@ -149,10 +149,11 @@ class ProbabilityModel:
 
 @dataclass(frozen=True, eq=False)
 class PoseOdds:
-    """The two sums. among_hidden: the second one where the object is mostly hidden at the best pose; None: the same.
+    """The two models. among_hidden: the decision model for an object that is mostly hidden at the best pose; None: the
+    same.
 
-    A field of one depth image is solid behind what was seen, so it says itself what was hidden, as an observation does.
-    The scenes of which nothing is known, from which their model has learned, show surface on most sides of an object.
+    A field of one depth image is solid behind the observed surface, so it contains the information of an observation.
+    The model for scenes without an observation was trained on scenes with surface on most sides of an object.
     """
 
     alone: ProbabilityModel
@@ -160,7 +161,7 @@ class PoseOdds:
     among_hidden: ProbabilityModel | None = None
 
     def log_odds(self, features: dict[str, Tensor], scores: Tensor, apart: Tensor) -> Tensor:
-        """(H,): log odds of the candidates, each as one among them.
+        """(H,): log-odds of the candidates, each compared with the others.
 
         features: each (H,) · scores: (H,), smaller is better · apart: (H, H) bool, which candidates are other answers
         than which.
@@ -174,8 +175,8 @@ class PoseOdds:
 
 @cache
 def pose_odds(observed: bool, of_thing: bool = False) -> PoseOdds:
-    """The models that are shipped. observed: whether it is known what was seen of the scene · of_thing: whether a
-    detection said which surface is the thing's."""
+    """The models of this release. observed: whether the scene has an observation · of_thing: whether a
+    detection defines the object's surface."""
     models = _stored()
     among = models["thing" if of_thing else "observed" if observed else "unobserved"]
     return PoseOdds(models["alone"], among, None if observed else models["observed"])
@@ -189,9 +190,10 @@ def _stored() -> dict[str, ProbabilityModel]:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The best of H candidates by the held-out samples, and its rivals, which explain these as well, best first.
+    """The best of H candidates on the verification samples, and its alternatives, which match these equally well, best
+    first.
 
-    scores: (H,), 0..1, smaller is better · demerits: (H,), what candidates are compared by, smaller is better, see
+    scores: (H,), 0..1, smaller is better · demerits: (H,), ranking values of the candidates, smaller is better, see
     :func:`regnf_core.robust.verdict.answer.merits` · probability: (H,), that the candidate is right, where those that
     place the object elsewhere compete with it, but the best one and those of its rivals that place nearly the same
     surface do not compete with each other: of those, that one of them is right · probability_alone: (H,), the same
@@ -208,7 +210,7 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """How H poses lie to each other, each (H, H).
+    """Relations between H poses, each (H, H).
 
     moved: how far the second places the object from the first, diameters · apart: bool, whether they are other answers,
     see `apart` · same: see `same_surface`.

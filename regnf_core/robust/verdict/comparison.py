@@ -70,7 +70,8 @@ def compare(one: Placed, other: Placed) -> Comparison:
 
 
 def decides_for_other(found: Difference) -> bool:
-    """Whether what was seen speaks clearly for the other candidate: the two stand in one place, and differ in parts."""
+    """Whether the observed surface clearly supports the other candidate: the two have the same place and differ in
+    parts."""
     return found.distinguishable and found.differs <= VERDICT.most_differing and found.favor <= -VERDICT.min_favor
 
 

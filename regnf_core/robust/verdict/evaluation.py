@@ -24,7 +24,8 @@ from regnf_core.robust.verdict.evidence import HeldOut, gather_evidence, pose_fe
 
 # The verdict on an answer: one gate, its probability (`verdict/answer.py`), which holds all the evidence together. The
 # option ``acceptance`` names the least one, or ``min_probability`` gives it. The reason of a rejection is the first
-# share that is not usual. Beside the gate, a pose must stand within the detection: elsewhere, nothing was asked for.
+# share that is not usual. Beside the importer, a pose must stand within the detection: elsewhere, nothing was
+# requested.
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def level_of(probability: float) -> Acceptance | None:
 
 @dataclass(frozen=True)
 class _Usual:
-    """A number of right poses and what it usually is at least, or at most. name: in words."""
+    """A metric and its usual minimum or maximum for correct poses. name: in words."""
 
     reason: str
     name: str
@@ -66,11 +67,11 @@ class _Usual:
     upper: bool = True
 
     def broken(self, told: dict[str, float]) -> str:
-        """That it is not so, in words; "" where it is."""
+        """The violation, in words; "" if there is none."""
         value = told[self.metric]
         if (value <= self.limit) if self.upper else (value >= self.limit):
             return ""
-        return f"{self.name} {value:.3g}, usual is {self.limit:g} or {'less' if self.upper else 'more'}"
+        return f"{self.name} {value:.3g}, usually {self.limit:g} or {'less' if self.upper else 'more'}"
 
 
 _USUAL = (
@@ -81,16 +82,17 @@ _USUAL = (
     _Usual("SURFACE_UNEXPLAINED", "unexplained share", "unexplained_share_scene", VERDICT.usual_unexplained),
     _Usual("SCENE_UNEXPLAINED", "explained share", "explained_share_scene", VERDICT.usual_explained, upper=False),
 )
-"""What explains a rejection, the first that holds: the probability decides, these say why it is low."""
+"""Explanations of a rejection; the first violated one is used. The probability decides, these only explain a low
+one."""
 
 
 def evaluate_pose(
     held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float
 ) -> PoseVerdict:
-    """The verdict on pose number ``index``, which ``rivals`` other poses equal.
+    """The verdict on pose number ``index``, which has ``rivals`` alternatives.
 
-    probability: that the pose or one of its rivals is right, 0..1. Written so that a number that is not finite can only
-    lead to a rejection.
+    probability: that the pose or one of its alternatives is correct, 0..1. Written so that a number that is not finite
+    can only lead to a rejection.
     """
     least = least_probability(options)
     margin = probability - least if math.isfinite(probability) else -1.0
@@ -105,19 +107,19 @@ def evaluate_pose(
 
 
 def _reason(told: dict[str, float], probability: float, least: float) -> tuple[str, str]:
-    """Why a probability is low, and the same in words."""
+    """The reason of a low probability: the stable word and a sentence."""
     value, limit = f"{probability:.3g}", f"{least:.3g}"
     if value == limit:  # 0.6996 is not "0.7, at least 0.7"
         value, limit = str(probability), str(least)
-    words = f"probability {value}, at least {limit} is needed"
+    words = f"probability {value}, at least {limit} is required"
     for usual in _USUAL:
         if broken := usual.broken(told):
             return usual.reason, f"{words}; {broken}"
     return "LOW_PROBABILITY", words
 
 
-# The poses that a registration has looked at to the end, with what speaks for and against each: for people to look at.
-# Nothing is evaluated for it: the held-out samples tell it that the verdict rests on.
+# The candidate poses of a registration with the evidence for and against each, for display. It needs no further
+# evaluations: the evidence is that of the verification samples, on which the verdict is based.
 
 _MOST = 6
 
@@ -125,7 +127,7 @@ _MOST = 6
 def considered_poses(
     problem: RegistrationProblem, candidates: PoseCandidates, held_out: HeldOut, answer: Answer, options: RobustOptions
 ) -> Considered:
-    """The best of the candidates that differ, the likeliest first."""
+    """The best distinct candidates, the most probable first."""
     points = problem.model.extremal_points
     ranked = distinct(candidates.T, answer.demerits, points, VERDICT.rivals_min_distance, len(candidates))
     chosen = ranked[:_MOST]
@@ -209,7 +211,7 @@ class Evaluation:
 def evaluate_candidates(
     problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions, known: HeldOut | None = None
 ) -> Evaluation:
-    """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
+    """Choose the most probable candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
 
     known: what they told before of the first of the candidates. The fields are evaluated on the problem's device; what
     follows is decided on the CPU.

@@ -26,7 +26,7 @@ from regnf_core.surface.result_clouds import newton_step
 
 @dataclass(frozen=True, eq=False)
 class Evidence(Bundle):
-    """What the held-out samples tell of H poses: shares 0..1, lengths in object diameters.
+    """Evidence of the verification samples for H poses: shares 0..1, lengths in object diameters.
 
     numbers: each (H,), by the names that results carry; docs/reference/metrics.md says what they are · scene_signs:
     (H, N) and object_signs: (H, M) uint8, see :class:`regnf_core.document.Considered` · partial: part of the scene is
@@ -41,7 +41,8 @@ class Evidence(Bundle):
 
 @dataclass(frozen=True, eq=False)
 class HeldOut(Bundle):
-    """What the held-out samples tell of H poses, on the CPU: all that a verdict is made of, asked of the fields once.
+    """Evidence of the verification samples for H poses, on the CPU: the complete basis of a verdict. The fields are
+    evaluated once.
 
     features: each (H,), by its name, see `pose_features` · admitted: (H,) bool, which of the poses the detection
     allows.
@@ -58,12 +59,14 @@ class HeldOut(Bundle):
 
 
 def gather_evidence(r: Residuals, offsets: Tensor, options: RobustOptions) -> Evidence:
-    """The evidence of the residuals of held-out samples under H poses. offsets: (H,), as the residuals have them."""
+    """The evidence of the residuals of the verification samples under H poses. offsets: (H,), as the residuals have
+    them."""
     n, limit = r.scene_count, options.inlier_distance
     to_scene = r.object_to_scene
     inlier = (r.values.abs() <= limit) & (r.cosines >= EVIDENCE.min_inlier_cosine)
     observed = torch.ones_like(to_scene, dtype=torch.bool) if r.unobserved is None else ~r.unobserved[:, n:]
-    # Within the scene's matter, or where nobody looked, an object sample is hidden: fields are solid behind surfaces.
+    # An object sample within the scene's matter, or where no camera looked, is hidden: fields are solid behind
+    # surfaces.
     occluded = (~observed | (to_scene < -limit)) & ~inlier[:, n:]
     visible = (~occluded).sum(1).clamp_min(1)
     near = r.scene_to_object.abs() <= EVIDENCE.near
@@ -107,7 +110,7 @@ def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> Te
     return agreement
 
 
-# How much of the object the agreement covers: what is shown by patches of its surface, not by all samples together.
+# Coverage: how much of the object matches, by patches of its surface instead of all samples together.
 #
 # Another object, or the right one in a wrong place, agrees with the scene where the two are alike and not elsewhere.
 # A share of all samples does not tell that from errors that are spread over the whole object.
@@ -281,7 +284,7 @@ def _groups(r: Residuals) -> _Groups:
 
 
 def _agreement(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
-    """Shares of what was seen of both surfaces that agrees, at two distances."""
+    """Shares of the observed parts of both surfaces that match, at two distances."""
     r1, r2 = r.scene_to_object.abs(), r.object_to_scene.abs()
     close, far = EVIDENCE.close, EVIDENCE.coarse
     return {

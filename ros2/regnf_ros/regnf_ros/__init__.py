@@ -1,1 +1,1 @@
-"""Asks a regnf service where detected objects stand, and publishes their poses."""
+"""Registers detected objects with a regnf service and publishes their poses."""

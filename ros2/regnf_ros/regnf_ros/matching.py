@@ -18,7 +18,7 @@ MOST_BYTES = 128 << 20
 MOST_WAITING = 16
 """Arrays of detections that wait for a depth image."""
 BACK_NS = 1_000_000_000
-"""A stamp that lies so much before the last one begins anew: a recording was started again."""
+"""A stamp that lies so much before the last one begins again: a recording was started again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Images:
 class Matcher:
     """Gives each array of detections its images. Depth and detections may complete shots, which are returned.
 
-    say: is told why detections are dropped.
+    say: called with the reason why detections are dropped.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
@@ -106,7 +106,9 @@ class Matcher:
         self._waiting.append(message)
         if len(self._waiting) > MOST_WAITING:
             lacking = "camera_info" if self._info is None else "later depth image"
-            self._say(f"no {lacking} has come for the oldest of {MOST_WAITING} arrays of detections: it is dropped")
+            self._say(
+                f"no {lacking} has arrived for the oldest of {MOST_WAITING} waiting detection arrays: it is dropped"
+            )
             self._waiting.popleft()
         return self._complete()
 
@@ -122,8 +124,8 @@ class Matcher:
                 shots.append(Shot(depth, self._info, self._colors.near(stamp), message, self._color_size))
             elif stamp < self._depths.first():
                 late = 1e-9 * (self._depths.first() - stamp)
-                self._say(f"detections came too late: the oldest depth image kept is {late:.1f} s newer")
+                self._say(f"detections arrived too late: the oldest stored depth image is {late:.1f} s newer")
             else:
-                self._say(f"no depth image lies within {1e-9 * NEAREST_NS:g} s of the detections")
+                self._say(f"no depth image is within {1e-9 * NEAREST_NS:g} s of the detections")
         self._waiting = waiting
         return shots

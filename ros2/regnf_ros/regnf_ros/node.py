@@ -149,12 +149,15 @@ class RegisterObjects(Node):
         known = [(number, one) for number, one in enumerate(seen_in(shot.detections)) if self.knows(one.class_id)]
         if known:
             if shot.color is not None and shot.color.header.frame_id != frame:
-                self.warn(f"depth is of {frame!r}, color of {shot.color.header.frame_id!r}: is the depth aligned?")
+                self.warn(
+                    f"depth is of {frame!r}, color of {shot.color.header.frame_id!r}. Check that the depth "
+                    f"is aligned to the color image."
+                )
             try:
                 T_map_camera = self.camera_in_map(header)
                 image = camera_image(shot.depth, shot.info, shot.color, T_map_camera, self.rectified)
             except (TransformException, ValueError) as error:
-                self.warn(f"no object is looked for: {error}")
+                self.warn(f"no object is searched: {error}")
                 return
             frame, size = frame if T_map_camera is None else self.map_frame, shot.color_size or image.size
             for number, one in known:
@@ -190,14 +193,16 @@ class RegisterObjects(Node):
         return box.moved(self.to_map(header))
 
     def camera_in_map(self, header: Any) -> Matrix | None:
-        """T_map_camera; None where no map is asked for, or tf does not know it: the camera's frame is the world then.
+        """T_map_camera; None where no map is requested, or tf does not know it: the camera's frame is the world then.
 
         Raises TransformException where tf knows it, but not at the time of the image.
         """
         if not self.map_frame:
             return None
         if not self.transforms.can_transform(self.map_frame, header.frame_id, Time()):
-            self.warn(f"tf knows no {header.frame_id!r} in {self.map_frame!r}: poses are in the camera's frame")
+            self.warn(
+                f"tf has no transform from {header.frame_id!r} to {self.map_frame!r}: poses are in the camera frame"
+            )
             return None
         return self.to_map(header)
 
@@ -250,7 +255,7 @@ class RegisterObjects(Node):
 
 
 def best_class(detection: Detection3D) -> str | None:
-    """The class of the likeliest hypothesis; None where there is none."""
+    """The class of the most probable hypothesis; None where there is none."""
     hypotheses = [one.hypothesis for one in detection.results]
     return max(hypotheses, key=lambda one: one.score).class_id if hypotheses else None
 

@@ -1,4 +1,4 @@
-"""From a detection to what is published: which object is asked for, what an answer means. No ROS."""
+"""From a detection to what is published: which object is requested, what an answer means. No ROS."""
 
 from __future__ import annotations
 

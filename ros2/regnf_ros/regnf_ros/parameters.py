@@ -1,4 +1,4 @@
-"""What the node is told: parameters as ROS hands them on. No ROS.
+"""The parameters of the node, as ROS passes them. No ROS.
 
 Launch files and command lines pass them through YAML, which makes a boolean of y and a number of 0.03 or 1e-3. So
 a parameter may have any type here, and each is read for what it is to mean.
@@ -40,7 +40,7 @@ def axis_of(name: str, value: Any) -> str:
         return ""
     found = _AXIS.fullmatch(value.strip()) if isinstance(value, str) else None
     if found is None:
-        raise ValueError(f"{name}: {value!r} is none of x, y and z")
+        raise ValueError(f"{name}: {value!r} is not x, y or z")
     return found[1].lower()
 
 
@@ -53,7 +53,7 @@ def share_of(name: str, value: Any) -> float | None:
     except (TypeError, ValueError):
         share = float("nan")
     if not 0.0 <= share < 1.0:
-        raise ValueError(f"{name}: {value!r} is no number of at least 0 and less than 1, like 0.03")
+        raise ValueError(f"{name}: {value!r} is not a number from 0 to below 1, such as 0.03")
     return share
 
 
@@ -68,17 +68,17 @@ def objects_of(value: Any) -> dict[str, str]:
         try:
             value = json.loads(value, object_pairs_hook=list)
         except ValueError as error:
-            raise ValueError(f"objects: no JSON: {error}") from error
+            raise ValueError(f"objects: not valid JSON: {error}") from error
         value = ["=".join(map(str, one)) if isinstance(one, (list, tuple)) else one for one in value]
     entries = _entries(value) if isinstance(value, str) else value
     if not isinstance(entries, (list, tuple)):
-        raise ValueError(f"objects: {value!r} is no list of CLASS=SHA256")
+        raise ValueError(f"objects: {value!r} is not a list of CLASS=SHA256")
     table: dict[str, str] = {}
     for entry in entries:
         name, sign, digest = str(entry).rpartition("=")
         name, digest = name.strip(), digest.strip()
         if not (name and sign and _DIGEST.fullmatch(digest)) or name in table:
-            raise ValueError(f"objects: {entry!r} is not CLASS=SHA256 (64 hex digits), or names its class again")
+            raise ValueError(f"objects: {entry!r} is not CLASS=SHA256 (64 hex digits), or has a class twice")
         table[name] = digest.lower()
     return table
 
@@ -96,7 +96,7 @@ def unit_of(name: str, value: Any) -> str:
     """The unit of the objects' fields: auto, free, or one of a known length. Raises ValueError."""
     if value in ("auto", "free", *METERS):
         return str(value)
-    raise ValueError(f"{name}: {value!r} is none of auto, free, {', '.join(METERS)}")
+    raise ValueError(f"{name}: {value!r} is not one of auto, free, {', '.join(METERS)}")
 
 
 def options_of(up_axis: str, scale_tolerance: float | None, object_unit: str, T_scene_map: Matrix) -> dict[str, Any]:

@@ -99,7 +99,7 @@ def field_from_map(dataparser_transforms: str) -> Matrix:
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{dataparser_transforms} does not hold a transform (3x4) and a scale: {error}") from error
     if not np.isfinite(T).all() or np.linalg.det(T[:3, :3]) <= 0:
-        raise ValueError(f"{dataparser_transforms}: the transform is no similarity")
+        raise ValueError(f"{dataparser_transforms}: the transform is not a similarity")
     return T
 
 

@@ -1,4 +1,4 @@
-"""The calls to a regnf service: register one box or one thing in an image, wait for the end, fetch the result.
+"""The calls to a regnf service: register one box or one object in an image, wait for the end, fetch the result.
 
 httpx alone, no ROS.
 """

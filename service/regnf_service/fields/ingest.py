@@ -125,13 +125,13 @@ def check_workers(services: Services, caller: str) -> None:
     """Refuse an import that the workers have no time for. Raises Problem QUOTA_ACTIVE_JOBS."""
     most = services.quota.imports
     if most is not None and services.records.importing(caller) >= most:
-        detail = f"{most} of your imports wait or run. Wait for one to end."
+        detail = f"{most} of your imports are waiting or running. Wait until one ends."
         raise Problem("QUOTA_ACTIVE_JOBS", detail, headers=RETRY_LATER)
 
 
 @dataclass(frozen=True)
 class StoredUpload:
-    """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried anew."""
+    """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried again."""
 
     record: FieldRecord
     created: bool

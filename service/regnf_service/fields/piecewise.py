@@ -49,9 +49,9 @@ def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange)
     if piece.first != found.offset:
         raise _not_finished(found.offset)
     if found.total not in (0, piece.total):
-        raise Problem("INVALID_HEADER", f"The earlier pieces are of a file of {found.total} bytes.")
+        raise Problem("INVALID_HEADER", f"The earlier pieces belong to a file of {found.total} bytes.")
     if found.pieces >= MOST_PIECES:
-        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.")
+        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are allowed.")
 
 
 async def finish_pieces(

@@ -1,4 +1,4 @@
-"""Another description of a field that is held: its bytes are imported anew, if they are still there."""
+"""Another description of a field that is held: its bytes are imported again, if they are still there."""
 
 from __future__ import annotations
 

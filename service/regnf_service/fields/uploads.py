@@ -57,7 +57,7 @@ class Upload:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        # also when the request is cancelled: what was written must go
+        # also when the request is canceled: what was written must go
         with anyio.CancelScope(shield=True):
             if self._writer is not None:
                 await UPLOADS.run(self._opened.close)
@@ -71,7 +71,7 @@ class Upload:
         Raises Problem UPLOAD_TOO_LARGE, QUOTA_STORED, FIELD_NOT_RECOGNIZED as soon as the bytes show it.
         """
         if self._bytes + len(self._pending) + len(data) > self._limit:
-            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.")
+            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are allowed.")
         self._claim.arrive(len(data))
         self._pending += data
         if not self._recognized and len(self._pending) >= HEAD_BYTES:
@@ -82,7 +82,7 @@ class Upload:
     async def finish(self) -> Received:
         """Write what is left. Raises Problem UPLOAD_INCOMPLETE, FIELD_NOT_RECOGNIZED."""
         if not self._bytes and not self._pending:
-            raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.", hint=_NO_BYTES_HINT)
+            raise Problem("UPLOAD_INCOMPLETE", "The upload is empty.", hint=_NO_BYTES_HINT)
         if not self._recognized:
             self._recognize()
         await self._flush()

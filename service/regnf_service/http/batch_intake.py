@@ -115,10 +115,13 @@ class Library:
             found += self._by_tags(wanted.tags)
         meant = list(dict.fromkeys(found))
         if not meant:
-            raise Problem("LIBRARY_EMPTY", errors=[{"pointer": "/candidates/library", "detail": "no entry is meant"}])
+            raise Problem(
+                "LIBRARY_EMPTY", errors=[{"pointer": "/candidates/library", "detail": "no entry is selected"}]
+            )
         if len(meant) > MAX_SELECTED:
             raise Problem(
-                "LIBRARY_TOO_LARGE", f"The request names {len(meant)} entries; one search takes {MAX_SELECTED} at most."
+                "LIBRARY_TOO_LARGE",
+                f"The request selects {len(meant)} entries; one search can have at most {MAX_SELECTED}.",
             )
         return meant
 
@@ -205,7 +208,7 @@ class Intake:
         self._count += len(texts)
         if self._count > most:
             extra = {"fitting_lines": most}
-            raise Problem("REQUEST_TOO_LARGE", f"A batch has at most {most} lines.", extra=extra)
+            raise Problem("REQUEST_TOO_LARGE", f"A batch can have at most {most} lines.", extra=extra)
         return [self._read(text) for text in texts]
 
     def take(self, read: Sequence[Read]) -> None:
@@ -225,7 +228,7 @@ class Intake:
     def finish(self) -> Posting:
         """All lines, to become jobs. Raises Problem INVALID_REQUEST."""
         if not self._lines:
-            raise Problem("INVALID_REQUEST", "The body has no line. Send one request a line.")
+            raise Problem("INVALID_REQUEST", "The body has no lines. Send one request per line.")
         return Posting(self._services, self._caller, self._identity.hexdigest()[:_ID_DIGITS], self._lines)
 
     def _read(self, text: TextLine) -> Read:
@@ -241,7 +244,7 @@ class Intake:
     def _spec(self, text: TextLine) -> BatchPair:
         """Raises Problem: what POST /register would say."""
         if text.text is None:
-            raise Problem("REQUEST_TOO_LARGE", f"A line may have {LINE_BYTES} bytes.")
+            raise Problem("REQUEST_TOO_LARGE", f"A line can have at most {LINE_BYTES} bytes.")
         spec = read_model(BatchPair, text.text)
         if spec.key is not None and self._keys.setdefault(spec.key, text.number) != text.number:
             fault = {"pointer": "/key", "detail": f"Line {self._keys[spec.key]} has the same key."}

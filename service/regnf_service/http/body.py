@@ -46,9 +46,11 @@ async def caller_of_request(request: Request) -> str:
 ServicesDep = Annotated[Services, Depends(services_of)]
 CallerDep = Annotated[str, Depends(caller_of_request)]
 PrefixDep = Annotated[str, Depends(prefix_of)]
-WaitQuery = Annotated[int, Query(ge=0, le=30, description="Seconds to hold the answer back for news.")]
-LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return at most.")]
-PageTokenQuery = Annotated[str | None, Query(max_length=200, description="`next_page_token` of the page before.")]
+WaitQuery = Annotated[
+    int, Query(ge=0, le=30, description="Longest time to wait for a change before the response is sent, seconds.")
+]
+LimitQuery = Annotated[int, Query(ge=1, le=200, description="Largest number of entries in the response.")]
+PageTokenQuery = Annotated[str | None, Query(max_length=200, description="The `next_page_token` of the previous page.")]
 
 
 def declared_length(request: Request, besides: int = 0) -> int | None:
@@ -57,7 +59,7 @@ def declared_length(request: Request, besides: int = 0) -> int | None:
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and len(text) <= 19):
-        raise Problem("INVALID_HEADER", "Content-Length is not a number of bytes.")
+        raise Problem("INVALID_HEADER", "Content-Length is not a valid number of bytes.")
     return max(0, int(text) - besides)
 
 
@@ -80,7 +82,7 @@ async def chunks(request: Request, limit: int, too_large: str = "UPLOAD_TOO_LARG
     """
     declared = declared_length(request)
     if declared is not None and declared > limit:
-        raise Problem(too_large, f"At most {limit} bytes are taken.")
+        raise Problem(too_large, f"At most {limit} bytes are allowed.")
     received = 0
     more = True
     while more:
@@ -90,7 +92,7 @@ async def chunks(request: Request, limit: int, too_large: str = "UPLOAD_TOO_LARG
         data: bytes = message.get("body", b"")
         received += len(data)
         if received > limit:
-            raise Problem(too_large, f"At most {limit} bytes are taken.")
+            raise Problem(too_large, f"At most {limit} bytes are allowed.")
         if data:
             yield data
         more = message.get("more_body", False)
@@ -258,7 +260,7 @@ def boundary_of(request: Request) -> str:
     """The boundary that the Content-Type announces. Raises Problem MALFORMED_MULTIPART."""
     boundary = _parameter(request.headers.get("content-type", ""), "boundary")
     if not boundary or not boundary.isascii() or len(boundary) > 70:
-        raise Problem("MALFORMED_MULTIPART", "The Content-Type names no usable boundary.")
+        raise Problem("MALFORMED_MULTIPART", "The Content-Type has no valid boundary.")
     return boundary
 
 
@@ -298,9 +300,9 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
     if part.name not in files and part.name not in texts:
         raise Problem("MALFORMED_MULTIPART", f"Known parts: {', '.join([*files, *texts])}.")
     if part.name in parts:
-        raise Problem("MALFORMED_MULTIPART", "Two parts bear the same name.")
+        raise Problem("MALFORMED_MULTIPART", "Two parts have the same name.")
     if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):
-        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.")
+        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not supported.")
     parts[part.name] = part
     if part.name in files:
         files[part.name].begin(part.filename)
@@ -308,5 +310,5 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
 
 def _add_text(part: _Part, content: bytearray, limit: int) -> None:
     if len(part.text) + len(content) > limit:
-        raise Problem("REQUEST_TOO_LARGE", f"The part {part.name} takes at most {limit} bytes.")
+        raise Problem("REQUEST_TOO_LARGE", f"The part {part.name} can have at most {limit} bytes.")
     part.text += content

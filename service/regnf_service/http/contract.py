@@ -17,29 +17,30 @@ from regnf_state.reasons import REASONS
 
 _DESCRIPTION = """\
 Register neural signed distance fields: given the field of a scene, a detection box in it and the field of a library
-object, find the similarity transform that carries the scene's copy of the object onto the library's.
+object, find the object's pose and scale in the scene (a similarity transform).
 
-Upload both fields, post a detection to `/register`, follow the job, fetch its result. Every error is a problem object
-(RFC 9457) with a stable `reason`; switch on it, never on text. Answers may gain members.
+Upload both fields, post a detection to `/register`, wait for the job and get its result. Every error is a problem
+object (RFC 9457) with a stable `reason`. Programs should branch on `reason`, never on the text. Responses may gain
+members in later releases.
 
-Where tokens are configured every call but `/healthz`, `/static`, `/docs` and a job's page needs
-`Authorization: Bearer`, and is refused with 401 `UNAUTHENTICATED` otherwise. A token names a caller; another caller's
-fields and jobs are 404.
-A service that limits calls answers 429 `RATE_LIMITED` with `Retry-After` at any address that needs a token,
-and any service 429 `TOO_MANY_REQUESTS_AT_ONCE` to a caller that has too many requests in progress.
+If the service has access tokens, every call needs `Authorization: Bearer`, except `/healthz`, `/static`, `/docs` and
+the page of a job. A call without a valid token gets 401 `UNAUTHENTICATED`. Each token belongs to a caller. The fields
+and jobs of other callers give 404. If the service limits the rate of calls, any address that needs a token may return
+429 `RATE_LIMITED` with `Retry-After`. A caller with too many requests in progress gets 429
+`TOO_MANY_REQUESTS_AT_ONCE`.
 
-Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.
+An unknown query parameter at an address of fields, registrations or jobs gives 400 `INVALID_QUERY`.
 """
 _TAGS = {
-    "fields": "Upload fields and see what was found in them.",
-    "recordings": "Upload frames of a depth camera, and see them.",
-    "library": "Objects by name, with tags, to be found by search.",
-    "registrations": "Find where an object stands in a scene.",
-    "batches": "Thousands of registrations at once.",
+    "fields": "Upload fields and read the report of their import.",
+    "recordings": "Upload frames of a depth camera and view them.",
+    "library": "Objects by name and tag. A search compares a detection with them.",
+    "registrations": "Find the pose of an object in a scene.",
+    "batches": "Many registrations in one request.",
     "renderings": "Pictures, meshes and fields of edited scenes.",
-    "jobs": "Follow, cancel and forget jobs.",
-    "results": "What a job has found, its files and its page.",
-    "service": "What the service says about itself.",
+    "jobs": "Follow, cancel and delete jobs.",
+    "results": "The result of a job, its files and its page.",
+    "service": "State, version and contract of the service.",
 }
 _UNUSED = ("HTTPValidationError", "ValidationError")
 
@@ -89,7 +90,7 @@ def _mend(operation: dict[str, Any]) -> None:
 
 
 def _say_who_may_call(path: str, operation: dict[str, Any]) -> None:
-    """401 wherever a token is asked for where some are configured; the other addresses need none."""
+    """401 wherever a token is requested where some are configured; the other addresses need none."""
     if OPEN_PATHS.fullmatch(path.replace("{id}", "id")):
         operation["security"] = [{}]
         return

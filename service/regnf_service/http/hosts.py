@@ -73,7 +73,7 @@ class AllowedHosts:
         for entry in listed - {ANY}:
             found = parse_authority(entry.removeprefix("*."))
             if found is None:
-                raise HostsError("REGNF_ALLOWED_HOSTS: an entry names no host; write `name`, `name:port` or `*.domain`")
+                raise HostsError("REGNF_ALLOWED_HOSTS: an entry has no host; write `name`, `name:port` or `*.domain`")
             if entry.startswith("*."):
                 self._domains.add((f".{found.host}", found.port))
             else:
@@ -129,5 +129,7 @@ def cors_origins(settings: Settings) -> frozenset[str]:
     """The origins that the settings list, as browsers write them. Raises HostsError for an entry that is none."""
     for entry in settings.cors_origins:
         if not _PLAIN.fullmatch(entry) or parse_origin(entry) is None or entry != entry.lower():
-            raise HostsError("REGNF_CORS_ORIGINS: an entry is no origin; write `https://name` or `https://name:port`")
+            raise HostsError(
+                "REGNF_CORS_ORIGINS: an entry is not an origin; write `https://name` or `https://name:port`"
+            )
     return settings.cors_origins

@@ -27,13 +27,13 @@ _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _PROBES = frozenset({"/healthz", "/readyz", "/static"})
 access_log = logging.getLogger(ACCESS_LOGGER)
 _CHALLENGE = {"WWW-Authenticate": 'Bearer realm="regnf"'}
-_NO_TOKENS = "Beyond loopback this service answers with tokens only, and none is configured."
+_NO_TOKENS = "This service has no access tokens, so it accepts only requests from this machine."
 
 
 class RequestContext:
     """Gives each request its id, the caller's own if it is well formed, and writes it on every answer.
 
-    ``count`` is told of each: its scope, status, seconds until the answer began, and bytes of its body.
+    ``count`` is called for each: its scope, status, seconds until the response began, and bytes of its body.
     """
 
     def __init__(self, app: ASGIApp, count: Callable[[Scope, int, float, int], None]) -> None:
@@ -220,7 +220,7 @@ class RequestGate:
     and the answers to a caller that leaves very many unread. What is answered is sent in blocks: the server takes the
     next one when its client has read enough, so a connection holds no more than a block or two.
 
-    Where no token is asked for, an address counts as a caller. The slots are not for what needs no token elsewhere.
+    Where no token is requested, an address counts as a caller. The slots are not for what needs no token elsewhere.
     """
 
     def __init__(self, app: ASGIApp, slots: Slots) -> None:
@@ -251,7 +251,7 @@ class RequestGate:
             nonlocal refused
             if message["type"] == "http.response.start" and self._unread[who] > _MOST_UNREAD:
                 refused = True
-                detail = "Too much of what was answered waits to be read. Read it, then repeat."
+                detail = "Too many response bytes are waiting to be read. Read them, then repeat the request."
                 problem = Problem("TOO_MANY_REQUESTS_AT_ONCE", detail, headers=RETRY_LATER)
                 await problem_response(problem, scope)(scope, receive, send)
             if refused:

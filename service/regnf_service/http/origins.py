@@ -45,7 +45,7 @@ class OriginGate:
         headers = Headers(scope=scope)
         if "transfer-encoding" in headers and "content-length" in headers:
             # a proxy in front may see the body's end at another place than this server
-            return Problem("INVALID_HEADER", "The body has two lengths.", headers={"Connection": "close"})
+            return Problem("INVALID_HEADER", "The body has two different lengths.", headers={"Connection": "close"})
         given = headers.getlist("host")
         host = parse_authority(given[0]) if len(given) == 1 and scope["path"].startswith("/") else None
         arrived_on = (scope.get("server") or ("",))[0] or ""

@@ -72,7 +72,7 @@ SECURITY_HEADERS = {**_FIXED, **_UNLESS_SAID}
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
 _PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.-]{1,200}")
-_RECORDS_FULL = "The record store keeps its last room for what goes on. Delete jobs, or retry later."
+_RECORDS_FULL = "The job store is almost full, so new work is refused. Delete finished jobs, or retry later."
 _STATUS_REASONS = {401: "UNAUTHENTICATED", 404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: "REQUEST_TOO_LARGE"}
 
 
@@ -101,7 +101,7 @@ def problem_of(error: Exception) -> Problem:
         case RegnfError():
             return Problem(error.reason if error.reason in REASONS else "INVALID_REQUEST", str(error), hint=error.hint)
         case RedisError():
-            return Problem("STORAGE_UNAVAILABLE", "The record store does not answer. Retry later.", headers=RETRY_LATER)
+            return Problem("STORAGE_UNAVAILABLE", "The job store does not respond. Retry later.", headers=RETRY_LATER)
         case StorageFullError():
             return Problem("STORAGE_FULL", headers=RETRY_LATER)
         case FileNotFoundError():  # the store answers: what was there a moment ago has been deleted

@@ -23,7 +23,7 @@ _MOST_PARAMETERS = 32
 async def refuse_unknown_parameters(request: Request) -> None:
     """Raises Problem INVALID_QUERY for parameters that the route does not take, or takes once and was given twice."""
     if request.scope["query_string"].count(b"&") >= _MOST_PARAMETERS:
-        raise Problem("INVALID_QUERY", f"At most {_MOST_PARAMETERS} parameters are taken.")
+        raise Problem("INVALID_QUERY", f"At most {_MOST_PARAMETERS} parameters are allowed.")
     route = request.scope["route"]
     if not request.query_params or not isinstance(route, APIRoute):
         return
@@ -41,8 +41,8 @@ async def refuse_unknown_parameters(request: Request) -> None:
 
 # Page tokens: where the look for the page before ended. They carry no secret and open nothing, so none is signed.
 
-_FORGED = "Use `next_page_token` of the page before, unchanged, as `page_token`."
-NEXT_PAGE = "For the next page's `page_token`; null on the last page. A page before the last may be short or empty."
+_FORGED = "Give the unchanged `next_page_token` of the previous page as `page_token`."
+NEXT_PAGE = "The `page_token` of the next page; null on the last page. Other pages may be short or empty as well."
 
 
 def encode_token(rest: Position | None) -> str | None:

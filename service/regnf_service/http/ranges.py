@@ -72,7 +72,8 @@ def field_etag(record: FieldRecord) -> str:
 
 async def _of_request(
     if_none_match: Annotated[
-        str | None, Header(description="One or several ETags, or `*`: 304 when one of them is the current one.")
+        str | None,
+        Header(description="One or several ETags, or `*`. The response is 304 if one of them is the current ETag."),
     ] = None,
 ) -> IfNoneMatch:
     return parse_if_none_match(if_none_match)
@@ -85,11 +86,11 @@ _ONE_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
 RangeHeader = Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")]
-IfRangeHeader = Annotated[str | None, Header(description="The ETag that the range belongs to.")]
+IfRangeHeader = Annotated[str | None, Header(description="The ETag of the file that the range is from.")]
 
 
 def parse_range(header: str | None, size: int) -> range | None:
-    """The places of the bytes asked for, None for all: no header, a malformed one, or more ranges than one.
+    """The places of the bytes requested, None for all: no header, a malformed one, or more ranges than one.
 
     Raises Problem RANGE_NOT_SATISFIABLE.
     """
@@ -173,13 +174,13 @@ def content_range(header: str | None, limit: int) -> PieceRange | None:
     first, last, total = (None if text is None else int(text) for text in match.groups())
     assert total is not None
     if total > limit:
-        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are taken.")
+        raise Problem("UPLOAD_TOO_LARGE", f"At most {limit} bytes are allowed.")
     if total == 0:
-        raise Problem("UPLOAD_INCOMPLETE", "The upload has no bytes.")
+        raise Problem("UPLOAD_INCOMPLETE", "The upload is empty.")
     if first is None or last is None:
         return PieceRange(None, None, total)
     if not first <= last < total:
-        raise Problem("INVALID_HEADER", "Content-Range names bytes beyond the file's end, or none.")
+        raise Problem("INVALID_HEADER", "Content-Range has bytes after the end of the file, or no bytes.")
     return PieceRange(first, last + 1, total)
 
 
@@ -216,5 +217,5 @@ def _decoded(text: str) -> str:
     except binascii.Error:
         value = b""
     if len(value) != 32:
-        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.")
+        raise Problem("INVALID_DIGEST", "Content-Digest has no SHA-256.")
     return value.hex()

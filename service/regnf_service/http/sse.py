@@ -33,7 +33,7 @@ async def event_stream(services: Services, job_id: str, after: str | None) -> As
             record, events = await services.job_watch.news(job_id, after)
         except (RedisError, OSError) as error:
             # the client connects again, and is told when with the 503 that it then gets
-            logger.warning("an event stream ends: a store does not answer: %s", type(error).__name__)
+            logger.warning("an event stream ends: a store does not respond: %s", type(error).__name__)
             return
         for event in events:
             yield f"id: {event.id}\nevent: {event.name}\ndata: {json.dumps(event.data)}\n\n"

@@ -40,7 +40,7 @@ def parse_json(body: bytes, most_values: int = MOST_VALUES, what: str = "The bod
     Raises Problem MALFORMED_JSON, REQUEST_TOO_LARGE for more values than any request needs.
     """
     if count_values(body) > most_values:
-        raise Problem("REQUEST_TOO_LARGE", f"JSON of at most {most_values} members and values is taken.")
+        raise Problem("REQUEST_TOO_LARGE", f"The JSON can have at most {most_values} members and values.")
     try:
         value = json_value(body, f"{what} is ", object_pairs_hook=_object, parse_float=_number)
     except InvalidInputError as error:
@@ -56,10 +56,10 @@ def _number(text: str) -> float | int:
 
 def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     if len(pairs) > MOST_MEMBERS:
-        raise Problem("REQUEST_TOO_LARGE", f"An object of at most {MOST_MEMBERS} members is taken.")
+        raise Problem("REQUEST_TOO_LARGE", f"An object can have at most {MOST_MEMBERS} members.")
     members = dict(pairs)
     if len(members) != len(pairs):
-        raise Problem("MALFORMED_JSON", "An object names a member twice.")
+        raise Problem("MALFORMED_JSON", "An object has a member twice.")
     return members
 
 
@@ -69,7 +69,7 @@ def _check_depth(value: Any) -> None:
         level = [child for item in level if isinstance(item, dict | list) for child in _children(item)]
         if not level:
             return
-    raise Problem("MALFORMED_JSON", "The body nests too deeply.")
+    raise Problem("MALFORMED_JSON", "The body is nested too deeply.")
 
 
 def _children(item: dict[str, Any] | list[Any]) -> list[Any]:

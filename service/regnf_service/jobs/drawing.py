@@ -1,4 +1,4 @@
-"""The picture of a result, drawn of its stored files when it is asked for the first time, and kept beside them."""
+"""The picture of a result, drawn of its stored files when it is requested the first time, and kept beside them."""
 
 from __future__ import annotations
 

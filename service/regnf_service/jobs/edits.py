@@ -101,8 +101,8 @@ def _named(services: Services, caller: str, scene: str, job_id: str, pointer: st
         _require_of_scene(record, reference_of(caller, scene))
         result = result_of(services, manifest_of(services, record))
         if result.get("verdict") == "rejected":
-            hint = "To use it all the same, give `object` and `T_object_scene` instead of `job`."
-            raise Problem("EDIT_INVALID", "The registration rejected its pose.", hint=hint)
+            hint = "To use it anyway, give `object` and `T_object_scene` instead of `job`."
+            raise Problem("EDIT_INVALID", "The verdict of the registration is `rejected`.", hint=hint)
         return _members(record, result)
     except Problem as problem:
         fault = {"pointer": pointer, "detail": problem.detail}
@@ -118,9 +118,9 @@ def _named(services: Services, caller: str, scene: str, job_id: str, pointer: st
 
 def _require_of_scene(record: JobRecord, scene: str) -> None:
     if record.kind != REGISTRATION:
-        raise Problem("EDIT_INVALID", "The job is a rendering. Name the registration that found the object.")
+        raise Problem("EDIT_INVALID", "The job is a rendering. Give the registration that found the object.")
     if record.request.get("scene") != scene:
-        hint = "If both scenes have one frame, give `object` and `T_object_scene` of its result instead of `job`."
+        hint = "If both scenes have the same frame, give `object` and `T_object_scene` of its result instead of `job`."
         raise Problem("EDIT_INVALID", "The job is a registration in another scene.", hint=hint)
 
 

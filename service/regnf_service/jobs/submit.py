@@ -58,14 +58,14 @@ def _check(settings: Settings, cost: Cost, usual: Cost, reason: str) -> None:
 def _check_files(settings: Settings, request: RenderingRequest) -> None:
     files, limit = rendering_cost.estimate(request.rendering).file_bytes, settings.job_scratch_bytes
     if files > limit:
-        detail = f"The files may take {files / _GIB:.1f} GiB; the limit is {limit / _GIB:.1f} GiB."
+        detail = f"The files may need {files / _GIB:.1f} GiB; the limit is {limit / _GIB:.1f} GiB."
         fault = {"pointer": "/outputs", "detail": detail}
-        hint = "Ask for fewer or smaller frames, or for fewer outputs."
+        hint = "Request fewer or smaller frames, or fewer outputs."
         raise Problem("RENDER_TOO_LARGE", detail, errors=[fault], hint=hint)
 
 
 def _refusal(term: Term, estimated: str, limit: str, reason: str) -> Problem:
-    detail = f"The job is estimated to take {estimated}; the limit is {limit}. Most of it is for {_count(term)}."
+    detail = f"The job would need an estimated {estimated}; the limit is {limit}. Most of it is for {_count(term)}."
     within = ("options",) if reason == "OPTIONS_TOO_COSTLY" else ()
     fault = f"{_count(term)}: {estimated}, limit {limit}"
     errors = [{"pointer": json_pointer((*within, *option)), "detail": fault} for option in term.options]
@@ -224,7 +224,7 @@ def _require_suited(request: JobRequest, scene: FieldRecord | None, named: Mappi
 def require_box(request: JobRequest) -> None:
     """Of a scene that is a field. Raises Problem IMAGE_DETECTION_WITHOUT_RECORDING."""
     if not isinstance(request, RenderingRequest) and not isinstance(request.detection, Detection):
-        fault = {"pointer": "/detection", "detail": "in an image, and the scene is a field"}
+        fault = {"pointer": "/detection", "detail": "in an image, but the scene is a field"}
         raise Problem("IMAGE_DETECTION_WITHOUT_RECORDING", errors=[fault])
 
 

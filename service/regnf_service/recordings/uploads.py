@@ -153,4 +153,6 @@ class _Image:
         """Raises Problem for an image that came and has no bytes, or too few to be one."""
         if self._head is not None:
             known = ", ".join(dict.fromkeys(_IMAGES[self._name].values()))
-            raise Problem("RECORDING_NOT_RECOGNIZED", f"The part `{self._name}` is no image of these kinds: {known}.")
+            raise Problem(
+                "RECORDING_NOT_RECOGNIZED", f"The part `{self._name}` is not an image of these types: {known}."
+            )

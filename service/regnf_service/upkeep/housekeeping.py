@@ -1,7 +1,7 @@
 """Deletes what is no longer needed: unused fields, results beyond the storage cap, and files that crashes left behind.
 
 Nothing here is urgent, so the leader does it once an hour. What a live job needs is never deleted: the record of a
-field is deleted first, and restored if a job has asked for the field in between; only then the bytes are deleted.
+field is deleted first, and restored if a job has requested the field in between; only then the bytes are deleted.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Term:
         self.number = number
 
     def confirm(self) -> None:
-        """Call this before anything that cannot be undone: the term begins anew. Raises LeaseLostError."""
+        """Call this before anything that cannot be undone: the term begins again. Raises LeaseLostError."""
         try:
             self._lock.reacquire()
         except LockError as error:
@@ -206,7 +206,7 @@ class Housekeeper:
         return (job for job in jobs if job.status not in ACTIVE)
 
     def _drop_field(self, term: Term, field: FieldRecord) -> bool:
-        """Delete a field unless a job has asked for it in between."""
+        """Delete a field unless a job has requested it in between."""
         term.confirm()
         self._records.delete_field(field.sha256)
         if next(iter(self._records.jobs_using_field(field.sha256)), None) is not None:

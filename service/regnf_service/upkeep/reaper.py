@@ -30,7 +30,7 @@ from regnf_state.settings import Settings
 
 
 class Staleness:
-    """Sees every record in every round. When two rounds are more than ``unbroken_s`` apart, all counting begins anew.
+    """Sees every record in every round. When two rounds are more than ``unbroken_s`` apart, all counting begins again.
 
     A process that could not look, because Redis was away or the machine slept, does not know what changed. Where it
     knows that it could not, it says so with ``forget``.
@@ -44,7 +44,7 @@ class Staleness:
         self._seen: dict[str, tuple[Any, float]] = {}
 
     def begin_round(self) -> None:
-        """Look anew; what the round before did not see is forgotten."""
+        """Look again; what the round before did not see is forgotten."""
         now = self._clock()
         self._before = self._seen if now - self._now <= self._unbroken_s else {}
         self._now, self._seen = now, {}
@@ -75,7 +75,7 @@ logger = logging.getLogger(__name__)
 
 Done = dict[str, list[str]]
 """What one round did: ids by action, which is requeued, failed, dismissed, enqueued, expired or recalled (a record made
-anew from the journal)."""
+again from the journal)."""
 
 
 class Reaper:
@@ -207,7 +207,7 @@ def _note(done: Done, name: str, look: Callable[[_Record, float], str | None], r
     except (RedisError, OSError, LeaseLostError):
         raise
     except Exception:
-        logger.exception("%s is left out of this round: an internal error", name)
+        logger.exception("%s is skipped in this round: an internal error", name)
         return
     if action is not None:
         done[action].append(name)

@@ -243,12 +243,12 @@ class Deliverer:
 
 
 def message_id(record: JobRecord, place: int) -> str:
-    """Each message's own: the same at every send, another when a job is deleted, asked for anew and ends again."""
+    """Each message's own: the same at every send, another when a job is deleted, requested again and ends again."""
     return f"{record.id}-{record.attempt}-{int(1000 * (record.finished or 0))}-{place}"
 
 
 def payload(record: JobRecord) -> bytes:
-    """The message: the same bytes at every send. It says that a job ended and how; what it found is asked for."""
+    """The message: the same bytes at every send. It says that a job ended and how; what it found is requested."""
     document = {
         "type": f"job.{record.status}",
         "timestamp": rfc3339(record.finished),
@@ -324,5 +324,5 @@ async def _guarded(work: Awaitable[_Result]) -> _Result | None:
     except RedisError as error:
         logger.warning("webhooks wait for Redis: %s", type(error).__name__)
     except Exception:
-        logger.exception("an internal error: a message of the outbox is tried again")
+        logger.exception("an internal error: a message of the outbox is sent again")
     return None

@@ -71,7 +71,7 @@ def _entry(entry: str) -> Target:
     url = entry if "://" in entry else f"https://{entry}"
     target = target_of(url)
     if target is None or urlsplit(url).path:
-        raise TokensError(f"{entry[:80]!r} is no host for webhooks: host, host:port or http://host:port")
+        raise TokensError(f"{entry[:80]!r} is not a host for webhooks: host, host:port or http://host:port")
     return target
 
 
@@ -114,7 +114,10 @@ def read_secrets(entries: Iterable[str]) -> Secrets:
     for entry in entries:
         caller, _, text = entry.partition(":")
         if not CALLER_NAME.fullmatch(caller):
-            raise TokensError(f"an entry of a webhook secret begins with no caller's name; without tokens: {ANONYMOUS}")
+            raise TokensError(
+                f"an entry of a webhook secret does not begin with the name of a caller; without tokens "
+                f"write {ANONYMOUS}"
+            )
         secrets.setdefault(caller, []).append(_key(caller, text))
     return secrets
 
@@ -125,7 +128,7 @@ def _key(caller: str, text: str) -> bytes:
     except binascii.Error:
         key = b""
     if not _MIN_KEY_BYTES <= len(key) <= _MAX_KEY_BYTES:
-        raise TokensError(f"the webhook secret of {caller} is not whsec_ and the base64 of 24 to 64 bytes")
+        raise TokensError(f"the webhook secret of {caller} is not whsec_ followed by the base64 of 24 to 64 bytes")
     return key
 
 
@@ -158,9 +161,9 @@ class Webhooks:
         if url is None:
             return
         if not self.allowed.allows(url):
-            raise Problem("WEBHOOK_NOT_ALLOWED", errors=[{"pointer": _POINTER, "detail": "no host that is allowed"}])
+            raise Problem("WEBHOOK_NOT_ALLOWED", errors=[{"pointer": _POINTER, "detail": "the host is not allowed"}])
         if caller not in self.secrets:
-            fault = {"pointer": _POINTER, "detail": "the service has no secret of yours to sign with"}
+            fault = {"pointer": _POINTER, "detail": "the service has no secret to sign your messages"}
             raise Problem("WEBHOOK_NOT_ALLOWED", errors=[fault])
 
     def deliveries(self, record: JobRecord) -> list[Delivery]:

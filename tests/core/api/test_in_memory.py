@@ -129,7 +129,7 @@ def test_a_function_is_a_field(function: Callable[[Tensor], Any], sign: int) -> 
         (lambda: regnf.from_function(lambda _: 1 / 0, CUBE), "FUNCTION_UNUSABLE", "ZeroDivisionError"),
         (lambda: regnf.from_function(lambda _: None, CUBE), "FUNCTION_UNUSABLE", "NoneType"),
         (lambda: regnf.from_function(lambda p: p, CUBE), "FUNCTION_UNUSABLE", "shape"),
-        (lambda: regnf.from_function(lambda p: p[:, 0] * np.nan, CUBE), "FIELD_NOT_FINITE", "finite"),
+        (lambda: regnf.from_function(lambda p: p[:, 0] * np.nan, CUBE), "FIELD_NOT_FINITE", "NaN or infinity"),
         (lambda: regnf.from_function(lambda p: p.norm(dim=1) + 1, CUBE), "NO_ZERO_LEVEL", "bounds"),
         (lambda: regnf.from_function(lambda p: p[:, 0], CUBE[::-1]), "BOUNDS_INVALID", "corners"),
         (lambda: regnf.from_function(3, CUBE), "FUNCTION_UNUSABLE", "called"),  # type: ignore[arg-type]

@@ -1,4 +1,5 @@
-"""A color never makes an import fail: what is not understood is left out, with a warning, and the geometry is kept."""
+"""A color never makes an import fail: what is not understood is left out, with a warning, and only the geometry is
+imported."""
 
 from __future__ import annotations
 
@@ -79,7 +80,7 @@ def test_a_checkpoint_without_color_is_nothing_to_warn_of() -> None:
 def test_an_appearance_of_which_nothing_is_said_is_told() -> None:
     (warning,) = whole().warnings
     assert warning.startswith("COLOR_ASSUMED: ")
-    assert "color.average_appearance true" in warning  # what to say
+    assert "color.average_appearance: true" in warning  # what to say
     for said in (True, False):
         assert convert(checkpoint(), **LAYOUT, color={"average_appearance": said}).warnings == ()
     assert convert(checkpoint(), **LAYOUT, color={"keep": False}).warnings == ()

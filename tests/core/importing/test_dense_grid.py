@@ -154,7 +154,7 @@ def test_nodes_without_weight_are_free_space_beyond_what_was_seen(tmp_path: Path
     weights[:, :, :4] = 0.0
     values = np.where(weights > 0, outward * BALL, 7.0)
     report = converted(tmp_path, {"sign": outward}, sdf=values, weight=weights, origin=LOW, spacing=SPACING)
-    assert any("of the nodes were seen" in why for why in report["why"])
+    assert any("of the nodes were observed" in why for why in report["why"])
     seen_low = LOW + np.array([0.0, 0.0, 4 * SPACING[2]])
     deep = torch.tensor(seen_low - np.array([0.0, 0.0, 3 * SPACING[2]])).float()
     corner = float(np.linalg.norm(seen_low) - 0.5)

@@ -37,7 +37,7 @@ def test_a_random_network_without_settings_is_never_guessed_at(family: str, tmp_
     """It is no distance: its behavior says nothing. The message has what to say."""
     found = judged(case := case_of(family, 1), case.beside, tmp_path)
     assert found.refused == "LAYOUT_AMBIGUOUS"
-    assert "to the description" in found.detail
+    assert "to the import options" in found.detail
     assert any(name in found.detail for name in case.said)
 
 

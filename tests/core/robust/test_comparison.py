@@ -50,7 +50,7 @@ def test_a_block_more_or_less_is_told_by_its_surface(there: AnalyticField) -> No
 
 
 def test_the_deciding_surface_is_told_where_it_stands_and_whose_it_is() -> None:
-    """Of a field far from the origin and twice as large: the block alone is another's, and the scene is free there."""
+    """Of a field far from the origin and twice as large: the block alone is another's, and free space in the scene."""
     grown = OrientedBox(torch.tensor([5.0, 0.0, 0.0]).double(), 2.0 * BOX.size, torch.eye(3).double())
     T = Sim3(torch.tensor(0.5).double(), torch.eye(3).double(), torch.tensor([-2.5, 0.0, 0.0]).double())
     bounds = [[3.0, -2.0, -2.0], [7.0, 2.0, 2.0]]

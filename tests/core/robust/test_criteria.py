@@ -126,8 +126,8 @@ def test_the_level_of_a_probability_is_the_strictest_that_it_reaches() -> None:
 @pytest.mark.parametrize(
     ("probability", "least", "said"),
     [
-        (0.6411, 0.7, "probability 0.641, at least 0.7 is needed"),
-        (0.69996, 0.7, "probability 0.69996, at least 0.7 is needed"),  # and not "0.7, at least 0.7"
+        (0.6411, 0.7, "probability 0.641, at least 0.7 is required"),
+        (0.69996, 0.7, "probability 0.69996, at least 0.7 is required"),  # and not "0.7, at least 0.7"
     ],
 )
 def test_a_rejection_says_the_number_and_its_limit(probability: float, least: float, said: str) -> None:
@@ -143,11 +143,11 @@ def test_a_pose_outside_of_the_detection_is_rejected_first() -> None:
 @pytest.mark.parametrize(
     ("evidence", "unexplained", "reason", "said"),
     [
-        (HIDDEN, 0.0, "TOO_LITTLE_SURFACE", "hidden share 0.95, usual is 0.9 or less"),
-        (FREE, 0.0, "FREE_SPACE_VIOLATED", "share in free space 0.3, usual is 0.2 or less"),
-        (HALF, 0.0, "LOW_OVERLAP", "scene inliers 0.5, usual is 0.6 or more"),
-        (ALIKE, 0.3, "SURFACE_UNEXPLAINED", "unexplained share 0.3, usual is 0.1 or less"),
-        (AMONG, 0.0, "SCENE_UNEXPLAINED", "explained share 0.333, usual is 0.4 or more"),
+        (HIDDEN, 0.0, "TOO_LITTLE_SURFACE", "hidden share 0.95, usually 0.9 or less"),
+        (FREE, 0.0, "FREE_SPACE_VIOLATED", "share in free space 0.3, usually 0.2 or less"),
+        (HALF, 0.0, "LOW_OVERLAP", "scene inliers 0.5, usually 0.6 or more"),
+        (ALIKE, 0.3, "SURFACE_UNEXPLAINED", "unexplained share 0.3, usually 0.1 or less"),
+        (AMONG, 0.0, "SCENE_UNEXPLAINED", "explained share 0.333, usually 0.4 or more"),
         (ALIKE, 0.0, "LOW_PROBABILITY", ""),
     ],
 )  # fmt: skip
@@ -156,7 +156,7 @@ def test_the_shares_say_why_a_pose_is_rejected_and_decide_nothing(
 ) -> None:
     rejected = verdict_on(evidence, 0.5, unexplained)
     assert (rejected.verdict, rejected.reason) == ("rejected", reason)
-    assert rejected.broken.removeprefix("probability 0.5, at least 0.8 is needed").removeprefix("; ") == said
+    assert rejected.broken.removeprefix("probability 0.5, at least 0.8 is required").removeprefix("; ") == said
     assert verdict_on(evidence, 1.0, unexplained).verdict == "registered"
 
 

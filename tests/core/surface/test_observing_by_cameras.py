@@ -177,12 +177,12 @@ def as_w_first(poses: Array) -> Array:
 HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 FORWARD_X = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 MISREAD: dict[str, tuple[Axes, Callable[[Array], Array], str]] = {
-    "OpenGL": ("opencv", lambda T: T @ HALF_TURN, "against z.*say --camera-axes opengl"),
-    "OpenCV": ("opengl", lambda T: T, "along z.*say --camera-axes opencv"),
+    "OpenGL": ("opencv", lambda T: T @ HALF_TURN, "against z.*give --camera-axes opengl"),
+    "OpenCV": ("opengl", lambda T: T, "along z.*give --camera-axes opencv"),
     "inverted": ("opencv", np.linalg.inv, "world to the camera: invert the matrices"),
     "inverted, OpenGL": ("opengl", lambda T: np.linalg.inv(T @ HALF_TURN), "world to the camera: invert the matrices"),
-    "inverted, OpenGL read as OpenCV": ("opencv", lambda T: np.linalg.inv(T @ HALF_TURN), "invert.*and say --camera"),
-    "a body": ("opencv", lambda T: T @ FORWARD_X, "along x .*turn the cameras' axes"),
+    "inverted, OpenGL read as OpenCV": ("opencv", lambda T: np.linalg.inv(T @ HALF_TURN), "invert.*and give --camera"),
+    "a body": ("opencv", lambda T: T @ FORWARD_X, "along x .*rotate the axes of the cameras"),
 }
 
 
@@ -203,7 +203,7 @@ def test_the_convention_that_the_field_agrees_with_is_named(name: str) -> None:
 
 def test_quaternions_in_another_order_are_tried() -> None:
     right, read = walk(9), trajectory(walk(9), "opencv", as_w_first)
-    mended = dict(others(read))["quaternions written w first: write quaternions as x y z w"]
+    mended = dict(others(read))["quaternions with w first: write quaternions as x y z w"]
     torch.testing.assert_close(mended.axes, right.axes, atol=1e-9, rtol=0.0)
 
 

@@ -193,8 +193,8 @@ def test_a_search_shows_where_its_first_two_candidates_differ(chair_run: ChairRu
 @pytest.mark.parametrize(
     ("states", "apart", "said"),
     [
-        ([0, 1, 1, 2], True, "Of what was seen, 67 % speaks for the first."),
-        ([0, 1, 1, 2], False, "Too little of it was seen to tell the two apart."),
+        ([0, 1, 1, 2], True, "67 % of the observed difference supports the first."),
+        ([0, 1, 1, 2], False, "Too little of the difference was observed to distinguish the two."),
     ],
 )
 def test_a_part_that_is_there_speaks_for_its_owner_else_for_the_other(

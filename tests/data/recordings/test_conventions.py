@@ -68,8 +68,8 @@ ROW = r"^(1\d\d\.\d+) (\S+ \S+ \S+) (\S+) (\S+) (\S+) (\S+)$"
 WRONG: dict[str, tuple[str, Callable[[], Truth], Callable[[Path], None], str]] = {
     "OpenGL's axes": ("7scenes", lambda: posed(lambda T: T @ OPENGL), nothing, "--camera-axes opengl"),
     "OpenCV's axes": ("nerfstudio", lambda: posed(lambda T: T @ OPENGL), nothing, "--camera-axes opencv"),
-    "world to camera": ("redwood", lambda: posed(np.linalg.inv), nothing, "Invert.*must lead from the camera to"),
-    "camera to world": ("bop", lambda: posed(np.linalg.inv), nothing, "cam_R_w2c.*must lead from the world to"),
+    "world to camera": ("redwood", lambda: posed(np.linalg.inv), nothing, "Invert.*must map from the camera to"),
+    "camera to world": ("bop", lambda: posed(np.linalg.inv), nothing, "cam_R_w2c.*must map from the world to"),
     "inverse and OpenGL": (
         "scannet", lambda: posed(lambda T: np.linalg.inv(T @ OPENGL)), nothing, "pose/.*--camera-axes opengl"),
     "along rays": ("replica", lambda: deep(lambda d: d * lengths()), nothing, "divide each by the length of its ray"),
@@ -81,11 +81,13 @@ WRONG: dict[str, tuple[str, Callable[[], Truth], Callable[[Path], None], str]] =
                            "camera-intrinsics.txt in pixels"),
     "poses in millimeters": ("7scenes", lambda: posed(lambda T: T * (1.0 + 999.0 * AT)), nothing,
                              "or divide the poses"),
-    "poses in reverse": ("scannet", lambda: posed(lambda T: T[::-1]), nothing, "own pose in pose/"),
+    "poses in reverse": ("scannet", lambda: posed(lambda T: T[::-1]), nothing, "correct pose in pose/"),
     "w first": ("tum", truth, edit("groundtruth.txt", ROW, r"\1 \2 \6 \3 \4 \5"), "quaternions of groundtruth.txt"),
-    "poses one off": ("redwood", lambda: posed(lambda T: np.roll(T, 1, axis=0)), nothing, "own pose in the trajectory"),
+    "poses one off": (
+        "redwood", lambda: posed(lambda T: np.roll(T, 1, axis=0)), nothing, "correct pose in the trajectory"),
     "order of text": (
-        "replica", lambda: posed(lambda T: T[[0, 1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9]]), nothing, "own pose in traj.txt"),
+        "replica", lambda: posed(lambda T: T[[0, 1, 10, 11, 2, 3, 4, 5, 6, 7, 8, 9]]), nothing,
+        "correct pose in traj.txt"),
 }  # fmt: skip
 
 
@@ -147,8 +149,8 @@ def test_intrinsics_are_of_the_images_whose_middle_they_have(of: str, tmp_path: 
 def test_intrinsics_of_another_resolution_are_refused_for_one_frame(tmp_path: Path) -> None:
     writers.depth_png(tmp_path / "depth.png", truth().depths[0], 1000.0)
     for values, said in (
-        ({"fx": 140, "fy": 144, "cx": 78.5, "cy": 62.5}, "intrinsics those of another resolution"),
-        ({"fx": 70, "fy": 72, "cx": 31, "cy": 39, "width": HEIGHT, "height": WIDTH}, "width and height exchanged"),
+        ({"fx": 140, "fy": 144, "cx": 78.5, "cy": 62.5}, "intrinsics are for another resolution"),
+        ({"fx": 70, "fy": 72, "cx": 31, "cy": 39, "width": HEIGHT, "height": WIDTH}, "width and height are swapped"),
         ({"K": K.T.tolist()}, "transposed"),
         ({"K": [[70, 0, 39], [0, 72, 31], [0, 0, 0]]}, "not a camera matrix"),
         ({"fx": float("nan"), "fy": 72, "cx": 39, "cy": 31}, "not finite"),

@@ -132,7 +132,7 @@ def test_a_detection_of_other_pixels_is_that_thing(kind: str) -> None:
 
 def test_a_mask_that_is_inverted_is_refused() -> None:
     frame, shown = ball_image()
-    with pytest.raises(InvalidDetectionError, match="is it inverted"):
+    with pytest.raises(InvalidDetectionError, match="whether it is inverted"):
         lift(frame, ImageDetection(mask=~shown))
 
 
@@ -169,7 +169,7 @@ def test_a_box_is_read_however_it_is_written(given: Any) -> None:
 
 def test_of_several_detections_one_is_chosen() -> None:
     listed = [{"name": "cup", "bbox": [0, 0, 5, 5]}, {"name": "bowl", "bbox": [10, 20, 20, 40]}]
-    with pytest.raises(InvalidDetectionError, match=r"2 detections are listed: say which \(0: cup, 1: bowl\)"):
+    with pytest.raises(InvalidDetectionError, match=r"there are 2 detections; choose one \(0: cup, 1: bowl\)"):
         read_image_detections(listed)
     assert read_image_detections(listed, index=1)[0].label == "bowl"
 
@@ -180,7 +180,7 @@ def test_of_several_detections_one_is_chosen() -> None:
         ({"box_2d": [30, 20, 10, 60]}, "no area"),
         ({"box_2d": [1, 2, 3]}, "not 4 finite numbers"),
         ({"point_2d": ["a", 2]}, "not 2 finite numbers"),
-        ({"label": "cup"}, "has a mask, a box_2d or a point_2d"),
+        ({"label": "cup"}, "needs a mask, a box_2d or a point_2d"),
     ],
 )
 def test_what_is_wrong_is_said(given: Any, said: str) -> None:
@@ -192,7 +192,7 @@ def test_what_is_wrong_is_said(given: Any, said: str) -> None:
     ("mask", "said"),
     [
         ({"size": [3, 4], "counts": [4, 2]}, "runs have 6 pixels, its size 4 x 3"),
-        ("no such file", "no file, no image"),
+        ("no such file", "not a file, not a base64 image"),
         (np.zeros((3, 4, 3)), r"shape \(3, 4, 3\)"),
     ],
 )
@@ -232,8 +232,8 @@ def test_a_thing_is_lifted_to_its_box(kind: str) -> None:
     [
         (ImageDetection(mask=np.zeros((H, W), np.bool_)), "frame 0: the mask is empty"),
         (ImageDetection(mask=np.ones((9, 9), np.bool_)), "frame 0: the mask has 9 x 9 pixels, not 160 x 120"),
-        (ImageDetection(box_2d=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box lies outside the image"),
-        (ImageDetection(point_2d=(-1.0, 5.0)), "frame 0: the point .* lies outside the image"),
+        (ImageDetection(box_2d=(500.0, 0.0, 600.0, 50.0)), "frame 0: the box is outside the image"),
+        (ImageDetection(point_2d=(-1.0, 5.0)), "frame 0: the point .* is outside the image"),
     ],
 )
 def test_a_detection_beside_the_image_is_refused(detection: ImageDetection, said: str) -> None:

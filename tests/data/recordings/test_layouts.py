@@ -141,7 +141,7 @@ def test_depths_of_openexr(compression: int, tmp_path: Path) -> None:
 def test_a_folder_of_recordings_names_them(tmp_path: Path) -> None:
     for scene in ("000001", "000002"):
         writers.bop(tmp_path / "test" / scene, truth())
-    with pytest.raises(DatasetError, match="holds 2: give one of test/000001, test/000002") as found:
+    with pytest.raises(DatasetError, match="contains 2: give one of test/000001, test/000002") as found:
         open_recording(tmp_path)
     assert found.value.reason == "DATASET_NOT_RECOGNIZED"
 

@@ -85,7 +85,7 @@ WRONG: dict[str, tuple[Callable[[PosedImages], PosedImages], str]] = {
     "OpenGL": (with_poses(lambda T: T @ OPENGL), "--camera-axes opengl"),
     "inverted": (with_poses(np.linalg.inv), "Invert the matrices"),
     "inverted OpenGL": (with_poses(lambda T: np.linalg.inv(T @ OPENGL)), "Invert the matrices.*--camera-axes opengl"),
-    "a robot's body": (with_poses(lambda T: T @ BODY), "columns of a pose to the world are the camera's right"),
+    "a robot's body": (with_poses(lambda T: T @ BODY), "the columns of a camera-to-world pose are the camera's right"),
     "along rays": (with_depths(lambda depths: depths * LENGTHS), "divide each by the length of its ray"),
     "millimeters": (with_depths(lambda depths: 1000.0 * depths), "by 0.001"),
     "5000 for 1000": (with_depths(lambda depths: 5.0 * depths), "by 0.2"),
@@ -94,10 +94,10 @@ WRONG: dict[str, tuple[Callable[[PosedImages], PosedImages], str]] = {
     "disparity": (with_depths(lambda depths: 20.0 / depths), "Write depths"),
     "half the size": (lambda images: replace(images, intrinsics=images.intrinsics * [[0.5], [0.5], [1.0]]), "pixels"),
     "turned": (lambda images: replace(images, intrinsics=images.intrinsics[:, [1, 0, 2]][:, :, [1, 0, 2]]), "pixels"),
-    "reversed": (with_poses(lambda T: T[::-1]), "each image its own pose"),
-    "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each image its own pose"),
-    "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions of the poses anew"),
-    "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions of the poses anew"),
+    "reversed": (with_poses(lambda T: T[::-1]), "each image its correct pose"),
+    "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each image its correct pose"),
+    "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions of the poses in the expected order"),
+    "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions of the poses in the expected order"),
     "mirrored": (with_depths(lambda depths: depths[:, :, ::-1]), "Mirror the depth images"),
     "far from the origin": (with_poses(lambda T: T @ OPENGL + FAR), "opengl"),
 }  # fmt: skip
@@ -207,7 +207,7 @@ def test_masks_that_leave_nothing(tmp_path: Path) -> None:
     images = scenes.images()
     with pytest.raises(DatasetError, match="only 0 pixels") as caught:
         fuse_images(replace(images, masks=np.zeros(images.colors.shape[:3], bool)), tmp_path / "map.safetensors")
-    assert "the other way round" in str(caught.value.hint)
+    assert "whether these are inverted" in str(caught.value.hint)
 
 
 def test_an_empty_image_among_good_ones_is_passed_over(tmp_path: Path) -> None:

@@ -134,7 +134,7 @@ def test_a_part_that_is_inside_out_is_matter(tmp_path: Path) -> None:
     found = mesh_target(written(tmp_path, TOP, leg), extent=1.0)
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.45], [0.3, 0.3, 0.0]])
     np.testing.assert_allclose(found.field.signed_distance(places), [-0.1, -0.05, 0.2 * 2**0.5], atol=1e-6)
-    assert any("turned round" in done for done in found.source["mesh_faces"])
+    assert any("flipped" in done for done in found.source["mesh_faces"])
 
 
 def test_nothing_is_said_of_faces_that_stay(tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""Color networks of the families' checkpoints, made ready for a safe field. One module a trainer."""
+"""Color networks of the families' checkpoints, made ready for a regnf field file. One module a trainer."""

@@ -52,9 +52,11 @@ class ColorNetwork:
         """
         weight, bias = last
         if weight.shape[0] != self.features.shape[1]:
-            raise tensor_error(f"the color sees {self.features.shape[1]} features of {weight.shape[0]}", "TENSOR_SHAPE")
+            raise tensor_error(
+                f"the color network uses {self.features.shape[1]} of {weight.shape[0]} features", "TENSOR_SHAPE"
+            )
         if self.features.shape[0] * weight.size > _MOST_PRODUCTS:
-            raise tensor_error("the color's first layer is too large", "TENSOR_TOO_LARGE")
+            raise tensor_error("the first layer of the color network is too large", "TENSOR_TOO_LARGE")
         features = self.features.astype(np.float64)
         first = np.concatenate((self.own, features @ weight.astype(np.float64)), axis=1)
         moved = self.layers[0][1] + features @ bias.astype(np.float64)
@@ -63,7 +65,7 @@ class ColorNetwork:
         named = {f"layers.{i}.weight": pair[0] for i, pair in enumerate(layers)}
         named |= {f"layers.{i}.bias": pair[1] for i, pair in enumerate(layers)}
         if not all(np.isfinite(array).all() for array in named.values()):
-            raise tensor_error("the color's first layer is not finite", "TENSOR_NOT_FINITE")
+            raise tensor_error("the first layer of the color network has NaN or infinity", "TENSOR_NOT_FINITE")
         return color_tensors(named)
 
 
@@ -108,14 +110,16 @@ def with_color(converted: ConvertedField, read: Callable[[], ReadColor], hidden_
     layers = sum(name.endswith(".weight") for name in tensors)
     return replace(
         _added(converted, {COLOR: asdict(form)}, _scaled(form.own_width, tensors, hidden_factor)),
-        why=(*converted.why, f"color: a network of {layers} layers, kept beside the geometry"),
+        why=(*converted.why, f"color: a network of {layers} layers, stored with the geometry"),
     )
 
 
 def without_color(converted: ConvertedField, keys: Sequence[str], family: str) -> ConvertedField:
     """``converted`` with the warning COLOR_LEFT_OUT, if the file has a color that is not read, under ``keys``."""
     return (
-        _warned(converted, f"{keys[0]}: colors of {family} are not read; the geometry is kept") if keys else converted
+        _warned(converted, f"{keys[0]}: colors of {family} are not read; only the geometry is imported")
+        if keys
+        else converted
     )
 
 
@@ -140,7 +144,7 @@ def with_values(converted: ConvertedField, read: Callable[[], StoredArray | None
     if values is None:
         return converted
     colored = _added(converted, {COLOR: asdict(ValueColor("values"))}, color_tensors({VALUES: values}))
-    return replace(colored, why=(*converted.why, "colors are kept"))
+    return replace(colored, why=(*converted.why, "colors are imported"))
 
 
 def with_deviation(
@@ -194,9 +198,9 @@ def degree_of(columns: int, said: int | None = None) -> int:
     """
     degree, rest = divmod(columns - 3, 6)
     understood(
-        rest == 0 and 0 <= degree <= MAX_DEGREE, f"{columns} columns for the direction, expected 3 + 6 a frequency"
+        rest == 0 and 0 <= degree <= MAX_DEGREE, f"{columns} columns for the direction, expected 3 + 6 per frequency"
     )
-    understood(said in (None, degree), f"{degree} frequencies of the direction, the description says {said}")
+    understood(said in (None, degree), f"{degree} frequencies of the direction, the import options have {said}")
     return degree
 
 

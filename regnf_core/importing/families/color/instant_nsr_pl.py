@@ -60,7 +60,9 @@ def read_color(
             degree**2 == direction and 1 <= degree <= _DEGREE,
             f"{direction} columns for the direction, expected those of spherical harmonics",
         )
-        understood(overrides.direction_degree in (None, degree), "the direction's degree is not the description's")
+        understood(
+            overrides.direction_degree in (None, degree), "the direction's degree differs from the import option"
+        )
         encoding = DirectionEncoding("spherical_harmonics", degree)
         form = NetworkColor("network", position=False, direction=encoding, gradient="unit")
     network = ColorNetwork(form, first[:, features:], first[:, :features], tuple(layers))
@@ -77,7 +79,9 @@ def _flat_layers(flat: Float32Array, inputs: int, said: int | None) -> list[Pair
         if rest == 0 and 0 <= hidden < _MOST_HIDDEN:
             fitting.append((width, hidden))
     if len(fitting) != 1:
-        message = f"{flat.size} numbers of a fully fused network that sees {inputs}, of {len(fitting)} possible widths"
+        message = (
+            f"{flat.size} numbers of a fully fused network with {inputs} inputs; {len(fitting)} widths are possible"
+        )
         raise tensor_error(message, "TENSOR_SHAPE")
     ((width, hidden),) = fitting
     shapes = [(width, columns), *[(width, width)] * hidden, (_BLOCK, width)]

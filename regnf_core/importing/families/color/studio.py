@@ -69,8 +69,8 @@ def assumed_of(state: Mapping[str, Any], overrides: ColorOverrides) -> str | Non
     if _EMBEDDING not in state or overrides.average_appearance is not None:
         return None
     return (
-        "the images' appearance is taken to be zeros (use_average_appearance_embedding false). If the trainer evaluates"
-        " with their mean, say color.average_appearance true, or add its settings"
+        "the appearance embedding is assumed to be zero (use_average_appearance_embedding false). If the trainer "
+        "uses the mean, give the import option color.average_appearance: true, or the trainer's config file"
     )
 
 

@@ -1,1 +1,1 @@
-"""Which of the trainers' settings the gate knows, and what their keys mean, by the kind of network."""
+"""Which of the trainers' settings the importer knows, and what their keys mean, by the kind of network."""

@@ -82,8 +82,9 @@ def _studio_schedule(keys: Keys, field: Keys, said: Said) -> None:
     opened = max(step // _STEPS_A_LEVEL + 1, model.whole("level_init") or 0)
     if opened < levels:
         said.warnings.append(
-            f"LEVEL_MASK_ASSUMED: by step {step} training had opened {opened} of {levels} levels; the trainer evaluates"
-            f" all of them after loading, and so does the field; say level_mask {opened} for the other"
+            f"LEVEL_MASK_ASSUMED: at step {step} the training used {opened} of {levels} levels; the trainer "
+            f"evaluates all of them after loading, and so does the field; to use only those, give the "
+            f"import option level_mask: {opened}"
         )
 
 

@@ -61,7 +61,7 @@ def neus(keys: Keys, said: Said) -> None:
     if arrays is not None:
         frame = arrays.numbers("scale_mat_0")
         if frame.ndim != 2:
-            raise FieldFormatError(f"{name}: scale_mat_0 is no matrix", reason="SETTINGS_MALFORMED")
+            raise FieldFormatError(f"{name}: scale_mat_0 is not a matrix", reason="SETTINGS_MALFORMED")
         if is_similarity(frame.tolist()):
             said.values["dataset_transform"] = frame.tolist()
             said.used.setdefault(name, []).append("scale_mat_0")

@@ -47,9 +47,9 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
     response_model=BatchDocument,
     status_code=202,
     responses={
-        200: {"description": "None of its jobs waits or runs.", "links": BATCH_LINKS},
+        200: {"description": "All jobs of the batch have ended.", "links": BATCH_LINKS},
         202: {
-            "description": "Its jobs wait or run.",
+            "description": "Jobs of the batch are waiting or running.",
             "headers": {"Location": header("The batch.")},
             "links": BATCH_LINKS,
         },
@@ -61,12 +61,12 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
     openapi_extra={"requestBody": {"required": True, "content": {MEDIA_TYPE: _BODY}}},
 )
 async def post_batch(request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:
-    """JSON Lines: on each line what `POST /register` takes, with a `key` of your own if you like.
+    """JSON Lines: each line is a body of `POST /register`, with an optional `key` of your own.
 
-    Each line becomes a job as with `POST /register`; one that is no request is told among `errors`, and refuses no
-    other. Where the new jobs do not fit into your quota or the queue, nothing is started: `new_jobs` says how many they
-    are, `fitting_lines` how many of the first lines would fit. The same lines are the same batch: posted again, jobs
-    that failed or were cancelled start anew, and nothing is done twice.
+    Each line becomes a job, as with `POST /register`. An invalid line is listed in `errors` and does not affect the
+    other lines. If the new jobs exceed your quota or the queue, no job is started: `new_jobs` has their number, and
+    `fitting_lines` the number of first lines that would fit. The same lines are the same batch. If they are posted
+    again, jobs that failed or were canceled are started again, and no other work is repeated.
     """
     if body.media_type(request) != MEDIA_TYPE:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send JSON Lines as {MEDIA_TYPE}.")
@@ -104,7 +104,7 @@ def _answer(services: Services, batch: Batch, prefix: str, status: int = 200) ->
 
 @router.get(
     "/batches",
-    summary="Batches, those posted last first",
+    summary="Batches, newest first",
     response_model=BatchPage,
     responses=refusals("INVALID_QUERY"),
 )
@@ -116,7 +116,7 @@ def list_batches(
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
 ) -> Response:
-    """A page may be short and not be the last: go on while there is a `next_page_token`."""
+    """A page may be short although more pages follow. Continue while there is a `next_page_token`."""
     page = services.batches.page(caller, limit, decode_token(page_token))
     documents = [summary_of(one, services.settings.job_retention_s, prefix) for one in page.records]
     return JSONResponse({"batches": documents, "next_page_token": encode_token(page.rest)})
@@ -135,7 +135,7 @@ async def get_batch(
     prefix: PrefixDep,
     wait: WaitQuery = 0,
 ) -> Response:
-    """With `wait`, the answer comes once none of its jobs waits or runs."""
+    """With `wait`, the response is sent when all jobs of the batch have ended."""
     batch = await in_thread(find_batch, services, caller, id)
     if wait:
         look = services.records.active_among
@@ -145,15 +145,15 @@ async def get_batch(
 
 @router.get(
     "/batches/{id}/results",
-    summary="A batch's results, as far as they are there",
+    summary="The results of a batch that are available",
     response_class=Response,
     responses={
         200: {
-            "description": "JSON Lines, in the order of the pairs, up to the first that has not ended.",
+            "description": "JSON Lines in the order of the pairs, up to the first pair that has not ended.",
             "content": {MEDIA_TYPE: {**BINARY, "x-line-schema": reference(BatchResult)}},
             "headers": {
-                "Batch-After": header("`after` of the next call."),
-                "Batch-Left": header("How many pairs follow: 0 on the last page."),
+                "Batch-After": header("The value of `after` for the next call."),
+                "Batch-Left": header("Number of pairs after this page; 0 on the last page."),
             },
         },
         **refusals("INVALID_QUERY", "BATCH_NOT_FOUND"),
@@ -163,14 +163,19 @@ async def batch_results(
     id: str,  # noqa: A002
     services: ServicesDep,
     caller: CallerDep,
-    after: Annotated[int, Query(ge=0, le=_MOST_LINES, description="`number` of the last result that you have.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=_MOST_LINES, description="How many lines at most.")] = _MOST_LINES,
-    status: Annotated[ResultStatus | None, Query(description="Only pairs that have ended so.")] = None,
+    after: Annotated[
+        int, Query(ge=0, le=_MOST_LINES, description="The `number` of the last result that you have.")
+    ] = 0,
+    limit: Annotated[
+        int, Query(ge=1, le=_MOST_LINES, description="Largest number of lines in the response.")
+    ] = _MOST_LINES,
+    status: Annotated[ResultStatus | None, Query(description="Only pairs with this outcome.")] = None,
     wait: WaitQuery = 0,
 ) -> Response:
-    """A line each. A page has some hundreds of lines, or a mebibyte: go on with `Batch-After` until `Batch-Left` is 0.
+    """One line per result. A page has at most some hundreds of lines, or 1 MiB. Get the next page with `Batch-After`
+    until `Batch-Left` is 0.
 
-    With `wait`, the answer comes once the pair behind `after` has ended.
+    With `wait`, the response is sent when the pair after `after` has ended.
     """
     batch = await in_thread(find_batch, services, caller, id)
     if wait:
@@ -183,18 +188,18 @@ async def batch_results(
 
 @router.post(
     "/batches/{id}/cancel",
-    summary="Stop a batch",
+    summary="Cancel a batch",
     response_model=BatchDocument,
     status_code=202,
     responses={
-        200: {"description": "None of its jobs waits or runs.", "model": BatchDocument},
+        200: {"description": "All jobs of the batch have ended.", "model": BatchDocument},
         **refusals("BATCH_NOT_FOUND"),
     },
 )
 @blocking
 def cancel_batch(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:  # noqa: A002
-    """The jobs that it has started and that wait or run are cancelled; waiting ones end at once, running ones within
-    seconds. Jobs that it found, started by another request, go on. What is done stays."""
+    """Cancels all jobs that the batch started and that have not ended. Waiting jobs end at once, running jobs within
+    seconds. Jobs that another request started continue. Results are kept."""
     batch = find_batch(services, caller, id)
     cancelled = cancel(services, batch)
     answer = _answer(services, batch, prefix)
@@ -204,13 +209,13 @@ def cancel_batch(id: str, services: ServicesDep, caller: CallerDep, prefix: Pref
 
 @router.delete(
     "/batches/{id}",
-    summary="Forget a batch",
+    summary="Delete a batch",
     status_code=204,
     response_class=Response,
     responses=refusals("BATCH_NOT_FOUND"),
 )
 @blocking
 def delete_batch(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
-    """Its jobs stay, and go on: cancel it first if they shall not."""
+    """The jobs of the batch are kept and continue. Cancel the batch first to stop them."""
     services.batches.delete(caller, find_batch(services, caller, id).id)
     return Response(status_code=204)

@@ -19,7 +19,7 @@ from regnf_service.services import Services
 router = APIRouter(tags=["service"])
 _FIELDS = {"scene": "mix-room.safetensors", "object": "armchair.safetensors"}
 _DETECTION = "detection.json"
-_NO_DEMO = "This service offers no demo: `regnf serve` does. Upload fields of your own."
+_NO_DEMO = "This service has no demo files. `regnf serve` has them. Upload your own fields."
 
 
 def _folder(services: Services) -> Path:
@@ -29,10 +29,11 @@ def _folder(services: Services) -> Path:
     return folder
 
 
-@router.get("/demo", summary="Fields to try", response_model=DemoDocument, responses=refusals("NOT_FOUND"))
+@router.get("/demo", summary="Example fields", response_model=DemoDocument, responses=refusals("NOT_FOUND"))
 @blocking
 def get_demo(services: ServicesDep, prefix: PrefixDep) -> JSONResponse:
-    """The addresses of two field files, to fetch and to upload, and a detection of the object in the scene."""
+    """The addresses of two field files, which you can download and upload, and a detection of the object in the
+    scene."""
     folder = _folder(services)
     files: dict[str, Any] = {
         part: {"name": name, "bytes": (folder / name).stat().st_size, "address": f"{prefix}/demo/{name}"}
@@ -44,7 +45,7 @@ def get_demo(services: ServicesDep, prefix: PrefixDep) -> JSONResponse:
 @get_and_head(
     router,
     "/demo/{name}",
-    summary="A field file to try",
+    summary="An example field file",
     response_class=FileResponse,
     responses={
         200: {"description": "The file.", "content": {"application/octet-stream": BINARY}},

@@ -28,7 +28,7 @@ def get_and_head(
         called = name or endpoint.__name__
         router.get(path, name=called, summary=summary, **how)(endpoint)
         alone = "head_" + called.removeprefix("get_")
-        router.head(path, name=alone, summary=f"{summary}: headers alone", operation_id=alone, **how)(endpoint)
+        router.head(path, name=alone, summary=f"{summary}: headers only", operation_id=alone, **how)(endpoint)
         return endpoint
 
     return declare
@@ -66,7 +66,7 @@ FIELD_LINKS = links("sha256", "/sha256", "get_field", "patch_field", "delete_fie
 JOB_LINKS = links("id", "/id", "get_job", "job_events", "cancel_job", "get_result", "delete_job", "view")
 BATCH_LINKS = links("id", "/id", "get_batch", "batch_results", "cancel_batch", "delete_batch")
 FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
-NOT_MODIFIED: dict[str, Any] = {"description": "Nothing has changed since one of the ETags given."}
+NOT_MODIFIED: dict[str, Any] = {"description": "The document still has one of the given ETags."}
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 UPLOAD_REFUSALS = (
     "INVALID_HEADER INVALID_DIGEST DIGEST_MISMATCH UPLOAD_INCOMPLETE UPLOAD_TOO_LARGE UNSUPPORTED_MEDIA_TYPE "

@@ -14,7 +14,7 @@ _CAMERA = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0], [0.
 
 REGISTER_EXAMPLES: dict[str, Any] = {
     "shortest": {
-        "summary": "An axis-aligned box by its corners; everything else at its default",
+        "summary": "An axis-aligned box given by its corners, default options",
         "value": _ASKED,
     },
     "oriented": {
@@ -34,7 +34,7 @@ REGISTER_EXAMPLES: dict[str, Any] = {
         },
     },
     "open3d": {
-        "summary": "A box as Open3D has it",
+        "summary": "A box in Open3D's form",
         "value": _ASKED
         | {
             "detection": {
@@ -45,20 +45,20 @@ REGISTER_EXAMPLES: dict[str, Any] = {
         },
     },
     "published": {
-        "summary": "The published method instead, with options of its own",
+        "summary": "The published method (preset `paper`), with options",
         "value": _ASKED
         | {"options": {"preset": "paper", "sampling": {"views": 8}, "optimization": {"iterations": 300}}},
     },
     "library search": {
-        "summary": "Which of these objects is it, and where?",
+        "summary": "Search: which of these objects is in the box, and where?",
         "value": {"scene": SCENE, "candidates": [OBJECT, OTHER], "detection": _BOX},
     },
     "warm start": {
-        "summary": "Where to look first, from an earlier result or a robot's odometry",
+        "summary": "With an initial guess, from an earlier result or a robot's odometry",
         "value": _ASKED | {"initial_transform": _WHERE},
     },
     "measured": {
-        "summary": "With the known transform: the metrics then hold the errors",
+        "summary": "With the true pose: the metrics then have the errors",
         "value": {
             "scene": SCENE,
             "object": OBJECT,
@@ -77,8 +77,8 @@ REGISTER_EXAMPLES: dict[str, Any] = {
 
 RENDER_EXAMPLES: dict[str, Any] = {
     "substitution": {
-        "summary": "The library object where the registered one stands, seen from all sides; instead of object and "
-        "transform an edit may name the `job` that found them",
+        "summary": "The library object in place of the registered one, seen from all sides. Instead of `object` and "
+        "transform, an edit may name the `job` that found them",
         "value": {
             "scene": SCENE,
             "edits": [{"kind": "substitution", "object": OBJECT, "T_object_scene": _WHERE}],
@@ -88,7 +88,8 @@ RENDER_EXAMPLES: dict[str, Any] = {
         },
     },
     "several edits": {
-        "summary": "One thing replaced, another one removed, from two places; the edited scene becomes a field",
+        "summary": "One object replaced and another one removed, seen from two positions. The edited scene becomes a "
+        "field",
         "value": {
             "scene": SCENE,
             "edits": [
@@ -103,8 +104,8 @@ RENDER_EXAMPLES: dict[str, Any] = {
             "outputs": ["color", "depth", "mesh", "field"],
         },
     },
-    "the scene alone": {
-        "summary": "As the cameras of a transforms.json saw it",
+    "scene only": {
+        "summary": "The scene without edits, seen by the cameras of a transforms.json",
         "value": {
             "scene": SCENE,
             "transforms": {

@@ -77,7 +77,7 @@ def require_field(services: Services, caller: str, sha256: str) -> FieldRecord:
 @get_and_head(
     router,
     "/fields/{sha256}",
-    summary="A field's state and what its import found",
+    summary="State of a field and report of its import",
     response_model=FieldDocument,
     responses=FIELD_ANSWERS,
 )
@@ -89,9 +89,11 @@ async def get_field(
     held: IfNoneMatchDep,
     wait: WaitQuery = 0,
 ) -> Response:
-    """With `wait`, the answer comes once the field is not `validating`; with `If-None-Match` too, at the first change.
+    """With `wait`, the response is sent when the field is not `validating`. With `If-None-Match` too, it is sent at the
+    first change.
 
-    200 for every field that is known, a rejected one included: its bytes were dropped, and may be sent again.
+    Every known field gives 200, also a rejected one. The file of a rejected field was deleted and can be uploaded
+    again.
     """
 
     def is_news(found: FieldRecord) -> bool:
@@ -117,9 +119,9 @@ async def get_field(
 async def get_field_preview(
     request: Request, sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep
 ) -> Response:
-    """The surface from two sides, and its section with lines of equal distance: orange is inside.
+    """The surface from two sides, and a section with lines of equal distance. Orange is inside.
 
-    Made once the field is ready, as the mesh is.
+    A worker makes it after the import, like the mesh.
     """
     record = await in_thread(require_field, services, caller, sha256)
     return await _view_answer(request, services, record, (PICTURE_NAME,), "image/png", held)
@@ -128,7 +130,7 @@ async def get_field_preview(
 @get_and_head(
     router,
     "/fields/{sha256}/mesh.glb",
-    summary="A field's surface as a mesh to look at",
+    summary="A field's surface as a mesh for display",
     response_class=Response,
     responses={
         200: {"description": "Triangles in the field's frame and unit.", "content": {"model/gltf-binary": BINARY}},
@@ -143,14 +145,14 @@ async def get_field_mesh(
     caller: CallerDep,
     held: IfNoneMatchDep,
     detail: Annotated[
-        Literal["fine", "coarse"], Query(description="At most 200,000 triangles, or at most 30,000.")
+        Literal["fine", "coarse"], Query(description="Level of detail: at most 200,000 triangles, or at most 30,000.")
     ] = "fine",
 ) -> Response:
-    """Made for people: flat where the field is a mesh, with vertex colors where the field has colors.
+    """The mesh is for display. It is flat-shaded if the field is a mesh, and has vertex colors if the field has colors.
 
-    A worker makes it once the field is ready and no work waits: until then `views` of the field is `pending`, and the
-    404 has `Retry-After`. A small surface has one mesh for both. A `.glb` of `POST /render` is made with the resolution
-    that you ask for.
+    A worker makes it when the field is ready and no job is waiting. Until then the field's `views` is `pending`, and
+    the 404 has `Retry-After`. A small surface has one mesh for both levels of detail. `POST /render` makes a `.glb`
+    with the resolution of the request.
     """
     record = await in_thread(require_field, services, caller, sha256)
     fine, coarse = MESH_NAMES
@@ -161,19 +163,19 @@ async def get_field_mesh(
 @get_and_head(
     router,
     "/fields/{sha256}/candidates/{number}.png",
-    summary="A picture of what a rejected field may be",
+    summary="A picture of one reading of an ambiguous file",
     response_class=Response,
     responses=_PICTURE_ANSWERS,
 )
 async def get_candidate_picture(
     request: Request,
     sha256: str,
-    number: Annotated[str, Path(description="Which candidate of the field's error, from 1.")],
+    number: Annotated[str, Path(description="Number of the candidate in the field's error, from 1.")],
     services: ServicesDep,
     caller: CallerDep,
     held: IfNoneMatchDep,
 ) -> Response:
-    """One of the `candidates` of a field's error, for as long as the upload is kept (`kept_until`)."""
+    """One of the `candidates` in the field's error. It is there while the upload is kept (`kept_until`)."""
     record = await in_thread(require_field, services, caller, sha256)
     if number not in _NUMBERS or not record.has_candidate_picture(int(number)):
         raise Problem("FIELD_VIEW_NOT_FOUND")
@@ -218,7 +220,7 @@ def list_fields(
     page_token: PageTokenQuery = None,
     label: Annotated[str | None, Query(max_length=200, description="Only fields with this label.")] = None,
 ) -> Response:
-    """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
+    """A page may be short or empty although more pages follow. Continue while there is a `next_page_token`.
 
     A browser gets a page, which needs no token.
     """
@@ -232,12 +234,12 @@ def list_fields(
 
 @router.patch(
     "/fields/{sha256}",
-    summary="Describe a field anew",
+    summary="Change a field's import options",
     response_model=FieldDocument,
     status_code=200,
     responses={
-        200: {"description": "The label alone has changed, or nothing.", "headers": {"ETag": header("For GET.")}},
-        202: {"description": "The kept bytes are imported anew.", "model": FieldDocument, "links": FIELD_LINKS},
+        200: {"description": "Only the label has changed, or nothing.", "headers": {"ETag": header("For GET.")}},
+        202: {"description": "The kept file is imported again.", "model": FieldDocument, "links": FIELD_LINKS},
         **refusals(
             "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
             "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST INVALID_DESCRIPTION FIELD_NOT_FOUND FIELD_VALIDATING FIELD_IN_USE "
@@ -249,10 +251,10 @@ def list_fields(
 async def patch_field(
     sha256: str, request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep
 ) -> JSONResponse:
-    """Answers a question of the import without a second upload, as long as the bytes are kept (`kept_until`).
+    """Changes the import options without a second upload, while the file is kept (`kept_until`).
 
-    Another description is another function of the same bytes. It is refused while an active job uses the field.
-    The body may also be sent as `application/merge-patch+json`.
+    Different import options can give a different field from the same file, so the call is refused while an active job
+    uses the field. The body may also be sent as `application/merge-patch+json`.
     """
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.")
@@ -297,16 +299,15 @@ def _merged(held: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any
 
 @router.delete(
     "/fields/{sha256}",
-    summary="Forget a field and its bytes",
+    summary="Delete a field and its file",
     status_code=204,
     response_class=Response,
     responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE", "FIELD_IN_LIBRARY"),
 )
 @blocking
 def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
-    """Refused while an active job needs the field, or the library has it. Results of finished jobs stay.
-
-    Pieces of an upload go too.
+    """The call is refused while an active job needs the field, or while it is in the library. Results of finished jobs
+    are kept. The pieces of an unfinished upload are deleted too.
     """
     if is_sha256(sha256) and services.pieces.find(caller, sha256).pieces:
         services.pieces.drop(caller, sha256)

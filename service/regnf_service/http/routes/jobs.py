@@ -91,11 +91,11 @@ def list_jobs(
     prefix: PrefixDep,
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
-    status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
+    status: Annotated[Status | None, Query(description="Only jobs with this status.")] = None,
 ) -> Response:
-    """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
+    """A page may be short or empty although more pages follow. Continue while there is a `next_page_token`.
 
-    `queue_position` is left out here: ask for the job itself. A browser gets a page, which needs no token.
+    `queue_position` is null here: get the job itself for it. A browser gets a page, which needs no token.
     """
     if wants_page(request.scope):
         return page("lists.html")
@@ -110,7 +110,12 @@ def list_jobs(
     summary="A job's state",
     response_model=JobDocument,
     responses={
-        200: {"headers": {"ETag": header("For If-None-Match."), "Retry-After": header("While the job is active.")}},
+        200: {
+            "headers": {
+                "ETag": header("For If-None-Match."),
+                "Retry-After": header("Seconds to wait before the next request. Only while the job is active."),
+            }
+        },
         304: NOT_MODIFIED,
         **refusals("INVALID_QUERY", "JOB_NOT_FOUND", "JOB_EXPIRED"),
     },
@@ -123,7 +128,8 @@ async def get_job(
     held: IfNoneMatchDep,
     wait: WaitQuery = 0,
 ) -> Response:
-    """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
+    """With `wait`, the response is sent when the job has finished. With `If-None-Match` too, it is sent at the first
+    change."""
 
     def look() -> _Seen:
         record = find_job(services, id, caller)
@@ -142,7 +148,7 @@ async def get_job(
 
 @router.get(
     "/jobs/{id}/request",
-    summary="What a registration was asked for",
+    summary="The request of a registration",
     responses={
         200: {"content": {"application/json": {"schema": _REQUEST}}},
         **refusals("JOB_NOT_FOUND", "JOB_EXPIRED"),
@@ -150,11 +156,11 @@ async def get_job(
 )
 @blocking
 def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
-    """The body of `POST /register`, without the webhook, to be posted again as it is or with other options."""
+    """The body of `POST /register` without the webhook. It can be posted again, unchanged or with other options."""
     record = find_job(services, id, caller)
     accepted = services.records.journal.accepted(record.id)
     if record.kind != "registration" or accepted is None:
-        raise Problem("JOB_NOT_FOUND", "The request of this job is not kept, or it is a rendering.")
+        raise Problem("JOB_NOT_FOUND", "The request of this job is not kept, or the job is a rendering.")
     return JSONResponse(request_document(accepted.request), headers={"Cache-Control": "no-cache"})
 
 
@@ -164,8 +170,8 @@ def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response: 
     response_class=StreamingResponse,
     responses={
         200: {
-            "description": "Events `status` and `progress`; the data are status, phase, progress, attempt, updated. "
-            "The stream ends after the event that ends the job.",
+            "description": "Events `status` and `progress`; the data are status, phase, progress, attempt and "
+            "updated. The stream ends with the last event of the job.",
             "content": {sse.MEDIA_TYPE: {"schema": _EVENT}},
         },
         204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
@@ -180,7 +186,7 @@ async def job_events(
         str | None, Header(description="Resume after this event.", json_schema_extra=_EVENT_ID)
     ] = None,
 ) -> Response:
-    """From the beginning, or after `Last-Event-ID`."""
+    """The stream starts at the first event, or after `Last-Event-ID`."""
     record = await in_thread(find_job, services, id, caller)
     try:
         waiting = await in_thread(services.records.events, id, last_event_id)
@@ -193,12 +199,12 @@ async def job_events(
 
 @router.post(
     "/jobs/{id}/cancel",
-    summary="Stop a job",
+    summary="Cancel a job",
     response_model=JobDocument,
     status_code=202,
     responses={
-        200: {"description": "It was dismissed already.", "model": JobDocument},
-        202: {"description": "A waiting job is dismissed at once, a running one within seconds."},
+        200: {"description": "The job was dismissed already.", "model": JobDocument},
+        202: {"description": "A waiting job is dismissed immediately, a running job within seconds."},
         **refusals("JOB_NOT_FOUND", "JOB_FINISHED", "JOB_EXPIRED"),
     },
 )
@@ -208,7 +214,7 @@ async def cancel_job(
     caller: CallerDep,
     prefix: PrefixDep,
 ) -> JSONResponse:
-    """Cancelling twice is no error."""
+    """A second call is no error."""
     before = await in_thread(find_job, services, id, caller)
     if before.status == "dismissed":
         return await job_answer(services, before, prefix)
@@ -223,14 +229,14 @@ async def cancel_job(
 
 @router.delete(
     "/jobs/{id}",
-    summary="Forget a job and its artifacts",
+    summary="Delete a job and its artifacts",
     status_code=204,
     response_class=Response,
     responses=refusals("JOB_NOT_FOUND", "JOB_ACTIVE", "JOB_EXPIRED"),
 )
 @blocking
 def delete_job(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
-    """Only a finished job: cancel it first."""
+    """Only a finished job can be deleted. Cancel a running job first."""
     if find_job(services, id, caller).status in ACTIVE:
         raise Problem("JOB_ACTIVE")
     services.records.delete_job(id)

@@ -37,12 +37,12 @@ _BODY_REFUSALS = (
     "INVALID_HEADER MALFORMED_JSON UPLOAD_INCOMPLETE TOO_MANY_REQUESTS_AT_ONCE REQUEST_TOO_LARGE "
     "UNSUPPORTED_MEDIA_TYPE INVALID_REQUEST CONFLICT LIBRARY_NAME_TAKEN"
 )
-NamePath = Annotated[str, Path(description="Of the entry.", max_length=4 * MAX_NAME)]
+NamePath = Annotated[str, Path(description="Name of the entry.", max_length=4 * MAX_NAME)]
 
 
 @router.get(
     "/library",
-    summary="The library's entries, the one added last first",
+    summary="The library's entries, newest first",
     response_model=EntryPage,
     responses={200: {"content": HTML}, **refusals("INVALID_QUERY")},
 )
@@ -55,9 +55,11 @@ def list_library(
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
     tag: Annotated[str | None, Query(max_length=MAX_TAG, description="Only entries with this tag.")] = None,
-    name: Annotated[str | None, Query(max_length=MAX_NAME, description="Only those with this in their names.")] = None,
+    name: Annotated[
+        str | None, Query(max_length=MAX_NAME, description="Only entries whose name contains this text.")
+    ] = None,
 ) -> Response:
-    """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
+    """A page may be short or empty although more pages follow. Continue while there is a `next_page_token`.
 
     A browser gets a page, which needs no token.
     """
@@ -71,20 +73,20 @@ def list_library(
 
 @router.post(
     "/library",
-    summary="Make a field an entry of the library",
+    summary="Add a field to the library",
     response_model=EntryDocument,
     status_code=201,
     responses={
-        200: {"description": "It was one, and says the same.", "model": EntryDocument},
+        200: {"description": "The same entry exists already.", "model": EntryDocument},
         201: {"headers": {"Location": header("The entry.")}},
         **refusals(_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY"),
     },
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(NewEntry)}}}},
 )
 async def post_library(request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:
-    """A field has one entry at most, under a name of the caller's choice. The field may still be `validating`.
+    """A field has at most one entry, with a name that the caller chooses. The field may still be `validating`.
 
-    A worker then makes the object's model, with the signature that searches compare, and looks for its symmetry.
+    A worker then computes the object's model, the signature that searches compare, and the object's symmetry.
     """
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.")
@@ -104,7 +106,7 @@ async def post_library(request: Request, services: ServicesDep, caller: CallerDe
 )
 @blocking
 def get_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:
-    """Its picture and its mesh are those of its field."""
+    """The picture and the mesh of an entry are those of its field."""
     return JSONResponse(entry_document(find_entry(services, caller, name), prefix))
 
 
@@ -118,8 +120,8 @@ def get_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep, 
 async def patch_library_entry(
     name: NamePath, request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep
 ) -> JSONResponse:
-    """What is left out stays, in a symmetry too; null takes a unit, a note or a symmetry back, and `[]` all tags
-    (RFC 7396)."""
+    """A member that is left out is unchanged, also within `symmetry`. null removes a unit, a note or a symmetry, and
+    `[]` removes all tags (RFC 7396)."""
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.")
     change = await read_json(request, services, caller, EntryChange)
@@ -139,29 +141,32 @@ def _changed(services: Services, caller: str, name: str, change: EntryChange) ->
 
 @router.delete(
     "/library/{name}",
-    summary="Take an entry out of the library",
+    summary="Remove an entry from the library",
     status_code=204,
     response_class=Response,
     responses=refusals("LIBRARY_ENTRY_NOT_FOUND", "CONFLICT"),
 )
 @blocking
 def delete_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep) -> Response:
-    """Its field stays: `DELETE /fields/{sha256}` forgets that."""
+    """The field is kept: `DELETE /fields/{sha256}` deletes it."""
     remove_entry(services, caller, name)
     return Response(status_code=204)
 
 
 @router.get(
     "/library/{name}/file",
-    summary="An entry's field as a safe field file",
+    summary="An entry's field as a regnf field file",
     response_class=StreamingResponse,
     responses={
-        200: {"description": "It can be uploaded anywhere.", "content": {"application/octet-stream": BINARY}},
+        200: {
+            "description": "The file. Any regnf service accepts it.",
+            "content": {"application/octet-stream": BINARY},
+        },
         **refusals("LIBRARY_ENTRY_NOT_FOUND", "FIELD_VALIDATING"),
     },
 )
 async def get_library_file(request: Request, name: NamePath, services: ServicesDep, caller: CallerDep) -> Response:
-    """What the import made of the upload (docs/safe-format.md): libraries are carried elsewhere with it."""
+    """The imported field (docs/safe-format.md). It can be uploaded to another service."""
     field = (await in_thread(find_entry, services, caller, name)).field
     if field.state != "ready":
         raise Problem("FIELD_VALIDATING")

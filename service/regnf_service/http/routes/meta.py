@@ -1,4 +1,4 @@
-"""What the service says about itself."""
+"""State, version and contract of the service."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from regnf_state.records import RecordError, RecordsFullError
 
 router = APIRouter(tags=["service"])
 logger = logging.getLogger(__name__)
-WorkerQuery = Annotated[bool, Query(description="Whether a live worker is asked for too.")]
+WorkerQuery = Annotated[bool, Query(description="Whether a live worker is required.")]
 
 
-@get_and_head(router, "/healthz", summary="Whether the process answers", response_model=HealthDocument)
+@get_and_head(router, "/healthz", summary="Liveness: the process responds", response_model=HealthDocument)
 async def healthz() -> dict[str, str]:
-    """Needs no token, looks at nothing else."""
+    """Needs no token. Nothing else is checked."""
     return {"status": "ok"}
 
 
 @get_and_head(
     router,
     "/readyz",
-    summary="Whether a registration would run",
+    summary="Readiness: a registration can run",
     response_model=ReadyDocument,
     responses=refusals("INVALID_QUERY", "NOT_READY"),
 )
 async def readyz(services: ServicesDep, worker: WorkerQuery = True) -> dict[str, object]:
-    """Records and storage, both asked to take a write, and at least one live worker.
+    """Checks that the job store and the storage accept a write, and that at least one worker is alive.
 
-    A 503 has the same `checks`; its detail names what is missing, and its `reasons` say why. With `worker=false` no
-    worker is asked for: whether uploads and requests would be taken, to wait for one.
+    A 503 has the same `checks`. Its `detail` names what is missing, and its `reasons` give the causes. With
+    `worker=false` no worker is required: uploads and requests are then accepted and wait for a worker.
     """
     return await PROBES.run(_readiness, services, worker)
 
@@ -79,17 +79,17 @@ def _fault(check: Callable[[], object]) -> str | None:
 def _records_write(services: Services) -> None:
     services.records.probe()
     if services.room.is_full:
-        raise RecordsFullError("Redis has less than its reserve of memory left")
+        raise RecordsFullError("Redis has less free memory than its reserve")
 
 
-@get_and_head(router, "/version", summary="What runs here", response_model=VersionDocument)
+@get_and_head(router, "/version", summary="Version of the service", response_model=VersionDocument)
 async def version() -> dict[str, str]:
     return {"name": "regnf", "version": __version__, "python": platform.python_version()}
 
 
-@get_and_head(router, "/", summary="Every address", response_model=IndexDocument, responses={200: {"content": HTML}})
+@get_and_head(router, "/", summary="All addresses", response_model=IndexDocument, responses={200: {"content": HTML}})
 async def index(request: Request, prefix: PrefixDep) -> Response:
-    """Start here. A browser gets the home page, which needs no token."""
+    """The entry point of the API. A browser gets the home page, which needs no token."""
     if wants_page(request.scope):
         return page("home.html")
     paths = request.app.openapi()["paths"]
@@ -127,15 +127,15 @@ async def openapi_json(request: Request) -> Response:
 @get_and_head(
     router,
     "/docs",
-    summary="This contract, for people",
+    summary="This contract as a web page",
     response_class=FileResponse,
     responses={200: {"description": "The page.", "content": HTML}},
 )
 @blocking
 def docs() -> FileResponse:
-    """Every address with a form to try it, every reason and schema.
+    """All addresses, each with a form to try it, all reasons and all schemas.
 
-    The page reads the contract, and asks for a token if one is needed. It loads nothing from elsewhere.
+    The page reads the contract and asks for a token if one is needed. It loads nothing from other hosts.
     """
     return page("docs.html")
 

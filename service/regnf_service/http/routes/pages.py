@@ -32,7 +32,7 @@ PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-acti
 )
 @blocking
 def view(id: str, services: ServicesDep) -> FileResponse:  # noqa: A002
-    """Shows progress while the job is active. Where tokens are needed, the page asks for one."""
+    """The page shows the progress of an active job. If the service needs a token, the page asks for it."""
     if not services.settings.needs_token:
         # with tokens the page comes before the token, so it must not tell which jobs there are
         find_job(services, id, ANONYMOUS)

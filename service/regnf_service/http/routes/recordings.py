@@ -69,18 +69,18 @@ _REFUSALS = (
     "FIELD_DESCRIPTION_DIFFERS INVALID_DESCRIPTION INVALID_QUERY"
 )
 FRAME_PARTS: dict[str, Any] = {
-    "depth": FILE | {"description": "A PNG of 16 bits, a TIFF or a `.npy` file."},
-    "color": FILE | {"description": "By the same camera: a PNG, a JPEG, a BMP or a WebP file."},
+    "depth": FILE | {"description": "The depth image: a 16-bit PNG, a TIFF or a `.npy` file."},
+    "color": FILE | {"description": "The color image of the same view: a PNG, JPEG, BMP or WebP file."},
     "camera": {
         "type": "object",
-        "description": "The intrinsics, as a `camera.json` beside images has them; `depth_unit`, meters a step, and "
-        "`T_world_camera`, 4x4, where they are known.",
+        "description": "The intrinsics, in the form of a `camera.json`. It may also have `depth_unit` (meters per "
+        "step) and `T_world_camera` (4x4).",
     },
 }
 _WHOLE = {"file": FILE, "upload": UPLOAD_PART}
 _NAME = r"[A-Za-z0-9._-]{1,100}"
-LabelQuery = Annotated[Label | None, Query(description="A name for people.")]
-DigestHeader = Annotated[str | None, Header(description="RFC 9530, of the body as sent.")]
+LabelQuery = Annotated[Label | None, Query(description="A name for display.")]
+DigestHeader = Annotated[str | None, Header(description="RFC 9530: the digest of the body as sent.")]
 
 
 def _body(required: list[str], **more: Any) -> dict[str, Any]:
@@ -106,11 +106,12 @@ async def post_recording(
     label: LabelQuery = None,
     content_digest: DigestHeader = None,
 ) -> JSONResponse:
-    """An archive of a folder, a bag (ROS, MCAP) or a stored recording, as the body or as the part `file`; or one frame.
+    """The body or the part `file` is an archive of a folder, a bag (ROS, MCAP) or a stored recording. Or the parts are
+    one frame.
 
-    The answer's `sha256` names the recording: `POST /register` takes it as `scene`. The same parts in the same order
-    are the same recording. `upload`, in place of `file`, names a file whose pieces came by `PUT /fields/{sha256}`;
-    `description` says what no file says.
+    The `sha256` in the response identifies the recording: `POST /register` takes it as `scene`. The same parts in the
+    same order are the same recording. `upload`, in place of `file`, names a file that was uploaded in pieces with `PUT
+    /fields/{sha256}`. `description` has import options that are in no file.
     """
     return upload_answer(await _taken(request, services, caller, content_digest, AsRecording(name=label)), prefix)
 
@@ -131,9 +132,9 @@ async def post_frame(
     prefix: PrefixDep,
     content_digest: DigestHeader = None,
 ) -> JSONResponse:
-    """Answers with another recording: all frames of this one, which must be `ready`, and the new one, called `name`.
+    """Creates another recording: all frames of this one, which must be `ready`, and the new frame with the name `name`.
 
-    The earlier recording stays until it is deleted. The frame's `camera` says `T_world_camera` in the same world.
+    This recording is kept until it is deleted. The frame's `camera` has `T_world_camera` in the same world frame.
     """
     known = await in_thread(require_field, services, caller, sha256)
     if known.state != "ready" or not known.is_recording:
@@ -171,7 +172,7 @@ async def _taken(
             return await store_upload(services, caller, upload, await upload.finish(), as_)
         wanted = ["camera", "depth"] + (["name"] if adds else [])
         if sorted(parts.keys() - {"color"}) != wanted:
-            raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and color if there is one.")
+            raise Problem("MALFORMED_MULTIPART", f"Send the parts {', '.join(wanted)}, and optionally color.")
         texts = {"camera.json": camera_of(parts)}
         if adds:
             name = parts["name"].decode("utf-8", "replace")
@@ -209,7 +210,7 @@ def list_recordings(
     page_token: PageTokenQuery = None,
     label: LabelQuery = None,
 ) -> Response:
-    """A page may be short or empty and not be the last: go on while there is a `next_page_token`."""
+    """A page may be short or empty although more pages follow. Continue while there is a `next_page_token`."""
     found = services.records.list_fields(label, limit, decode_token(page_token), caller, recordings=True)
     documents = [field_document(record, prefix) for record in found.records]
     return JSONResponse({"recordings": documents, "next_page_token": encode_token(found.rest)})
@@ -219,14 +220,14 @@ get_and_head(
     router,
     "/recordings/{sha256}",
     name="get_recording",
-    summary="A recording's state and what its import found",
+    summary="State of a recording and report of its import",
     response_model=FieldDocument,
     responses=FIELD_ANSWERS,
 )(get_field)
 router.delete(
     "/recordings/{sha256}",
     name="delete_recording",
-    summary="Forget a recording and its bytes",
+    summary="Delete a recording and its file",
     status_code=204,
     response_class=Response,
     responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE", "FIELD_IN_LIBRARY"),
@@ -236,10 +237,10 @@ router.delete(
 @get_and_head(
     router,
     "/recordings/{sha256}/frames/{name:path}/color.png",
-    summary="A frame's color image, or its depth as gray",
+    summary="Color image of a frame, or its depth image in gray",
     response_class=Response,
     responses={
-        200: {"description": "Of the image's own size.", "content": {"image/png": BINARY}},
+        200: {"description": "The image has its original size.", "content": {"image/png": BINARY}},
         304: NOT_MODIFIED,
         **refusals("FIELD_NOT_FOUND", "RECORDING_FRAME_NOT_FOUND"),
     },
@@ -247,9 +248,8 @@ router.delete(
 async def get_frame_picture(
     sha256: str, name: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep
 ) -> Response:
-    """`name` is the frame's name, or its number. Detections are in pixels of this image.
-
-    Depth is brighter where it is farther, and black where nothing was measured.
+    """`name` is the frame's name, or its number. Detections are in pixels of this image. In a depth image farther
+    points are brighter, and pixels without a measurement are black.
     """
     record = await in_thread(require_field, services, caller, sha256)
     headers = {"ETag": field_etag(record), "Cache-Control": "private, max-age=3600"}

@@ -60,24 +60,28 @@ from regnf_state.registration_request import JobRequest, RegistrationRequest
 
 _PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
 _MAX_WAIT_S = 30
-DryRunQuery = Annotated[bool, Query(description="Check everything, start nothing.")]
-PreferHeader = Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")]
+DryRunQuery = Annotated[bool, Query(description="Only check the request; start no job.")]
+PreferHeader = Annotated[
+    str | None, Header(description="`wait=N`: send the response when the job has finished, or after N seconds.")
+]
 IdempotencyKeyHeader = Annotated[
     str | None,
     Header(
-        description="Up to 255 printable ASCII characters, kept for 24 hours: refused with another request.",
+        description="Up to 255 printable ASCII characters, kept for 24 hours. The same key with a different "
+        "request is refused.",
         json_schema_extra={"pattern": "^[!-~]([ -~]{0,253}[!-~])?$"},
     ),
 ]
 JOB_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The job has finished (`Prefer: wait`, or an identical one had), or the dry run passed.",
+        "description": "The job has finished (with `Prefer: wait`, or the same request was posted earlier), or the "
+        "dry run passed.",
         "content": {JSON: {"schema": {"anyOf": [reference(JobDocument), reference(DryRunDocument)]}}},
         "links": JOB_LINKS,
     },
     202: {
         "description": "Accepted.",
-        "headers": {"Location": header("The job."), "Retry-After": header("Seconds until a look is worth it.")},
+        "headers": {"Location": header("The job."), "Retry-After": header("Seconds to wait before the next request.")},
         "links": JOB_LINKS,
     },
 }
@@ -89,7 +93,7 @@ JOB_REFUSALS = (
 
 @dataclass(frozen=True)
 class Asking:
-    """How a job is asked for, beside what it is to do."""
+    """How a job is requested, beside what it is to do."""
 
     dry_run: bool
     prefer: str | None
@@ -139,7 +143,7 @@ _ONE_SHOT = {
             "scene": FILE,
             "object": FILE,
             **FRAME_PARTS,
-            "mask": FILE | {"description": "The detection in the frame: a PNG of its size."},
+            "mask": FILE | {"description": "The mask of the object in the frame: a PNG of the same size."},
             "request": reference(OneShotRequest),
             **{f"{role}_description": reference(UploadDescription) for role in ("scene", "object")},
             **{f"{role}_settings": FILE for role in ("scene", "object")},
@@ -150,7 +154,7 @@ _ONE_SHOT = {
 
 @router.post(
     "/register",
-    summary="Find the transform that lays the scene's copy of the object onto the library's",
+    summary="Register an object: find its pose in the scene",
     response_model=JobDocument,
     status_code=202,
     responses={
@@ -184,9 +188,10 @@ async def register(
     prefer: PreferHeader = None,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JSONResponse:
-    """The same request twice is one job: its id follows from what is asked. A job that failed is started anew.
+    """The same request twice is one job: the job id is a hash of the request. A job that failed is started again.
 
-    Requests that differ in the label, the score or the webhook alone are the same. Every webhook is told of the end.
+    Requests that differ only in the label, the score or the webhook are the same. Every webhook gets the message about
+    the end of the job.
     """
     check_idempotency_key(idempotency_key)
     asked = await _read(request, services, caller, keep=not dry_run)
@@ -194,7 +199,7 @@ async def register(
 
 
 async def _read(request: Request, services: Services, caller: str, keep: bool) -> RegistrationRequest:
-    """What is asked for, checked; files that come along are kept if ``keep``."""
+    """What is requested, checked; files that come along are kept if ``keep``."""
     match body.media_type(request):
         case "application/json":
             return await _by_reference(request, services, caller)
@@ -259,14 +264,16 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
 def _check_parts(parts: Mapping[str, bytes]) -> None:
     """Raises Problem MALFORMED_MULTIPART."""
     if "request" not in parts:
-        raise Problem("MALFORMED_MULTIPART", "The part `request` is missing. It names the object, or `object` is sent.")
+        raise Problem(
+            "MALFORMED_MULTIPART", "The part `request` is missing. It is needed unless the part `object` is sent."
+        )
     if ("scene" in parts) == ("depth" in parts):
-        raise Problem("MALFORMED_MULTIPART", "Send the part `scene`, or `depth` and `camera` of a frame.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `scene`, or the parts `depth` and `camera` of a frame.")
     needed = {"camera": "depth", "depth": "camera", "color": "depth", "mask": "depth"}
     needed |= {f"{name}_{what}": name for name in _ROLES for what in ("settings", "description")}
     for part, other in needed.items():
         if part in parts and other not in parts:
-            raise Problem("MALFORMED_MULTIPART", f"The part `{part}` goes with `{other}`, which is missing.")
+            raise Problem("MALFORMED_MULTIPART", f"The part `{part}` needs the part `{other}`, which is missing.")
 
 
 async def _asked(
@@ -274,7 +281,7 @@ async def _asked(
 ) -> tuple[RegistrationRequest, dict[str, str]]:
     """The job's request and the fields that must be held, as ``asked_by_reference``. came: the SHA-256s of files."""
     if ("object" in came) == (spec.object is not None or spec.candidates is not None):
-        raise Problem("MALFORMED_MULTIPART", "Send the part `object`, or name `object` or `candidates` in the request.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `object`, or give `object` or `candidates` in the request.")
     if ("mask" in parts) == (spec.detection is not None) or not parts.get("mask", _PNG).startswith(_PNG):
         raise Problem("INVALID_DETECTION", "Give `detection` in the request, or a PNG as the part `mask` of a frame.")
     mask = (ImageDetection(mask=base64.b64encode(parts["mask"]).decode()),) if "mask" in parts else spec.detection

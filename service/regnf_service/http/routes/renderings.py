@@ -41,7 +41,7 @@ router = APIRouter(tags=["renderings"])
 
 @router.post(
     "/render",
-    summary="Render a scene in which objects are substituted, replaced, removed or inserted",
+    summary="Render a scene with edits: objects substituted, replaced, removed or inserted",
     response_model=JobDocument,
     status_code=202,
     responses={
@@ -70,7 +70,8 @@ async def render(
     prefer: PreferHeader = None,
     idempotency_key: IdempotencyKeyHeader = None,
 ) -> JSONResponse:
-    """A job like a registration: the same request twice is one job. Edits that name a registration must be finished."""
+    """The rendering is a job, like a registration: the same request twice is one job. If an edit names a registration,
+    that registration must be finished."""
     check_idempotency_key(idempotency_key)
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.")
@@ -97,8 +98,8 @@ def _poses(said: RenderBody) -> list[dict[str, Any]] | None:
     T = None if file.T_scene_file is None else rows_of(file.T_scene_file)
     poses = poses_of_transforms(file.document, T, said.size, file.every)
     if len(poses) > MOST_CAMERAS:
-        message = f"{len(poses)} cameras, at most {MOST_CAMERAS} are taken of a file"
-        raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Take one of so many: `transforms.every`.")
+        message = f"{len(poses)} cameras; at most {MOST_CAMERAS} of a file can be used"
+        raise InvalidInputError(message, reason="RENDER_TOO_LARGE", hint="Use every N-th camera: `transforms.every`.")
     return poses
 
 

@@ -24,7 +24,7 @@ router = APIRouter(tags=["results"])
 _CACHE = "private, max-age=0, must-revalidate"
 _ARTIFACT_WAIT_S = 20
 ArtifactWaitQuery = Annotated[
-    int, Query(ge=0, le=30, description="Seconds to hold the answer back for a file that is still to come.")
+    int, Query(ge=0, le=30, description="Longest time to wait for a file that is still being made, seconds.")
 ]
 _FILES = {kind: {} if kind == JSON else BINARY for kind in sorted(MEDIA_TYPES)}
 
@@ -35,7 +35,7 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
 
 @router.get(
     "/jobs/{id}/result",
-    summary="What the registration found, or what the rendering has made",
+    summary="The result of a registration or a rendering",
     response_model=ResultDocument | RenderResultDocument,
     responses={
         200: {"links": links("name", "/artifacts/0/name", "get_artifact", "head_artifact", id="id")},
@@ -44,10 +44,10 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
 )
 @blocking
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
-    """A failed job has no result: the member `error` of the 409 is the job's own problem.
+    """A failed job has no result. The member `error` of the 409 has the reason why the job failed.
 
-    The result is there before its pictures and clouds, which are listed as `pending` until they are made. `preview.png`
-    is drawn of the clouds when it is asked for the first time: `bytes` and `sha256` are null until then.
+    The result is available before its point clouds and pictures, which are listed as `pending` until they are made.
+    `preview.png` is drawn from the point clouds at its first request. Until then its `bytes` and `sha256` are null.
     """
     manifest = _manifest(services, id, caller)
     document = result_of(services, manifest)
@@ -72,9 +72,9 @@ def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: Prefix
 _RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"description": "The whole file.", "content": _FILES},
     206: {
-        "description": "The range asked for.",
+        "description": "The requested range.",
         "content": _FILES,
-        "headers": {"Content-Range": header("Which bytes these are.")},
+        "headers": {"Content-Range": header("The position of these bytes in the file.")},
     },
     304: NOT_MODIFIED,
     **refusals(
@@ -104,9 +104,10 @@ async def get_artifact(
     if_range: IfRangeHeader = None,
     wait: ArtifactWaitQuery = _ARTIFACT_WAIT_S,
 ) -> Response:
-    """The names are those of the result's `artifacts` list. The answer is held back while the file is still to come.
+    """The names are in the result's list `artifacts`. If the file is still being made, the response is sent when it is
+    finished.
 
-    `preview.png` is drawn of the clouds when it is asked for the first time.
+    `preview.png` is drawn from the point clouds at its first request.
     """
     caller = request.state.caller
 

@@ -47,18 +47,22 @@ DESCRIPTION_BYTES = 16 * 1024
 _BESIDE = ("settings", "cameras")
 UPLOAD_BYTES = 4 * (64 + 4)
 """A digest in any encoding, with a mark and the end of its line."""
-_HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
+_HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document changes.")}
 _DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
 ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The bytes were held already.",
+        "description": "The service already has the file.",
         "model": FieldDocument,
         "headers": _HEADERS,
         "links": FIELD_LINKS,
     },
     201: {"description": "Stored; the import is queued.", "headers": _HEADERS, "links": FIELD_LINKS},
 }
-UPLOAD_PART = {"type": "string", "pattern": "^[0-9a-f]{64}$", "description": "In place of the file: its pieces."}
+UPLOAD_PART = {
+    "type": "string",
+    "pattern": "^[0-9a-f]{64}$",
+    "description": "In place of `file`: a file that was uploaded in pieces.",
+}
 _MULTIPART = {
     "schema": {
         "type": "object",
@@ -76,15 +80,15 @@ _MULTIPART = {
 
 @router.put(
     "/fields/{sha256}",
-    summary="Upload a field under its SHA-256",
+    summary="Upload a field with a known SHA-256",
     response_model=FieldDocument,
     status_code=201,
     responses={
         **ANSWERS,
         202: {
-            "description": "The piece is kept; the rest is awaited.",
+            "description": "The piece is stored. More pieces are needed.",
             "model": UploadProgress,
-            "headers": {"Upload-Offset": header("How many bytes have arrived.")},
+            "headers": {"Upload-Offset": header("Number of bytes that have arrived.")},
         },
         **refusals(UPLOAD_REFUSALS, PIECE_REFUSALS),
     },
@@ -102,22 +106,27 @@ async def put_field(
     content_range_: Annotated[
         str | None,
         Header(
-            alias="Content-Range", description="RFC 9110: which piece comes.", json_schema_extra={"pattern": PATTERN}
+            alias="Content-Range",
+            description="RFC 9110: the position of this piece in the file.",
+            json_schema_extra={"pattern": PATTERN},
         ),
     ] = None,
     upload_complete: Annotated[
-        Literal["?0", "?1"], Header(description="?0: the pieces wait for `POST /fields`, with what goes with them.")
+        Literal["?0", "?1"],
+        Header(description="?0: the pieces are kept until a `POST /fields` names them in its part `upload`."),
     ] = "?1",
 ) -> JSONResponse:
-    """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held.
+    """The body is the unchanged file: a checkpoint, a map, a grid or a mesh (docs/import-gate.md). The call can be
+    repeated: it returns 200 if the service has the file.
 
-    With `Content-Range: bytes first-last/total` one piece of them, in order: what has arrived whole stays when the next
-    one breaks off. `bytes */total` without a body asks how much has arrived, and finishes what has arrived whole.
+    With `Content-Range: bytes first-last/total` the body is one piece of the file. Send the pieces in order. A complete
+    piece is kept if the transfer of the next one fails. `bytes */total` without a body returns how many bytes have
+    arrived. If all have arrived, it completes the upload.
     """
     if not is_sha256(sha256):
         raise Problem("INVALID_DIGEST")
     if body.media_type(request).startswith("multipart/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.")
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT needs only the bytes of the file as the body.")
     digest = announced_digest(content_digest)
     span = content_range(content_range_, services.settings.max_upload_bytes)
     declared = body.declared_length(request)
@@ -168,14 +177,15 @@ async def post_field(
     caller: CallerDep,
     prefix: PrefixDep,
     content_digest: Annotated[
-        str | None, Header(description="RFC 9530, of the body as sent.", json_schema_extra=_DIGEST)
+        str | None, Header(description="RFC 9530: the digest of the body as sent.", json_schema_extra=_DIGEST)
     ] = None,
 ) -> JSONResponse:
-    """The bytes alone, or multipart with the part `file` and what goes with it.
+    """The body is the file, or multipart with the part `file` and optional parts.
 
-    `settings` is the file of settings that the trainer left, or a zip or tar file of several; `cameras` says where the
-    cameras stood whose images the field was made from (docs/import-gate.md); `description` is JSON: what no file says.
-    An archive of a whole training run needs none of them. `upload` names a file whose pieces came by PUT.
+    `settings` is the trainer's config file, or a zip or tar file with several. `cameras` is a file with the poses of
+    the cameras from whose images the field was made (docs/import-gate.md). `description` is JSON with import options
+    that are in no file. An archive of a whole training run needs none of them. `upload` names a file that was uploaded
+    in pieces with PUT.
     """
     if body.media_type(request).startswith("text/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.")
@@ -224,7 +234,7 @@ async def _receive_piece(
                 raise Problem("DIGEST_MISMATCH")
             if known is None:
                 if received.bytes != span.length:
-                    raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.")
+                    raise Problem("UPLOAD_INCOMPLETE", "The length of the body differs from Content-Range.")
                 await in_thread(services.pieces.make_room, caller, sha256, span.first + received.bytes)
                 await upload.commit(services.pieces.key(caller, sha256, span.first, span.total))
     return known
@@ -258,7 +268,7 @@ async def _receive_parts(
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts)
     if ("file" in parts) == ("upload" in parts):
-        raise Problem("MALFORMED_MULTIPART", "Send the part `file`, or `upload` in its place.")
+        raise Problem("MALFORMED_MULTIPART", "Send the part `file` or the part `upload`.")
     description = read_description(parts.get("description"))
     settings, cameras = [await beside[part].received() for part in _BESIDE]
     if "file" in parts:
@@ -271,7 +281,7 @@ def named_upload(text: bytes) -> str:
     try:
         named = decode_text(text).strip()
     except TextError as error:
-        raise Problem("INVALID_DIGEST", f"The part upload is {error}.") from error
+        raise Problem("INVALID_DIGEST", f"The part `upload` is {error}.") from error
     if not is_sha256(named):
         raise Problem("INVALID_DIGEST")
     return named

@@ -21,37 +21,41 @@ _PROBLEMS_SHOWN = 32
 
 
 class BatchPair(RegisterRequest):
-    """A line of a batch: a registration, with a key of the caller's."""
+    """A line of a batch: a registration with an optional key of the caller's choice."""
 
-    key: Label | None = Field(None, description="Your own name of the pair, unique in the batch; results repeat it.")
+    key: Label | None = Field(
+        None, description="Your own name of the pair, unique in the batch. The results repeat it."
+    )
 
 
 class RefusedLine(Outgoing):
-    """A line that has become no job."""
+    """A line that was refused: it has no job."""
 
-    line: int = Field(description="In the body, from 1 on.")
+    line: int = Field(description="Line number in the body, from 1.")
     error: ProblemDocument
 
 
 class BatchCounts(Outgoing):
-    """How pairs have ended, by the verdict of their result or by what went wrong."""
+    """Number of pairs by outcome: by the verdict of the result or by the kind of failure."""
 
     registered: int = 0
     ambiguous: int = 0
     rejected: int = 0
     failed: int = Field(
-        0, description="Their job failed, was cancelled, or is gone. Posting the batch again starts them anew."
+        0,
+        description="Number of pairs whose job failed, was canceled or was deleted. Posting the batch again "
+        "starts these jobs again.",
     )
-    refused: int = Field(0, description="Their line has become no job.")
+    refused: int = Field(0, description="Number of lines that were refused: they have no job.")
 
 
 class BatchSummary(Outgoing):
-    """What the list tells of a batch."""
+    """A batch in a list."""
 
     id: str
-    pairs: int = Field(description="How many lines it has.")
-    created_at: Moment = Field(description="When it was posted last.")
-    expires_at: Moment = Field(description="When it will be gone. Its jobs go by their own times.")
+    pairs: int = Field(description="Number of lines.")
+    created_at: Moment = Field(description="Time of the last post.")
+    expires_at: Moment = Field(description="Time at which the batch is deleted. Its jobs have their own times.")
     links: Links
 
 
@@ -59,28 +63,29 @@ class BatchDocument(BatchSummary):
     """One batch."""
 
     status: Literal["running", "finished", "dismissed"] = Field(
-        description="`running` while a job of it waits or runs; then `dismissed` if jobs of it were cancelled."
+        description="`running` while a job of the batch waits or runs. Afterwards `dismissed` if its jobs were "
+        "canceled, else `finished`."
     )
-    active: int = Field(description="Pairs whose job waits or runs.")
+    active: int = Field(description="Number of pairs whose job waits or runs.")
     counts: BatchCounts
     progress: float = Field(ge=0, le=1)
-    errors: list[RefusedLine] = Field([], description="The first lines that have become no job, 32 at most.")
+    errors: list[RefusedLine] = Field([], description="The first refused lines, 32 at most.")
 
 
 class BatchPage(Outgoing):
-    """Batches, those posted last first."""
+    """Batches, newest first."""
 
     batches: list[BatchSummary]
     next_page_token: str | None = Field(None, description=NEXT_PAGE)
 
 
 class BatchResult(Outgoing):
-    """A line of a batch's results: a pair that has ended."""
+    """A line of the results of a batch: a pair that has ended."""
 
-    number: int = Field(description="Of the pair, from 1 on: `after` of the next call.")
-    line: int = Field(description="Of the pair in the body that was posted.")
+    number: int = Field(description="Number of the pair, from 1. It is the value of `after` for the next call.")
+    line: int = Field(description="Line number of the pair in the posted body.")
     key: str | None
-    job: str | None = Field(description="The job, with all of the result and its files.")
+    job: str | None = Field(description="The job, which has the full result and its files.")
     status: ResultStatus
     verdict: Verdict | None = None
     verdict_reason: str | None = None
@@ -91,9 +96,11 @@ class BatchResult(Outgoing):
     center_scene: list[float] | None = None
     uncertainty: UncertaintyDocument | None = None
     alternatives: list[AlternativeDocument] = Field([])
-    object: str | None = Field(None, description="Of a search, the likeliest object.")
-    metrics: dict[str, float | None] = Field({}, description="Those of the result; the seconds of all phases as one.")
-    error: ProblemDocument | None = Field(None, description="Unless `status` is `successful`.")
+    object: str | None = Field(None, description="For a search, the most probable object.")
+    metrics: dict[str, float | None] = Field(
+        {}, description="The metrics of the result, with one sum for the time of all phases."
+    )
+    error: ProblemDocument | None = Field(None, description="Null if `status` is `successful`.")
 
 
 def summary_document(batch: Summary, retention_s: float, prefix: str) -> dict[str, Any]:

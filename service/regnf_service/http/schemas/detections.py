@@ -24,11 +24,11 @@ _Row = Annotated[list[_Component], Field(min_length=3, max_length=3)]
 _List = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[_Component], Field(min_length=4, max_length=4)]
 _Nothing = SkipJsonSchema[None]
-_IGNORED = Field(None, description="Of Open3D; ignored beside its names of the box's members.")
+_IGNORED = Field(None, description="A member of Open3D's boxes. It is ignored.")
 
 
 class Point(Incoming):
-    """A point by its coordinates' names."""
+    """A point, given by the names of its coordinates."""
 
     x: Coordinate
     y: Coordinate
@@ -36,7 +36,7 @@ class Point(Incoming):
 
 
 class Quaternion(Incoming):
-    """A quaternion by its components' names, as ROS has it."""
+    """A quaternion, given by the names of its components, as in ROS."""
 
     x: _Component
     y: _Component
@@ -45,7 +45,7 @@ class Quaternion(Incoming):
 
 
 class Edges(Incoming):
-    """Full edge lengths by their axes' names."""
+    """Full edge lengths, by the names of the axes."""
 
     x: _Edge
     y: _Edge
@@ -55,13 +55,14 @@ class Edges(Incoming):
 _Point = _List | Point
 _Size = Annotated[list[_Edge], Field(min_length=3, max_length=3)] | Edges
 _Matrix = Annotated[
-    list[_Row], Field(min_length=3, max_length=3, description="Rows; the columns are the box's axes in the scene.")
+    list[_Row],
+    Field(min_length=3, max_length=3, description="Rows of the matrix. Its columns are the box's axes in the scene."),
 ]
 _Rotation = _Matrix | Quaternion
 
 
 class _Labeled(Incoming):
-    label: Label | None = Field(None, description="What the detector took it for. Not used by the registration.")
+    label: Label | None = Field(None, description="The detector's class. The registration does not use it.")
     score: Annotated[float, Field(ge=0, le=1)] | None = Field(None, description="The detector's confidence.")
 
 
@@ -85,8 +86,8 @@ def _one_of_each(*groups: tuple[str, ...]) -> ConfigDict:
 
 
 class CenteredBox(_OfOpen3D):
-    """A box by center, full edge lengths and rotation, which is the identity when left out. Open3D's
-    OrientedBoundingBox, with `extent` and `R`, is taken as it is."""
+    """A box given by its center, full edge lengths and rotation (default: identity). Open3D's OrientedBoundingBox, with
+    `extent` and `R`, is accepted unchanged."""
 
     model_config = _one_of_each(("center",), ("size", "extent"))
 
@@ -96,13 +97,16 @@ class CenteredBox(_OfOpen3D):
     rotation_quaternion_xyzw: _Four | Quaternion | _Nothing = None
     rotation_quaternion_wxyz: _Four | Quaternion | _Nothing = None
     rotation: _Rotation | _Nothing = Field(
-        None, description="Box axes to scene axes. Four bare numbers are refused: they do not say their order."
+        None,
+        description="Rotates box axes to scene axes. Four numbers without a name are refused, because their order "
+        "is unknown.",
     )
     R: _Rotation | _Nothing = None
 
 
 class CornerBox(_OfOpen3D):
-    """An axis-aligned box by its lowest and its highest corner. `min_bound` and `max_bound` are Open3D's names."""
+    """An axis-aligned box given by its lowest and its highest corner. `min_bound` and `max_bound` are Open3D's
+    names."""
 
     model_config = _one_of_each(("min", "min_bound"), ("max", "max_bound"))
 
@@ -122,15 +126,16 @@ _Pixels = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class InImage(_Labeled):
-    """A thing in one image of a recording, in pixels of its color image, or of its depth image where it has none."""
+    """An object in one image of a recording, in pixels of the color image. Without a color image, in pixels of the
+    depth image."""
 
     model_config = _one_of_each(("mask", "box_2d", "point_2d"))
 
     frame: str | int = Field(0, description="The name of the frame, or its number.")
     mask: str | dict[str, Any] | list[list[_Pixels]] | _Nothing = Field(
         None,
-        description="A PNG of the image's size as base64, not 0 on the thing; or COCO's run lengths, `size` (height, "
-        "width) and `counts`, or its polygons.",
+        description="A PNG of the image's size as base64, not 0 on the object; or COCO's run-length encoding, "
+        "`size` (height, width) and `counts`; or COCO's polygons.",
     )
     box_2d: Annotated[list[_Pixels], Field(min_length=4, max_length=4, description="Left, top, right, bottom.")] | (
         _Nothing
@@ -139,24 +144,24 @@ class InImage(_Labeled):
 
 
 MOST_IMAGES = 32
-"""Detections of one thing, each in an image of its own."""
+"""Detections of one object, each in an image of its own."""
 _MOST_NAME = 200
 _PNG = "iVBORw0KGgo"
 """How one begins as base64."""
 
 
 def read_images(value: Any) -> tuple[ImageDetection, ...]:
-    """A thing in images, as requests have it. Raises InvalidDetectionError."""
+    """An object in images, as requests have it. Raises InvalidDetectionError."""
     if isinstance(value, list) and len(value) > MOST_IMAGES:
-        hint = "Give the images that show most of it."
+        hint = "Give the images that show most of the object."
         raise InvalidDetectionError(f"has {len(value)} entries, expected {MOST_IMAGES} at most", hint=hint)
     found = read_image_detections(value)
     for one in found:
         if max(len(str(one.frame)), len(one.label or "")) > _MOST_NAME:
-            raise InvalidDetectionError(f"the frame's name and the label have at most {_MOST_NAME} characters")
+            raise InvalidDetectionError(f"the frame's name and the label can have at most {_MOST_NAME} characters")
         if isinstance(one.mask, str) and not (one.mask.partition("base64,")[2] or one.mask).startswith(_PNG):
-            hint = "Write the bytes of a PNG of the image's size as base64, or COCO's run lengths."
-            raise InvalidDetectionError("the mask is no PNG as base64", hint=hint, place=("mask",))
+            hint = "Write the bytes of a PNG of the image's size as base64, or COCO's run-length encoding."
+            raise InvalidDetectionError("the mask is not a PNG as base64", hint=hint, place=("mask",))
     return found
 
 
@@ -198,4 +203,4 @@ AnyDetection = Annotated[
     ),
     PlainSerializer(values_of, return_type=Any),
 ]
-"""The same of a scene that may be a recording: a box, or the thing in its images."""
+"""The same of a scene that may be a recording: a box, or the object in its images."""

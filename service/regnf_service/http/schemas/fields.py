@@ -18,7 +18,7 @@ from regnf_state.records import CANDIDATES, FieldRecord
 
 
 class SettingsDocument(Outgoing):
-    """A file that came with an upload."""
+    """A file that was uploaded with a field."""
 
     name: str
     sha256: Sha256
@@ -26,42 +26,50 @@ class SettingsDocument(Outgoing):
 
 
 class EntryNamed(Outgoing):
-    """Under which name a library has the field."""
+    """The library entry of the field."""
 
     name: str
     tags: list[str] = Field([])
 
 
 class FieldDocument(Outgoing):
-    """One field, or one recording. `validating` until its import has ended; only what is `ready` can be registered."""
+    """One field, or one recording. It is `validating` until its import has ended. Only a `ready` one can be
+    registered."""
 
     sha256: Sha256
     state: Literal["validating", "ready", "rejected"]
     bytes: int
     label: str | None = None
-    description: dict[str, Any] = Field({}, description="What the uploader said that the file does not.")
-    settings: SettingsDocument | None = Field(None, description="The file of settings that came with the upload.")
-    cameras: SettingsDocument | None = Field(None, description="The file that says where its cameras stood.")
+    description: dict[str, Any] = Field({}, description="The import options of the upload.")
+    settings: SettingsDocument | None = Field(
+        None, description="The trainer's config file that was uploaded with the field."
+    )
+    cameras: SettingsDocument | None = Field(
+        None, description="The file with the camera poses that was uploaded with the field."
+    )
     report: dict[str, Any] = Field(
         {},
-        description="What the import found: family, bounds, those of the surface, parameters, plausibility; of a "
-        "recording, with the `kind` `recording`, its layout, frames, sizes, bounds and notes.",
+        description="The report of the import. For a field: family, bounds, bounds of the surface, parameters and "
+        "plausibility. For a recording (`kind` is `recording`): layout, frames, sizes, bounds and "
+        "notes.",
     )
     symmetry: SymmetryDocument | None = Field(
-        None, description="The object's own, found by the first job that registers the field as an object."
+        None, description="The object's symmetry. The first job that registers the field as an object detects it."
     )
-    library: EntryNamed | None = Field(None, description="Its entry in the library: `GET /library/{name}`.")
+    library: EntryNamed | None = Field(None, description="Its library entry: `GET /library/{name}`.")
     queue_position: int | None = Field(
-        None, description="1 is next; null for an import that runs or has ended, and in lists."
+        None, description="Position in the queue, 1 is next. Null for an import that runs or has ended, and in lists."
     )
     views: Literal["pending", "ready", "none"] | None = Field(
         None,
-        description="Of a ready field: whether its mesh and picture, which follow when workers have time, are still to "
-        "be made, are there, or cannot be made. Null also of a field from before they followed.",
+        description="State of the mesh and the picture of a ready field: not made yet, made, or impossible. "
+        "Workers make them when they have time. Null if it is unknown.",
     )
     error: ProblemDocument | None = Field(None, description="Why the field was rejected.")
     kept_until: Moment | None = Field(
-        None, description="Until when the upload can be imported anew with another description: PATCH. Null: it cannot."
+        None,
+        description="Until this time the file can be imported again with other import options (PATCH). Null: it "
+        "cannot.",
     )
     created_at: Moment
     updated_at: Moment
@@ -72,8 +80,8 @@ class UploadProgress(Outgoing):
     """An upload in pieces that is not finished."""
 
     sha256: Sha256
-    offset: int = Field(description="How many bytes have arrived: where the next piece begins.")
-    bytes: int = Field(description="How many the file has.")
+    offset: int = Field(description="Number of bytes that have arrived. The next piece starts here.")
+    bytes: int = Field(description="Size of the file, bytes.")
 
 
 class _DocumentedAsDescription:
@@ -85,14 +93,16 @@ class _DocumentedAsDescription:
 
 
 class FieldChange(Incoming):
-    """What is to be changed of a field. What is left out stays as it is."""
+    """Changes of a field. Members that are left out are unchanged."""
 
     description: Annotated[dict[str, Any], _DocumentedAsDescription] | None = Field(
         None,
-        description="Entries to add to what was said, or to replace; null takes an entry back (RFC 7396). Another "
-        "description is another function: the kept bytes are imported anew.",
+        description="Import options to add or to replace; null removes an option (RFC 7396). If the options "
+        "change, the kept file is imported again.",
     )
-    label: Label | None = Field(None, description="A name for people; null: none. Nothing is imported for it.")
+    label: Label | None = Field(
+        None, description="A name for display; null: none. A change of the name causes no new import."
+    )
 
     def description_change(self, held: dict[str, Any]) -> dict[str, Any]:
         """What is to be changed of what is ``held``; null for the whole takes back all of it."""

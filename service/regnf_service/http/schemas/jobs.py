@@ -32,15 +32,17 @@ _NOT_ASKED_AGAIN = frozenset({"version", "webhook"})
 
 
 class WebhookDocument(Outgoing):
-    """How the message about the job's end fares."""
+    """Delivery of the message about the job's end."""
 
     url: str
     state: Literal["waiting", "pending", "delivered", "failed"] | None = Field(
-        None, description="Waiting for the job's end; to be sent, again perhaps; received; given up. Null in lists."
+        None,
+        description="State of the message: waiting for the job's end; to be sent (again); received; or given up. "
+        "Null in lists.",
     )
     sends: int = 0
-    last_status: int | None = Field(None, description="What the receiver answered last.")
-    last_error: str | None = Field(None, description="A word for why there was no answer.")
+    last_status: int | None = Field(None, description="HTTP status of the receiver's last response.")
+    last_error: str | None = Field(None, description="A stable word: the reason why there was no response.")
     next_at: Moment | None = None
     delivered_at: Moment | None = None
 
@@ -53,37 +55,45 @@ class JobDocument(Outgoing):
     status: Status
     phase: _Phase | None = Field(
         None,
-        description="loading, sampling, initializing, optimizing, verifying or exporting: where it is, or ended. Of a "
-        "rendering: loading, composing, rendering or exporting.",
+        description="The current or last phase: loading, sampling, initializing, optimizing, verifying or "
+        "exporting. For a rendering: loading, composing, rendering or exporting.",
     )
     progress: float = Field(0.0, ge=0, le=1)
-    queue_position: int | None = Field(None, description="1 is next; null for a job that does not wait.")
-    attempts: int = Field(1, ge=1, description="How often the job was handed to a worker.")
+    queue_position: int | None = Field(
+        None, description="Position in the queue, 1 is next. Null for a job that is not waiting."
+    )
+    attempts: int = Field(1, ge=1, description="How often a worker has started the job.")
     cancel_requested: bool = False
     created_at: Moment
     updated_at: Moment
     started_at: Moment | None = None
     finished_at: Moment | None = None
-    expires_at: Moment | None = Field(None, description="When a finished job and its artifacts will be gone.")
+    expires_at: Moment | None = Field(None, description="Time at which a finished job and its artifacts are deleted.")
     inputs: dict[str, Any] = Field(
-        description="scene, object or the number of candidates, detection, seed, initial_transform, pictures, and the "
-        "SHA-256 of the full options. Of a rendering: scene, the kinds of its edits, frames, size, mode, outputs, seed."
+        description="scene, object or the number of candidates, detection, seed, initial_transform, pictures, and "
+        "the SHA-256 of the full options. For a rendering: scene, the kinds of its edits, frames, "
+        "size, mode, outputs and seed."
     )
     engine: dict[str, Any] = Field(
-        {}, description="Version, revision and device. The revision grows with changed results."
+        {}, description="Version, revision and device of the engine. Results may differ between revisions."
     )
     warnings: dict[str, list[str]] = Field(
         {},
-        description="What the imports of `scene` and `object` were not sure of: words; the result has sentences.",
+        description="Warnings of the imports of `scene` and `object`: their stable words. The result has the full "
+        "sentences.",
     )
-    verdict: _Verdict | None = Field(None, description="Of a successful job: its result's verdict.")
-    probability: float | None = Field(None, description="Its result's.")
-    level: _Level | None = Field(None, description="Its result's.")
+    verdict: _Verdict | None = Field(None, description="The verdict of the result, for a successful job.")
+    probability: float | None = Field(None, description="The probability of the result.")
+    level: _Level | None = Field(None, description="The named level of the result.")
     object_found: Sha256 | None = Field(
-        None, description="Of a successful search: the object of its result. If that is rejected, it was none of them."
+        None,
+        description="The object of the result, for a successful search. If the verdict is `rejected`, no "
+        "candidate was found.",
     )
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
-    webhooks: list[WebhookDocument] = Field([], description="Told of the job's end, in the order of asking.")
+    webhooks: list[WebhookDocument] = Field(
+        [], description="Receivers of the message about the job's end, in the order of the requests."
+    )
     links: Links
 
 
@@ -113,7 +123,7 @@ def job_document(
 
 
 def request_document(request: dict[str, Any]) -> dict[str, Any]:
-    """What a registration was asked for, to be posted again. request: of the job's record as it was accepted."""
+    """The request of a registration, to be posted again. request: of the job's record as it was accepted."""
     asked = {name: value for name, value in request.items() if value is not None and name not in _NOT_ASKED_AGAIN}
     asked["scene"] = sha256_of(asked["scene"])
     if "object" in asked:
@@ -125,7 +135,7 @@ def request_document(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_asked(detection: Any) -> Any:
-    """Of a box its members that were given; of things in images each one's."""
+    """Of a box its members that were given; of objects in images each one's."""
     if isinstance(detection, list | tuple):
         return [_as_asked(one) for one in detection]
     return {name: value for name, value in detection.items() if value is not None}

@@ -58,15 +58,18 @@ Note = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NOTE, patte
 
 
 class SaidSymmetry(Incoming):
-    """The turns that carry the object onto itself, as people say it."""
+    """The rotations that map the object onto itself, as given by a user."""
 
     order: Annotated[int, Field(ge=1, le=MAX_ORDER)] = Field(
-        description="How many, the identity included; with `continuous`, how many ends look alike: 1 or 2."
+        description="Number of rotations, including the identity. With `continuous`: 1, or 2 if both ends of the "
+        "axis look alike."
     )
     axis: Annotated[list[_FINITE], Field(min_length=3, max_length=3)] | None = Field(
-        None, description="That all of them turn about, object frame; of any length but 0."
+        None, description="The axis of all rotations, object frame. Any length except 0."
     )
-    continuous: bool = Field(False, description="Whether every turn about the axis is one: it needs an axis then.")
+    continuous: bool = Field(
+        False, description="Whether every rotation about the axis is a symmetry. An axis is required then."
+    )
 
     @model_validator(mode="after")
     def _is_one(self) -> SaidSymmetry:
@@ -78,11 +81,11 @@ class SaidSymmetry(Incoming):
 
 
 class _Notes(Incoming):
-    tags: Tags = Field([], description="By which entries are chosen together.")
-    unit: Unit | None = Field(None, description="Of the object's field, where it is known.")
-    note: Note | None = Field(None, description="For people.")
+    tags: Tags = Field([], description="Tags, by which several entries can be selected together.")
+    unit: Unit | None = Field(None, description="The unit of the object's field, if it is known.")
+    note: Note | None = Field(None, description="A comment.")
     symmetry: SaidSymmetry | None = Field(
-        None, description="In place of the detected one, for those who use the pose; null: the detected one."
+        None, description="Replaces the detected symmetry, for programs that use the pose. null: the detected one."
     )
 
 
@@ -94,9 +97,9 @@ class NewEntry(_Notes):
 
 
 class EntryChange(_Notes):
-    """What is to be changed of an entry. What is left out stays as it is."""
+    """Changes of an entry. Members that are left out are unchanged."""
 
-    name: EntryName | None = Field(None, description="Another name.")
+    name: EntryName | None = Field(None, description="The new name.")
 
 
 class EntryDocument(Outgoing):
@@ -104,17 +107,19 @@ class EntryDocument(Outgoing):
 
     name: str
     field: Sha256
-    state: Literal["validating", "ready", "rejected"] = Field(description="Of its field.")
+    state: Literal["validating", "ready", "rejected"] = Field(description="The state of its field.")
     tags: list[str] = Field([])
     unit: Unit | None = None
     note: str | None = None
-    symmetry: SymmetryDocument | None = Field(None, description="The one that holds: as said, or else as detected.")
+    symmetry: SymmetryDocument | None = Field(
+        None, description="The symmetry in use: the given one if there is one, else the detected one."
+    )
     symmetry_source: Literal["said", "detected"] | None = Field(
         None,
-        description="Null: nothing is said, and none was detected yet. A worker looks for it.",
+        description="Null: no symmetry was given, and the detection has not run yet. A worker runs it.",
     )
-    bounds: list[list[float]] | None = Field(None, description="Of the field: lowest and highest corner.")
-    surface_bounds: list[list[float]] | None = Field(None, description="Of its surface: the object's own size.")
+    bounds: list[list[float]] | None = Field(None, description="Bounds of the field: lowest and highest corner.")
+    surface_bounds: list[list[float]] | None = Field(None, description="Bounds of its surface: the size of the object.")
     added_at: Moment
     updated_at: Moment
     links: Links
@@ -128,7 +133,7 @@ class EntryPage(Outgoing):
 
 
 class LibraryFilter(Incoming):
-    """Entries with any of the names, and those with any of the tags; `{}`: all."""
+    """Entries with any of these names or any of these tags; `{}`: all entries."""
 
     names: Annotated[list[EntryName], Field(min_length=1, max_length=MAX_SELECTED)] | None = None
     tags: Annotated[list[EntryTag], Field(min_length=1, max_length=MAX_TAGS)] | None = None
@@ -146,7 +151,7 @@ class LibrarySelection(Incoming):
     library: LibraryFilter
 
 
-BY_DIGEST, BY_LIBRARY = "named by digest", "named in the library"
+BY_DIGEST, BY_LIBRARY = "by digest", "named in the library"
 
 
 def by_library(value: Any) -> str:

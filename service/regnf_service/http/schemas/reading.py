@@ -72,7 +72,9 @@ _FIELDS = frozenset({"scene", "object", "candidates", "replacement"})
 _TAGS = TRANSFORM_SPELLINGS | EDIT_KINDS | {BY_DIGEST, BY_LIBRARY}
 """Parts of places that no body has: which model of several was taken."""
 _HASH_DIGITS = 64
-_HASH_HINT = "A field is named by the SHA-256 of its file: `sha256sum FILE` prints it, and so does POST /fields."
+_HASH_HINT = (
+    "A field is identified by the SHA-256 of its file. `sha256sum FILE` prints it, and POST /fields returns it."
+)
 _Model = TypeVar("_Model")
 
 
@@ -111,7 +113,7 @@ def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
     """The problem for what a schema refused: the reason goes by the first faulty member, every fault is listed."""
     raw = error.errors(include_url=False)
     if any(fault["type"] == "json_invalid" for fault in raw):
-        return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
+        return Problem("MALFORMED_JSON", "A string has half of a surrogate pair.")
     faults = [_fault(entry, model) for entry in raw[:MAX_ERRORS]]
     deciding = next(filter(_reason, faults), None)
     reason = (deciding and _reason(deciding)) or otherwise
@@ -147,7 +149,7 @@ def _fault(entry: Any, model: Any) -> _Fault:
         meant = did_you_mean(place[1:])
         return _Fault(kind, place, "No such option" + meant, meant[2:3].upper() + meant[3:] or _meant(place, model))
     if kind in ("extra_forbidden", UNKNOWN_OPTION):
-        return _Fault(kind, place, "This member is not known.", _meant(place, model))
+        return _Fault(kind, place, "This member is unknown.", _meant(place, model))
     if kind == "string_pattern_mismatch" and not _FIELDS.isdisjoint(place):
         return _Fault(kind, place, _hash_fault(str(entry["input"])), _HASH_HINT)
     return _Fault(kind, place, detail, None)
@@ -160,9 +162,9 @@ def _meant(place: Sequence[str | int], model: Any) -> str | None:
 
 
 def _hash_fault(text: str) -> str:
-    expected = f"expected {_HASH_DIGITS} lower-case hexadecimal digits"
+    expected = f"expected {_HASH_DIGITS} lowercase hexadecimal digits"
     if len(text) == _HASH_DIGITS and text.lower() != text:
-        return f"It has upper-case letters, {expected}."
+        return f"It has uppercase letters, {expected}."
     if len(text) != _HASH_DIGITS:
         return f"It has {len(text)} characters, {expected}."
     return f"It has other characters than digits and a to f, {expected}."

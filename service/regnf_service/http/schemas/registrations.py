@@ -58,7 +58,8 @@ _Four = Annotated[list[Coordinate], Field(min_length=4, max_length=4)]
 
 
 class TransformObject(Incoming):
-    """A transform as results carry it. `matrix` holds all of it; the others may be left out, not contradict it."""
+    """A transform in the form of a result. `matrix` is complete; the other members are optional and must agree with
+    it."""
 
     matrix: Matrix
     scale: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
@@ -74,7 +75,7 @@ class TransformObject(Incoming):
         if self.rotation_quaternion_xyzw is not None:
             agrees = agrees and any(self.rotation_quaternion_xyzw) and self._is_turned(scale)
         if not agrees:
-            raise ValueError("scale, rotation_quaternion_xyzw or translation contradict the matrix")
+            raise ValueError("scale, rotation_quaternion_xyzw or translation do not match the matrix")
         return self
 
     def _is_turned(self, scale: float) -> bool:
@@ -114,13 +115,13 @@ def _one_direction(schema: dict[str, Any]) -> None:
 
 
 class ObjectPose(Incoming):
-    """Where the object is, in one of two directions."""
+    """The object's pose, in one of two directions."""
 
     model_config = ConfigDict(json_schema_extra=_one_direction)
 
     T_object_scene: Similarity | None = Field(None, description="Scene coordinates to object coordinates.")
     T_scene_object: Similarity | None = Field(
-        None, description="Object coordinates to scene coordinates, as results have it."
+        None, description="Object coordinates to scene coordinates, as in results."
     )
 
     @model_validator(mode="after")
@@ -134,7 +135,7 @@ class ObjectPose(Incoming):
         """The 4x4 T_object_scene."""
         if self.T_object_scene is not None:
             return rows_of(self.T_object_scene)
-        assert self.T_scene_object is not None, "one of both is given"
+        assert self.T_scene_object is not None, "give exactly one of them"
         return inverse_rows(rows_of(self.T_scene_object))
 
 
@@ -157,7 +158,7 @@ PRESET_FAULT = "preset_unsuitable"
 
 
 class FieldReference(Incoming):
-    """A field by the SHA-256 of the bytes that were uploaded."""
+    """A field, identified by the SHA-256 of the uploaded file."""
 
     field: Sha256
 
@@ -171,13 +172,13 @@ Reference = Annotated[Sha256, BeforeValidator(_bare_reference, json_schema_input
 
 def _given(value: Any) -> Any:
     if value is None:
-        raise ValueError("leave it out, or name something")
+        raise ValueError("leave it out, or give at least one")
     return value
 
 
 def _distinct(names: list[str]) -> list[str]:
     if len(set(names)) < len(names):
-        raise ValueError("a field is named twice")
+        raise ValueError("a field is given twice")
     return names
 
 
@@ -200,24 +201,27 @@ class RegistrationSpec(Incoming):
     """What a registration asks for, apart from the fields: the part `request` of a one-shot upload."""
 
     detection: AnyDetection = Field(
-        description="Where in the scene the object is: a box; of a recording also the thing in its images."
+        description="Where in the scene the object is: a box. For a recording also a mask, box or point in its images."
     )
     options: RegistrationOptions = Field(default_factory=RegistrationOptions)
     seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="The same seed gives the same result.")] = 0
     initial_transform: Start | None = Field(
         None,
-        description="Where to look first: everything else is searched only if that is rejected or less likely than "
-        "0.95. A bare transform is a T_object_scene. For the preset `robust`.",
+        description="Initial guess. The full search runs only if the pose from the initial guess is rejected or "
+        "has a probability below 0.95. A transform without a name is a T_object_scene. Only for the "
+        "preset `robust`.",
     )
-    ground_truth: ObjectPose | None = Field(None, description="The known pose: the metrics then hold the errors.")
+    ground_truth: ObjectPose | None = Field(
+        None, description="The true pose. If it is given, the metrics have the errors."
+    )
     webhook: Webhook | None = Field(
-        None, description="Told of the job's end, at once if it has finished. Only hosts that the service allows."
+        None, description="Gets a message when the job ends, at once if it has ended. The service must allow the host."
     )
 
     pictures: StrictBool = Field(
         True,
-        description="Whether the result gets clouds of points, residuals and a picture, which take a worker a third "
-        "of a small registration's time. Without them it has the numbers.",
+        description="Whether the job makes diagnostic artifacts: point clouds, residuals and a picture. They take "
+        "about a third of the time of a small registration. The numbers in the result are the same without them.",
     )
 
     @field_validator("initial_transform")
@@ -225,7 +229,7 @@ class RegistrationSpec(Incoming):
     def _is_of_use(cls, start: Any, info: ValidationInfo) -> Any:
         options = info.data.get("options")  # absent when they were refused themselves
         if start is not None and options is not None and options.preset != "robust":
-            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` starts from a given transform")
+            raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` can use an initial transform")
         return start
 
     def to_request(
@@ -264,7 +268,7 @@ def _nothing_needed(schema: dict[str, Any]) -> None:
 
 
 class RegisterRequest(RegistrationSpec):
-    """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among."""
+    """One registration: the scene, the detection in it, and the object, or the candidates to choose from."""
 
     model_config = ConfigDict(json_schema_extra=_one_of_both)
 
@@ -276,8 +280,8 @@ class RegisterRequest(RegistrationSpec):
         SeveralObjects | None, BeforeValidator(_given, json_schema_input_type=Candidates | LibrarySelection)
     ] = Field(
         None,
-        description="Instead of `object`: fields, or entries of the library. The likeliest is found and registered by "
-        "the preset `robust`, and the result ranks them.",
+        description="Instead of `object`: fields, or entries of the library. The preset `robust` registers the "
+        "most probable one. The result ranks the candidates.",
     )
 
     @field_validator("candidates")
@@ -289,7 +293,7 @@ class RegisterRequest(RegistrationSpec):
         if options is not None and options.preset != "robust":
             raise PydanticCustomError(PRESET_FAULT, "only the preset `robust` searches a library")
         if info.data.get("initial_transform") is not None:
-            raise PydanticCustomError(PRESET_FAULT, "a search of a library starts from no given transform")
+            raise PydanticCustomError(PRESET_FAULT, "a search of a library cannot use an initial transform")
         if info.data.get("ground_truth") is not None:
             raise ValueError("a ground truth applies to one object, not to several candidates")
         return names
@@ -302,13 +306,13 @@ class RegisterRequest(RegistrationSpec):
 
 
 class OneShotRequest(RegisterRequest):
-    """The part `request` of a registration whose scene, and perhaps whose object, is in the same body."""
+    """The part `request` of a registration that is sent together with its scene, and optionally its object."""
 
     model_config = ConfigDict(json_schema_extra=_nothing_needed)
 
     scene: None = None  # type: ignore[assignment]
     detection: AnyDetection | None = Field(  # type: ignore[assignment]
-        None, description="Where in the scene the object is; of a frame in place of the part `mask`."
+        None, description="Where in the scene the object is. For a frame, the part `mask` can be used instead."
     )
 
     @model_validator(mode="after")
@@ -319,7 +323,7 @@ class OneShotRequest(RegisterRequest):
 
 
 class DryRunDocument(Outgoing):
-    """The answer to `?dry_run=true`: the request would be accepted, and this is what it would become."""
+    """The response to `?dry_run=true`: the request would be accepted, and these would be its values."""
 
     valid: bool
     id: str

@@ -26,7 +26,7 @@ class Incoming(BaseModel):
 
 
 class ProblemEntry(Outgoing):
-    """One fault: a JSON Pointer into the body, or the name of a query parameter or header."""
+    """One error: a JSON Pointer into the body, or the name of a query parameter or header."""
 
     pointer: str | None = None
     parameter: str | None = None
@@ -34,30 +34,32 @@ class ProblemEntry(Outgoing):
 
 
 class ReadingDocument(Outgoing):
-    """One of several functions that an upload may be."""
+    """One of several possible readings of an uploaded file."""
 
     name: str
-    description: dict[str, Any] = Field(description="The entries that choose it: send them with PATCH.")
-    picture: Address | None = Field(None, description="Its picture, for as long as the upload is kept.")
+    description: dict[str, Any] = Field(
+        description="The import options that select this reading. Send them with PATCH."
+    )
+    picture: Address | None = Field(None, description="Its picture. It is there while the upload is kept.")
 
 
 class ProblemDocument(Outgoing):
-    """RFC 9457 problem details. Programs switch on `reason`, never on text."""
+    """RFC 9457 problem details. Programs should branch on `reason`, never on the text."""
 
     type: Address
     title: str
     status: Annotated[int, Field(ge=400, le=599)]
     reason: str
     detail: str
-    hint: str | None = Field(None, description="What to do next, for people.")
+    hint: str | None = Field(None, description="What the user can do next.")
     instance: str | None = None
     request_id: str | None = None
     errors: list[ProblemEntry] = Field([])
     candidates: list[ReadingDocument] = Field(
-        [], description="With a field's `LAYOUT_AMBIGUOUS`: what it may be, the likeliest first."
+        [], description="With a field's `LAYOUT_AMBIGUOUS`: the possible readings of the file, the most probable first."
     )
-    error: ProblemDocument | None = Field(None, description="With `JOB_FAILED`: the job's own problem.")
-    offset: int | None = Field(None, description="Of an upload in pieces: how many bytes have arrived.")
+    error: ProblemDocument | None = Field(None, description="With `JOB_FAILED`: the reason why the job failed.")
+    offset: int | None = Field(None, description="For an upload in pieces: the number of bytes that have arrived.")
 
 
 def outgoing_problem(error: dict[str, Any] | None) -> dict[str, Any] | None:
@@ -65,24 +67,24 @@ def outgoing_problem(error: dict[str, Any] | None) -> dict[str, Any] | None:
     return None if error is None else whole_problem(error)
 
 
-# What the service says about itself.
+# State, version and contract of the service.
 
 
 class HealthDocument(Outgoing):
-    """The process answers."""
+    """The process responds."""
 
     status: Literal["ok"]
 
 
 class ReadyDocument(Outgoing):
-    """Every part the service needs is there."""
+    """All parts that the service needs are available."""
 
     status: Literal["ready"]
     checks: dict[str, bool]
 
 
 class VersionDocument(Outgoing):
-    """What runs here."""
+    """Version of the service."""
 
     name: Literal["regnf"]
     version: str
@@ -90,7 +92,7 @@ class VersionDocument(Outgoing):
 
 
 class IndexDocument(Outgoing):
-    """Every address, each with what it is for."""
+    """All addresses, each with its purpose."""
 
     name: Literal["regnf"]
     version: str
@@ -98,7 +100,7 @@ class IndexDocument(Outgoing):
 
 
 class DemoFile(Outgoing):
-    """A field file to fetch and to upload."""
+    """A field file, which you can download and upload."""
 
     name: str
     bytes: int
@@ -106,7 +108,7 @@ class DemoFile(Outgoing):
 
 
 class DemoDocument(Outgoing):
-    """A scene and an object to try, and a detection as `POST /register` takes it."""
+    """An example scene and object, and a detection for `POST /register`."""
 
     scene: DemoFile
     object: DemoFile

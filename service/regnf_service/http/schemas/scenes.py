@@ -22,7 +22,7 @@ _EITHER = "an edit has either `job`, or `object` and `T_object_scene`"
 
 
 class _Edit(Incoming):
-    name: Name | None = Field(None, description="For people.")
+    name: Name | None = Field(None, description="A comment.")
 
     def plain(self) -> dict[str, Any]:
         """The members that were given, as plain values; a transform as its rows."""
@@ -44,15 +44,19 @@ def _without_nulls(schema: dict[str, Any]) -> None:
 class _OfObject(_Edit):
     model_config = ConfigDict(json_schema_extra=_without_nulls)
 
-    job: _JobId | None = Field(None, description="A finished registration in this scene: its object, where it is.")
-    object: Reference | None = Field(None, description="Instead of `job`: the field of what stands there.")
+    job: _JobId | None = Field(
+        None, description="A finished registration in this scene. Its object is used, at its pose."
+    )
+    object: Reference | None = Field(None, description="Instead of `job`: the field of the object in the scene.")
     T_object_scene: Similarity | None = Field(None, description="With `object`: scene to object coordinates.")
     residual: Residual | None = Field(
-        None, description="How far surfaces are apart, object units: of the job's result where it is left out."
+        None,
+        description="Distance between the surfaces of object and scene, object units. Default: that of the job's "
+        "result.",
     )
 
     def named(self) -> bool:
-        """Whether a thing is named at all. Raises ValueError for half of a name, or for two."""
+        """Whether an object is named at all. Raises ValueError for half of a name, or for two."""
         pair = (self.object is not None, self.T_object_scene is not None)
         if pair[0] != pair[1] or (self.job is not None and pair[0]):
             raise ValueError(_EITHER)
@@ -68,19 +72,19 @@ class _OfNamedObject(_OfObject):
 
 
 class Substitution(_OfNamedObject):
-    """The object's own field where the scene shows the object."""
+    """Substitutes the object's own field for the object in the scene."""
 
     kind: Literal["substitution"]
-    tint: Rgb | None = Field(None, description="sRGB, 0 to 1: what its surface is colored with.")
+    tint: Rgb | None = Field(None, description="sRGB, 0 to 1: color of its surface.")
 
 
 class Replacement(_OfNamedObject):
-    """Another object in place of one that was registered."""
+    """Replaces a registered object by another object."""
 
     kind: Literal["replacement"]
-    replacement: Reference = Field(description="The field of what will stand there.")
+    replacement: Reference = Field(description="The field of the new object.")
     T_replacement_object: Similarity | None = Field(
-        None, description="From the object's coordinates to the replacement's. Left out: on the same base, as large."
+        None, description="From the object's coordinates to the replacement's. Default: same base, same size."
     )
     match: Literal["height", "diagonal"] = "height"
     up_object: Axis = "z"
@@ -89,10 +93,10 @@ class Replacement(_OfNamedObject):
 
 
 class Removal(_OfObject):
-    """What stands in the box, or what was registered, is taken away; floor and walls go on."""
+    """Removes the content of a box or a registered object. Floor and walls are continued there."""
 
     kind: Literal["removal"]
-    detection: Detection | None = Field(None, description="A box round all of it, in the scene.")
+    detection: Detection | None = Field(None, description="A box in the scene around the whole object.")
 
     @model_validator(mode="after")
     def _names_something(self) -> Removal:
@@ -102,11 +106,11 @@ class Removal(_OfObject):
 
 
 class Insertion(_Edit):
-    """An object where nothing of the scene is removed."""
+    """Adds an object. Nothing of the scene is removed."""
 
     kind: Literal["insertion"]
     object: Reference
-    T_object_scene: Similarity = Field(description="Scene to object coordinates: any similarity.")
+    T_object_scene: Similarity = Field(description="Scene to object coordinates: any similarity transform.")
     tint: Rgb | None = None
 
 
@@ -118,13 +122,15 @@ Edit = Annotated[Substitution | Replacement | Removal | Insertion, Discriminator
 MOST_CAMERAS = 256
 """That a request lists: its record is held until the job ends."""
 _Count = Annotated[int, Field(ge=1)]
-_Resolution = Annotated[int, Field(ge=2, le=1024, description="Cells along the longest edge of the scene's bounds.")]
+_Resolution = Annotated[
+    int, Field(ge=2, le=1024, description="Number of cells along the longest edge of the scene's bounds.")
+]
 
 
 @dataclass(frozen=True)
 class Orbit(OrbitRequest):
-    """Cameras round one thing: the object of the edit of this number, or a box; left out: of the first edit, or without
-    edits the whole scene."""
+    """Cameras on an orbit around the object of the edit with this number, or around a box. Default: around the object
+    of the first edit, or without edits around the whole scene."""
 
     detection: Detection | None = None
 
@@ -132,36 +138,39 @@ class Orbit(OrbitRequest):
 class CameraFile(Incoming):
     """The cameras of a transforms.json, as nerfstudio and instant-ngp write it."""
 
-    document: dict[str, Any] = Field(description="All of the file.")
+    document: dict[str, Any] = Field(description="The content of the file.")
     T_scene_file: Similarity | None = Field(
-        None, description="From the file's world to the scene's. Left out: as the file says, or the same."
+        None,
+        description="From the world frame of the file to that of the scene. Default: the transform in the file, "
+        "or the identity.",
     )
-    every: Annotated[int, Field(ge=1, le=10_000, description="Take one camera of so many.")] = 1
+    every: Annotated[int, Field(ge=1, le=10_000, description="Use every N-th camera.")] = 1
 
 
 class RenderBody(Incoming):
-    """One rendering of a scene with its edits: one of `orbit`, `look_at`, `poses` and `transforms`, or an orbit."""
+    """One rendering of a scene with edits. The cameras are given by one of `orbit`, `look_at`, `poses` and
+    `transforms`. Default: an orbit."""
 
-    scene: Reference = Field(description="The scene's field: an edited scene, too, is one.")
+    scene: Reference = Field(description="The scene's field. It may be an edited scene.")
     edits: Annotated[list[Edit], Field(max_length=MOST_EDITS)] = Field([])
     orbit: Orbit | None = None
     look_at: Annotated[list[StationRequest], Field(min_length=1, max_length=MOST_CAMERAS)] | None = None
     poses: Annotated[list[PoseRequest], Field(min_length=1, max_length=MOST_CAMERAS)] | None = None
     transforms: CameraFile | None = None
     size: tuple[_Count, _Count] | None = Field(
-        None, description="Width and height of every frame. Left out: 480 x 360, or as the cameras say."
+        None, description="Width and height of every frame. Default: 480 x 360, or the size in the camera file."
     )
     options: RenderOptions = Field(default_factory=RenderOptions)
     outputs: Annotated[list[Output], Field(min_length=1, max_length=16)] = Field(
         ["color", "depth", "normal", "strip"],
-        description="color, depth, normal: files of each frame. animation: WebP. strip: before and after. mesh: "
-        "composite.glb. field: the edited scene, which becomes a field.",
+        description="color, depth, normal: one file per frame. animation: WebP. strip: before and after. mesh: "
+        "composite.glb. field: the edited scene as a new field.",
     )
     before: bool = Field(True, description="Whether the scene without its edits is rendered too.")
     mesh_resolution: _Resolution = 192
     field_resolution: _Resolution = 192
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
-    webhook: Webhook | None = Field(None, description="As of a registration.")
+    webhook: Webhook | None = Field(None, description="As for a registration.")
 
     @model_validator(mode="after")
     def _has_one_kind_of_cameras(self) -> RenderBody:
@@ -180,21 +189,25 @@ class RenderBody(Incoming):
 
 
 class FileEntry(ArtifactEntry):
-    """One file that a rendering has made."""
+    """One file of a rendering."""
 
     kind: Literal["color", "depth", "normal", "animation", "strip", "mesh", "field", "report"] | None = None
-    frame: int | None = Field(None, description="Its number; null for what is of all frames.")
-    before: bool = Field(False, description="Whether it shows the scene without its edits.")
+    frame: int | None = Field(None, description="Number of the frame; null for a file about all frames.")
+    before: bool = Field(False, description="Whether the file shows the scene without its edits.")
 
 
 class RenderResultDocument(Outgoing):
-    """What a rendering has made."""
+    """The result of a rendering."""
 
     frames: int
     size: list[int]
-    depth_unit: float = Field(description="Scene units that a level of the depth PNGs stands for; 0 is nothing met.")
-    seconds: dict[str, float] = Field({}, description="Of each stage.")
-    field: str | None = Field(None, description="SHA-256 of the edited scene's field, if it was asked for.")
+    depth_unit: float = Field(
+        description="Scene units per level of the depth PNGs. The level 0 means that the ray hit no surface."
+    )
+    seconds: dict[str, float] = Field({}, description="Time of each stage, seconds.")
+    field: str | None = Field(
+        None, description="SHA-256 of the edited scene's field, if the output `field` was requested."
+    )
     seed: int = 0
     options: dict[str, Any] = Field({})
     engine: dict[str, Any] = Field({})

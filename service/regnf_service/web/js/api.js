@@ -1,4 +1,4 @@
-// The job's own part of the HTTP API. Every address is below the job's, taken from the page's own address.
+// The job's own part of the HTTP API. Every address is below that of the job, which is taken from the address of the page.
 
 import { patientFetch } from './patience.js';
 
@@ -7,7 +7,7 @@ export const TOKEN_KEY = 'regnf.token';
 /** What the service answers instead of a result: RFC 9457 problem details. */
 export class ApiProblem extends Error {
   constructor(status, problem = {}) {
-    super(problem.detail || problem.title || `The service answered ${status}`);
+    super(problem.detail || problem.title || `The service responded with ${status}`);
     this.status = status;
     this.problem = problem;
     this.reason = problem.reason ?? '';

@@ -61,7 +61,7 @@ async function main() {
 
 /** What can be done with a job that has ended. */
 function offerActs(job) {
-  const service = new Service(() => Promise.reject(new Error('The token is no longer valid. Reload the page.')));
+  const service = new Service(() => Promise.reject(new Error('The token is not valid. Reload the page.')));
   show(byId('run-again'), canRunAgain(job));
   show(byId('delete-job'));
   byId('run-again').onclick = () => runAgain(service, job);
@@ -107,7 +107,7 @@ async function showResult(job, result) {
 
 async function showStage(job, result, frames, names) {
   const stage = new Stage(api, names, fieldNames);
-  showLoading('Fetching the surfaces');
+  showLoading('Loading the surfaces');
   try {
     await stage.open(job, result, frames);
     hideCard();
@@ -146,7 +146,7 @@ async function showStage(job, result, frames, names) {
     playback.nameInstead('A candidate pose');
     showTransform(pose, 'A candidate pose');
   });
-  announce('The surfaces are shown.');
+  announce('The surfaces are displayed.');
   if (!prefersStillness() && frames.length > 1) playback.play();
 }
 

@@ -4,13 +4,13 @@ import { announce, byId, el, show } from './dom.js';
 import { number } from './format.js';
 
 const ROWS = [['Center', 'center'], ['Size', 'size']];
-const FIRST = 'Click a thing in the scene: it gets a box. Click it again for a larger or smaller one.';
-const ONE_MORE = 'Click the thing again for a larger or smaller box. A click elsewhere moves the box there; Add a box keeps it.';
+const FIRST = 'Click an object in the scene to get a box around it. Click it again for a larger or smaller box.';
+const ONE_MORE = 'Click the object again for a larger or smaller box. A click elsewhere moves the box there. Add a box keeps this box and starts another.';
 
 export class BoxList {
   /** workspace() is where they are drawn; onChange() hears that there are others. */
   constructor(workspace, onChange) {
-    Object.assign(this, { workspace, onChange, boxes: [], edits: null, adding: false, made: 0, title: 'Boxes', one: 'Add a box', wanted: 'a box: click a thing in the scene' });
+    Object.assign(this, { workspace, onChange, boxes: [], edits: null, adding: false, made: 0, title: 'Boxes', one: 'Add a box', wanted: 'a box: click an object in the scene' });
     this.inputs = this.makeInputs();
   }
 
@@ -37,7 +37,7 @@ export class BoxList {
   add() {
     this.adding = true;
     this.rest();
-    byId('boxes-note').textContent = 'Click the next thing: it gets a box of its own.';
+    byId('boxes-note').textContent = 'Click the next object to get a box around it.';
   }
 
   /** Leaves the view to what was found: no box is edited. */

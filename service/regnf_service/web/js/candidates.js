@@ -24,7 +24,7 @@ async function listOf(api, name, sha256) {
 
 async function figureOf(api, heading, sha256, candidate, number) {
   const said = JSON.stringify(candidate.description);
-  const copy = el('button', { type: 'button', className: 'quiet', 'aria-label': `Copy what to say for ${heading}` }, 'Copy');
+  const copy = el('button', { type: 'button', className: 'quiet', 'aria-label': `Copy the import option for ${heading}` }, 'Copy');
   copy.addEventListener('click', () => copyText(said, copy));
   const line = el('div', { className: 'row' }, el('code', {}, said), copy);
   const caption = el('figcaption', { className: 'note' }, `${heading}: ${candidate.name}`);

@@ -30,11 +30,11 @@ function inWords({ uncertainty, metrics, T_scene_object: pose }) {
   const [center, turn, scale] = [most(uncertainty?.center_scene), most(uncertainty?.rotation_deg), uncertainty?.scale_percent];
   const share = (100 * center) / ((metrics?.object_diameter ?? NaN) * (pose?.scale ?? NaN));
   const parts = [
-    Number.isFinite(center) && `its center to ± ${number(center, 2)} scene units${Number.isFinite(share) ? `, ${number(share, 2)} % of its size` : ''}`,
-    Number.isFinite(turn) && `its rotation to ± ${number(turn, 2)}°`,
-    Number.isFinite(scale) && `its scale to ± ${number(scale, 2)} %`,
+    Number.isFinite(center) && `its center within ± ${number(center, 2)} scene units${Number.isFinite(share) ? `, ${number(share, 2)} % of its size` : ''}`,
+    Number.isFinite(turn) && `its rotation within ± ${number(turn, 2)}°`,
+    Number.isFinite(scale) && `its scale within ± ${number(scale, 2)} %`,
   ].filter(Boolean);
-  return parts.length ? `If the pose is right, it is known: ${parts.join('; ')}.` : '';
+  return parts.length ? `If the pose is correct, it is known: ${parts.join('; ')}.` : '';
 }
 
 /** { order, axis, continuous } in words. */

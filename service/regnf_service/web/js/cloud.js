@@ -11,7 +11,7 @@ const MODES = { layer: 0, residual: 1, file: 2 };
 /** A geometry from the bytes of a PLY file with x y z and, where given, nx ny nz and red green blue. */
 export function geometryFromPly(buffer) {
   const geometry = new PLYLoader().parse(buffer);
-  if (!geometry.getAttribute('position')?.count) throw new Error('the file holds no points');
+  if (!geometry.getAttribute('position')?.count) throw new Error('the file has no points');
   const color = geometry.getAttribute('color');
   if (color) geometry.setAttribute('aColor', displayColors(color));
   geometry.computeBoundingSphere();

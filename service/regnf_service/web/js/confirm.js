@@ -40,7 +40,7 @@ export function askFirst({ what, lost, verb, act }) {
 /** What is asked before a job is deleted, and done. */
 export const deletionOf = (service, job, name) => ({
   what: `Delete the job “${name}”?`,
-  lost: 'Its result, pictures and files are deleted. The fields stay.',
+  lost: 'Its result, pictures and files are deleted. The fields are kept.',
   verb: 'Delete',
   act: () => service.request(`/jobs/${job.id}`, { method: 'DELETE' }),
 });

@@ -7,9 +7,9 @@ import { inverse, readSim3 } from './sim3.js';
 
 const ROWS = [
   ['Score, lower is better', 'score', (value) => number(value, 3)],
-  ['Object confirmed by the scene', 'inlier_share_object', percent], ['Scene nearby explained', 'inlier_share_scene', percent],
-  ['Object in free space', 'free_space_violations', percent], ['Object not seen', 'occluded_share_object', percent],
-  ['Other surface joined to it', 'unexplained_share_scene', percent],
+  ['Object inliers', 'inlier_share_object', percent], ['Scene inliers', 'inlier_share_scene', percent],
+  ['Object in free space', 'free_space_violations', percent], ['Object unobserved', 'occluded_share_object', percent],
+  ['Scene unexplained', 'unexplained_share_scene', percent],
 ];
 const AGREES = 'SURFACES_AGREE';
 /** Of the signs in considered.npz, the property of the style sheet that colors them; others are not drawn. */
@@ -34,7 +34,7 @@ export function offerConsidered(api, result, names, onChoose) {
   };
   byId('considered-list').replaceChildren(el('legend', { className: 'unseen' }, 'Candidate pose'), ...poses.map((one, i) => {
     const input = el('input', { type: 'radio', name: 'considered', value: String(i), onchange: () => choose(i) });
-    const words = one.reason === AGREES ? 'The surfaces agree.' : one.detail || one.reason;
+    const words = one.reason === AGREES ? 'The surfaces match.' : one.detail || one.reason;
     return el('label', { title: one.reason }, input, el('span', {}, words), el('span', { className: 'mono' }, sureOf(one) ?? '–'));
   }));
   show(byId('considered'), poses.length > 0);

@@ -27,8 +27,8 @@ export async function readSentences() {
 
 /** Where work stands that no worker has yet: a job's or a field's document. */
 export function queueWords({ queue_position: position }) {
-  if (!Number.isFinite(position)) return 'Waiting for a worker: the next free one takes it';
-  return position <= 1 ? 'Waiting for a worker: it is next' : `Waiting for a worker: ${position - 1} before it`;
+  if (!Number.isFinite(position)) return 'Waiting for a worker';
+  return position <= 1 ? 'Waiting for a worker: this job is next' : `Waiting for a worker: ${position - 1} before it`;
 }
 
 /** The detection box { center, size, quaternion } in the scene frame, or null. */

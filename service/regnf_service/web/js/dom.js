@@ -59,7 +59,7 @@ export async function copyText(text, button) {
   const label = button.dataset.label ?? button.textContent;
   button.dataset.label = label;
   button.textContent = copied ? 'Copied' : 'Not allowed';
-  announce(copied ? 'Copied' : 'The browser did not allow copying');
+  announce(copied ? 'Copied' : 'The browser does not allow copying');
   setTimeout(() => { button.textContent = label; }, 1500);
 }
 

@@ -30,11 +30,11 @@ export function entryTile(service, entry, acts) {
 
 /** What is known of an object's symmetry, and from where. */
 export function symmetryWords({ symmetry, symmetry_source: source }) {
-  if (!symmetry) return 'symmetry not known yet';
+  if (!symmetry) return 'symmetry not detected yet';
   const { order, axis, continuous } = symmetry;
   const about = axis ? ` about ${axis.map((part) => number(part, 2)).join(', ')}` : '';
-  const turns = continuous ? `every turn${about}` : order > 1 ? `${order} turns${about}` : 'no symmetry';
-  return source === 'said' ? `${turns} (as said)` : turns;
+  const turns = continuous ? `every rotation${about}` : order > 1 ? `${order} rotations${about}` : 'no symmetry';
+  return source === 'said' ? `${turns} (as given)` : turns;
 }
 
 function actions(service, entry, acts) {

@@ -45,7 +45,7 @@ export class FieldTiles {
       sayRole(field.sha256, select.value);
       this.store.tell();
     };
-    return el('label', { className: 'role note', title: 'Your choice is kept in this browser only.' }, 'This is ', select);
+    return el('label', { className: 'role note', title: 'Your choice is stored only in this browser.' }, 'This is ', select);
   }
 
   actions(field) {
@@ -85,7 +85,7 @@ export class FieldTiles {
 
   async remove(field) {
     const what = `Delete ${nameOf(field)}?`;
-    const lost = 'The service forgets it; the file on your own disk stays. Jobs that used it keep their results.';
+    const lost = 'The service deletes it. The file on your own disk is kept. Jobs that used it keep their results.';
     const act = () => this.service.request(`/fields/${field.sha256}`, { method: 'DELETE' });
     if (await askFirst({ what, lost, verb: 'Delete', act })) await this.refresh();
   }

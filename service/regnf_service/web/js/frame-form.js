@@ -46,7 +46,7 @@ export class FrameForm {
     const examples = { fx: FOCAL * width, fy: 'as fx', cx: (width - 1) / 2, cy: (height - 1) / 2 };
     for (const [name, example] of Object.entries(examples)) byId(`camera-${name}`).placeholder = String(example);
     byId('camera-unit').disabled = /\.npy$/i.test(this.parts.depth.name);
-    this.say(`${this.parts.depth.name}: no file says the camera's intrinsics. Type them under Scene, or add a camera.json.`);
+    this.say(`${this.parts.depth.name}: no file has the camera's intrinsics. Enter them under Scene, or add a camera.json.`);
     show(byId('camera-form'));
     byId('camera-fx').focus();
   }

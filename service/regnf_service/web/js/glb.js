@@ -9,7 +9,7 @@ const NAMES = { POSITION: 'position', NORMAL: 'normal', COLOR_0: 'aColor' };
 /** A geometry from the bytes of a GLB file. Raises Error on what the service does not write. */
 export function geometryFromGlb(buffer) {
   const view = new DataView(buffer);
-  if (view.getUint32(0, true) !== 0x46546c67) throw new Error('the service sent no mesh');
+  if (view.getUint32(0, true) !== 0x46546c67) throw new Error('the service did not send a mesh');
   const length = view.getUint32(12, true);
   const document = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, length)));
   const start = 28 + length;

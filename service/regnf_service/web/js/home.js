@@ -59,11 +59,11 @@ async function showField(field, up, isLatest) {
   });
   tell(`${nameOf(field)}: its surface is being drawn.`);
   await workspace.showScene(service, field.sha256, up);
-  if (isLatest()) tell(`${nameOf(field)}: click the thing to look for.`);
+  if (isLatest()) tell(`${nameOf(field)}: click the object to register.`);
 }
 
 async function showRecording(recording) {
-  tell(`${nameOf(recording)}: click the thing to look for, or draw a box round it.`);
+  tell(`${nameOf(recording)}: click the object to register, or draw a box around it.`);
   await pictures.open(service, recording);
 }
 
@@ -86,7 +86,7 @@ function update() {
   byId('register').disabled = starting || missing.length > 0;
   byId('add-box').disabled = !scene.field;
   byId('missing').textContent = missing.length ? `Missing: ${missing.join('; ')}.` : '';
-  if (list.boxes.length) tell(objects.chosen().length ? '' : 'Now add the object that this may be.');
+  if (list.boxes.length) tell(objects.chosen().length ? '' : 'Now add the object.');
 }
 
 byId('register').addEventListener('click', async () => {

@@ -13,7 +13,7 @@ export async function showInImage(api, { camera }, names) {
   fillFacts(byId('in-image-facts'), [
     ['Center, m', center?.length ? mono(center.map((part) => fixed(part, 4)).join('  ')) : null],
     ['Distance, m', center?.length ? mono(fixed(Math.hypot(...center), 4)) : null],
-    ['Unit of the object’s file', unit ? mono(`${number(unit)} m`) : 'not known'],
+    ['Unit of the object’s file', unit ? mono(`${number(unit)} m`) : 'unknown'],
   ]);
   show(byId('in-image'));
   if (!names.includes(OVERLAY)) return;

@@ -39,7 +39,7 @@ export async function showStrip(api, names) {
 }
 
 async function renderInScene(api, request) {
-  note('Asking for the picture');
+  note('Requesting the picture');
   let job = await api.startRendering(request);
   const rendering = api.ofJob(job.id);
   while (isActive(job)) {
@@ -49,7 +49,7 @@ async function renderInScene(api, request) {
   if (job.status !== 'successful') throw new ApiProblem(409, job.error ?? { detail: 'The rendering was dismissed.' });
   await showStrip(rendering, [STRIP]);
   byId('in-scene-note').replaceChildren(el('a', { href: job.links.view }, 'The rendering and its files'));
-  announce('The picture is shown.');
+  announce('The picture is displayed.');
 }
 
 /** One view of the object from above, and the same of the scene without it; walls before the camera are cut away. */

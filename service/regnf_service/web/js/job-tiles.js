@@ -57,7 +57,7 @@ export class JobTiles {
     return [
       job.error && toldOf(job.error),
       job.status === 'accepted' && queueWords(job),
-      candidates && job.object_found && job.verdict !== 'rejected' && `the likeliest of ${candidates} objects`,
+      candidates && job.object_found && job.verdict !== 'rejected' && `the most probable of ${candidates} objects`,
       Number.isFinite(job.probability) && `probability ${sure(job.probability, job.level)}`,
       boxOfJob(job),
       times.filter(Boolean).join(', '),

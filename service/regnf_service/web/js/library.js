@@ -35,7 +35,7 @@ function drawTags() {
   const chosen = byId('tag').value;
   const tags = [...new Set(entries.flatMap((entry) => entry.tags))].sort((a, b) => a.localeCompare(b));
   const options = tags.map((tag) => el('option', { value: tag }, tag));
-  byId('tag').replaceChildren(el('option', { value: '' }, 'every tag'), ...options);
+  byId('tag').replaceChildren(el('option', { value: '' }, 'all tags'), ...options);
   byId('tag').value = tags.includes(chosen) ? chosen : '';
 }
 
@@ -46,7 +46,7 @@ function draw() {
   byId('list').replaceChildren(...shown.map((entry) => tiles.get(entry)));
   byId('note').textContent = entries.length
     ? `${shown.length} of ${entries.length}`
-    : 'Nothing in the library yet. Add objects: files, or a field that the service has.';
+    : 'The library is empty. Add objects: files, or a field of the service.';
   const ready = shown.filter(({ state }) => state === 'ready');
   show(byId('search-these'), ready.length > 1 && !text);
   byId('search-these').textContent = `Search for one of these ${ready.length}`;
@@ -55,8 +55,8 @@ function draw() {
 }
 
 async function remove(entry) {
-  const what = `Take ${entry.name} out of the library?`;
-  const lost = 'Its name, tags, unit, note and symmetry are deleted. The field stays.';
+  const what = `Remove ${entry.name} from the library?`;
+  const lost = 'Its name, tags, unit, note and symmetry are deleted. The field is kept.';
   const act = () => service.request(`/library/${encodeURIComponent(entry.name)}`, { method: 'DELETE' });
   if (await askFirst({ what, lost, verb: 'Remove', act })) await refresh();
 }

@@ -2,13 +2,13 @@
 
 import { announce, byId, el, show } from './dom.js';
 
-const FIRST = 'Click the thing in the picture, or draw a box round it.';
-const ONE_MORE = 'A click or a box elsewhere moves the mark there; Add a mark keeps it.';
+const FIRST = 'Click the object in the picture, or draw a box around it.';
+const ONE_MORE = 'A click or a box elsewhere moves the mark there. Add a mark keeps this mark and starts another.';
 
 export class MarkList {
   /** view() is the picture that they are drawn in; onChange() hears that there are others. */
   constructor(view, onChange) {
-    Object.assign(this, { view, onChange, boxes: [], edits: null, adding: false, made: 0, title: 'Marks', one: 'Add a mark', wanted: 'a mark: click a thing in the picture' });
+    Object.assign(this, { view, onChange, boxes: [], edits: null, adding: false, made: 0, title: 'Marks', one: 'Add a mark', wanted: 'a mark: click an object in the picture' });
   }
 
   /** What was marked: a thing more, or another place of the one that is edited. */
@@ -26,7 +26,7 @@ export class MarkList {
   add() {
     this.adding = true;
     this.rest();
-    byId('boxes-note').textContent = 'Click the next thing, or draw a box round it.';
+    byId('boxes-note').textContent = 'Click the next object, or draw a box around it.';
   }
 
   rest() {

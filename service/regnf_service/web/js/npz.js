@@ -31,7 +31,7 @@ function findEnd(view) {
   for (let at = view.byteLength - 22; at >= 0; at -= 1) {
     if (view.getUint32(at, true) === END_OF_DIRECTORY) return at;
   }
-  throw new Error('this is no zip archive');
+  throw new Error('this is not a zip archive');
 }
 
 async function unpack(buffer, view, { method, packed, offset }) {
@@ -39,7 +39,7 @@ async function unpack(buffer, view, { method, packed, offset }) {
   const start = offset + 30 + view.getUint16(offset + 26, true) + view.getUint16(offset + 28, true);
   const bytes = buffer.slice(start, start + packed);
   if (method === STORED) return bytes;
-  if (method !== DEFLATED) throw new Error('the archive is packed in an unknown way');
+  if (method !== DEFLATED) throw new Error('the compression of the archive is unknown');
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate-raw'))).arrayBuffer();
 }
 
@@ -51,6 +51,6 @@ function readNpy(buffer) {
   const header = new TextDecoder().decode(new Uint8Array(buffer, start, length));
   const type = /'descr':\s*'[<|]([a-z]\d)'/.exec(header)?.[1];
   const shape = /'shape':\s*\(([^)]*)\)/.exec(header)?.[1].split(',').map((part) => part.trim()).filter(Boolean).map(Number);
-  if (!ARRAYS[type] || !shape || /'fortran_order':\s*True/.test(header)) throw new Error('an array is of an unknown kind');
+  if (!ARRAYS[type] || !shape || /'fortran_order':\s*True/.test(header)) throw new Error('an array has an unknown type');
   return { data: new ARRAYS[type](buffer.slice(start + length)), shape };
 }

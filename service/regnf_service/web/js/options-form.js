@@ -4,22 +4,22 @@ import { el } from './dom.js';
 import { number, words } from './format.js';
 
 const FIRST = {
-  min_scale: 'Min. scale, object units for each scene unit',
+  min_scale: 'Min. scale, object units per scene unit',
   max_scale: 'Max. scale',
   box_tolerance: 'Box tolerance (× box edge)',
   inlier_distance: 'Inlier distance (object diameters)',
   acceptance: 'Accept at level',
-  min_probability: 'Or at probability ≥',
-  rotations: 'Rotations to start from',
+  min_probability: 'Or accept at probability ≥',
+  rotations: 'Start rotations',
 };
-const UPRIGHT = 'stands upright';
+const UPRIGHT = 'is upright';
 
 export class OptionsForm {
   /** Fills host with one row an option; load() adds those of the contract. given: options of a result. */
   constructor(host, service, given = {}, seed = 0) {
     Object.assign(this, { host, service, given, fields: [] });
     this.preset = select(['robust', 'paper'], given.preset ?? 'robust');
-    this.upright = select([UPRIGHT, 'any way up'], given.up_axis ? UPRIGHT : 'any way up');
+    this.upright = select([UPRIGHT, 'any orientation'], given.up_axis ? UPRIGHT : 'any orientation');
     this.seed = el('input', { type: 'number', min: 0, max: 2 ** 32 - 1, step: 1, value: String(seed) });
     this.list = el('div', { className: 'options-form' });
     host.replaceChildren(...row(host, 'Preset', this.preset), ...row(host, 'The object', this.upright), ...row(host, 'Seed', this.seed), this.list);

@@ -11,7 +11,7 @@ const CAPTION = 52; // pixels of the picture, with words that stand beside a sma
 export function placeWords({ camera }) {
   if (!camera?.center_camera?.length) return '';
   const [x, y, z] = camera.center_camera.map((part) => fixed(part, 3));
-  return `Its center in the camera’s frame: x\u00a0${x}, y\u00a0${y}, z\u00a0${z}\u00a0m (right, down, ahead)`;
+  return `Its center in the camera’s frame: x\u00a0${x}, y\u00a0${y}, z\u00a0${z}\u00a0m (right, down, forward)`;
 }
 
 /** The overlay, which opens large when it is clicked. Raises ApiProblem where the job has none. */
@@ -21,7 +21,7 @@ export async function overlayButton(api) {
   const picture = await createImageBitmap(blob);
   const small = el('canvas', { width: picture.width, height: picture.height - CAPTION, role: 'img', 'aria-label': label });
   small.getContext('2d').drawImage(picture, 0, -CAPTION);
-  return el('button', { type: 'button', className: 'overlay', title: 'Show it large', onclick: () => open(blob, label) }, small);
+  return el('button', { type: 'button', className: 'overlay', title: 'Enlarge', onclick: () => open(blob, label) }, small);
 }
 
 async function open(blob, label) {

@@ -9,9 +9,9 @@ import { inverse, partsOf, readSim3, rowsOf } from './sim3.js';
 const turns = new Turns();
 let toCamera = null; // T_camera_scene, of a scene that is a recording
 const DIRECTIONS = {
-  T_scene_object: 'T_scene_object, the object’s pose in the scene: carries object coordinates to scene coordinates',
-  T_object_scene: 'T_object_scene: carries scene coordinates to object coordinates',
-  T_camera_object: 'T_camera_object, the object’s pose in the camera’s frame: carries object coordinates to meters, x right, y down, z ahead',
+  T_scene_object: 'T_scene_object, the object’s pose in the scene: maps object coordinates to scene coordinates',
+  T_object_scene: 'T_object_scene: maps scene coordinates to object coordinates',
+  T_camera_object: 'T_camera_object, the object’s pose in the camera frame: maps object coordinates to meters, x right, y down, z forward',
 };
 
 export function showVerdict(job, result) {
@@ -34,7 +34,7 @@ export function showVerdict(job, result) {
     ['Residual RMS', figure(percent(metrics.residual_rms, 2), 'of the diameter')],
     ['Scale, object ← scene', figure(scale ? fixed(partsOf(scale).scale, 4) : '–',
       Number.isFinite(deviation) ? `± ${number(deviation, 2)} %` : '')],
-    ['Inliers', figure(percent(Math.min(metrics.inlier_share_scene, metrics.inlier_share_object)), 'weaker side')],
+    ['Inliers', figure(percent(Math.min(metrics.inlier_share_scene, metrics.inlier_share_object)), 'the smaller of scene and object')],
     ['Time', figure(seconds(waited ?? worked), waited === null ? '' : `from request to result, ${seconds(worked)} of it computing`)],
   ]);
   show(byId('verdict'));

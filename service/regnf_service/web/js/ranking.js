@@ -5,7 +5,7 @@ import { number, percent, sure, words } from './format.js';
 
 const SHOWN = 8;
 const STAGES = {
-  refined: 'refined', coarse: 'searched coarsely', signature: 'by signature', unusable: 'no object',
+  refined: 'refined', coarse: 'coarse search', signature: 'by signature', unusable: 'unusable',
 };
 
 /** candidates as the result has them, the likeliest first; the rest folds away. */
@@ -39,6 +39,6 @@ function row({ object, stage, score, verdict, verdict_reason: reason, probabilit
 
 /** Whether what was seen tells a candidate from the first one. */
 function toldApart({ distinguishable, seen }) {
-  if (!distinguishable) return 'cannot be told apart from the first by what was seen';
-  return `told apart from the first by ${percent(seen)} of the surface, which was seen`;
+  if (!distinguishable) return 'cannot be distinguished from the first by the observed surface';
+  return `distinguished from the first by ${percent(seen)} of the surface, which was observed`;
 }

@@ -13,7 +13,7 @@ const TOP_SHARE = 0.97; // the ramp ends here: a few stray samples must not make
 export async function readResiduals(buffer, plain) {
   const arrays = await readNpz(buffer);
   const sizes = ['scene', 'object'].flatMap((side) => absolute(arrays[`${side}_residuals`]));
-  if (sizes.length === 0) throw new Error('the file holds no residuals');
+  if (sizes.length === 0) throw new Error('the file has no residuals');
   const top = [...sizes].sort((a, b) => a - b)[Math.floor((sizes.length - 1) * TOP_SHARE)] || 1e-9;
   const cloud = (side, like) => {
     const points = arrays[`${side}_points`];

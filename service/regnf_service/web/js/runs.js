@@ -81,7 +81,7 @@ export class Runs {
     const facts = [
       Number.isFinite(probability) && `probability ${sure(probability, level)}`,
       `scale ${result.T_object_scene.scale.toPrecision(4)}`,
-      `${seconds(took / 1000)} from the click on Register`,
+      `${seconds(took / 1000)} since the click on Register`,
     ].filter(Boolean);
     row.replaceChildren(
       el('strong', { 'data-tone': tone }, `${name}, ${words(result.verdict).toLowerCase()}: ${nameOf(object)}`),
@@ -89,7 +89,7 @@ export class Runs {
       ...(result.verdict_hint ? [el('span', { className: 'note' }, result.verdict_hint)] : []),
       ...(result.camera ? [el('span', {}, placeWords(result))] : []),
       el('span', { className: 'note' }, facts.join(', ')),
-      el('p', { className: 'row' }, el('a', { className: 'button', href: job.links.view }, 'Look closer')),
+      el('p', { className: 'row' }, el('a', { className: 'button', href: job.links.view }, 'Open the result')),
     );
     row.dataset.verdict = result.verdict;
     announce(`${name}: ${words(result.verdict)}`);
@@ -100,7 +100,7 @@ export class Runs {
       row.append(await overlayButton(this.service.job(job.id)));
       row.classList.add('pictured');
     } catch (error) {
-      row.append(el('p', { className: 'note' }, `There is no picture: ${told(error)}`));
+      row.append(el('p', { className: 'note' }, `No picture: ${told(error)}`));
     }
   }
 }

@@ -111,7 +111,7 @@ export class Service {
         if (request.status < 300) resolve(request.response);
         else reject(new ApiProblem(request.status, request.response ?? {}));
       };
-      request.onerror = () => reject(new ApiProblem(0, { detail: 'The connection broke. Send the file again.' }));
+      request.onerror = () => reject(new ApiProblem(0, { detail: 'The connection was lost. Send the file again.' }));
       request.send(body);
     });
   }

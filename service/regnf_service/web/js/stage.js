@@ -190,5 +190,5 @@ export class Stage {
 
 // The residuals are the result's, wherever the object is shown: nothing is computed in the browser.
 function noteResiduals(areOfThePoseShown) {
-  byId('legend-note').textContent = areOfThePoseShown ? '' : ' – of the result’s pose, not of the one shown';
+  byId('legend-note').textContent = areOfThePoseShown ? '' : ' – for the result’s pose, not for the displayed one';
 }

@@ -41,7 +41,7 @@ export function showActive(job) {
 }
 
 export function showTrouble(error) {
-  if (error) byId('message-text').textContent = 'The service does not answer. Trying again.';
+  if (error) byId('message-text').textContent = 'The service does not respond. Trying again.';
 }
 
 /** A failed job's own problem object. */
@@ -53,7 +53,7 @@ export function showFailed(job) {
 }
 
 export function showDismissed(job) {
-  const again = canRunAgain(job) ? 'Run again starts it anew.' : 'Start it anew on the page Register.';
+  const again = canRunAgain(job) ? 'Press Run again to start it again.' : 'Start it again on the page Register.';
   showBadge('dismissed', job.id);
   card({ eyebrow: 'No result', title: 'The job was dismissed', text: `It was canceled before it had a result. ${again}`, tone: 'still' });
 }
@@ -61,11 +61,11 @@ export function showDismissed(job) {
 /** A refusal of the service, or a broken connection. onRetry is offered where trying again makes sense. */
 export function showError(error, onRetry) {
   const problem = error instanceof ApiProblem ? error.problem : {};
-  const titles = { 401: 'This service asks for a token', 403: 'Not allowed', 404: 'There is no such job', 410: 'The job has expired' };
+  const titles = { 401: 'This service needs a token', 403: 'Not allowed', 404: 'This job does not exist', 410: 'The job has expired' };
   showBadge('unavailable');
   byId('status').dataset.tone = 'bad';
   card({
-    eyebrow: error.status ? `The service answered ${error.status}` : 'No connection',
+    eyebrow: error.status ? `The service responded with ${error.status}` : 'No connection',
     title: titles[error.status] ?? problem.title ?? 'The job could not be loaded',
     text: toldOf({ ...problem, detail: error.message, hint: null }),
     tone: error.status === 401 ? 'wait' : 'bad',
@@ -78,16 +78,16 @@ export function showError(error, onRetry) {
 
 /** The results are there, but the 3D view cannot be shown. */
 export function showNoView(error) {
-  card({ eyebrow: 'The results are complete', title: 'The 3D view cannot be shown', text: error.message, tone: 'warn' });
+  card({ eyebrow: 'The results are complete', title: 'The 3D view cannot be displayed', text: error.message, tone: 'warn' });
 }
 
 /** A job of a kind that has no pose to look at. */
 export function showFilesOnly() {
-  card({ eyebrow: 'Finished', title: 'The job wrote files', text: 'This kind of job has no pose to show.', tone: 'good' });
+  card({ eyebrow: 'Finished', title: 'The job wrote files', text: 'This kind of job has no pose.', tone: 'good' });
 }
 
 export function showNumbersOnly() {
-  const text = 'This registration was asked for without pictures. Its pose and its metrics are beside this text.';
+  const text = 'The request of this registration has no pictures. Its pose and its metrics are next to this text.';
   card({ eyebrow: 'Finished', title: 'There are no pictures', text, tone: 'good' });
 }
 
@@ -129,6 +129,6 @@ const titleOf = ({ title, reason }) => (title && title !== reason ? title : word
 const runningText = (attempt) => (attempt > 1 ? `Running, attempt ${attempt}` : 'Running');
 
 function queueText(ahead) {
-  if (!Number.isFinite(ahead)) return 'The next free worker takes it.';
-  return ahead <= 0 ? 'It is next.' : `${ahead} ${ahead === 1 ? 'job is' : 'jobs are'} before it.`;
+  if (!Number.isFinite(ahead)) return 'Waiting for the next free worker.';
+  return ahead <= 0 ? 'This job is next.' : `${ahead} ${ahead === 1 ? 'job is' : 'jobs are'} ahead of it.`;
 }

@@ -184,6 +184,6 @@ export class Viewer {
 
 function rendererFor(canvas, antialias) {
   const context = canvas.getContext('webgl2', { antialias, alpha: true });
-  if (!context) throw new Error('This browser offers no WebGL 2. The numbers and the downloads do without it.');
+  if (!context) throw new Error('This browser has no WebGL 2. The numbers and the downloads work without it.');
   return new WebGLRenderer({ canvas, context, antialias, alpha: true });
 }

@@ -39,7 +39,7 @@ def graph_of(steps: list[str]) -> Any:
 def test_values_that_are_alive_at_once_are_refused_before_they_are_made(tmp_path: Path) -> None:
     """120 of 64 MiB, in a file of a few kilobytes that takes half a minute of work."""
     path = saved(tmp_path, graph_of(MADE + SUMMED).SerializeToString())
-    with pytest.raises(FieldFormatError, match=r"an estimated \d+ MiB at once; \d+ MiB are free") as caught:
+    with pytest.raises(FieldFormatError, match=r"an estimated \d+ MiB of memory; \d+ MiB are free") as caught:
         convert_file(path, tmp_path, None, ImportLimits())
     assert caught.value.reason == "IMPORT_TOO_COSTLY"
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]

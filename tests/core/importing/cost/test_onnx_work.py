@@ -113,7 +113,7 @@ def test_costly_graphs_are_refused_before_anything_is_evaluated(
 def test_a_costly_graph_through_the_gate_says_both_numbers(tmp_path: Path) -> None:
     path = saved(tmp_path, costly("large products one after the other"))
     assert path.stat().st_size < 2_000
-    with pytest.raises(FieldFormatError, match=r"estimated \d+ s of a core; 60 s are allowed") as caught:
+    with pytest.raises(FieldFormatError, match=r"estimated \d+ s of processor time; 60 s are allowed") as caught:
         import_field(path, tmp_path / "out", None, ImportLimits(wall_s=100))
     assert caught.value.reason == "IMPORT_TOO_COSTLY"
 

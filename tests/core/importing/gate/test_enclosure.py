@@ -104,13 +104,16 @@ def test_a_thing_turned_inside_out_is_refused(formula: Formula) -> None:
         assert said is not None
         assert said.startswith("FIELD_IMPLAUSIBLE")
         assert "inside out" in said
-        assert f"say sign {other} to turn it round" in said
+        assert f"sign: {other} to invert it" in said
     assert accepted is None
 
 
 @pytest.mark.parametrize(
     ("formula", "words"),
-    [(empty_room, "at its bounds only"), (lambda points: points.norm(dim=-1) - 1.65, "everything is inside")],
+    [
+        (empty_room, "only at its bounds"),
+        (lambda points: points.norm(dim=-1) - 1.65, "everything except places at the bounds is inside"),
+    ],
 )
 def test_where_nothing_could_be_found_it_is_refused(formula: Formula, words: str) -> None:
     """The second: all but the corners."""

@@ -159,7 +159,7 @@ def test_solids_that_face_outward_are_left_as_they_are(said: dict[str, str]) -> 
 def test_a_shell_that_faces_outward_round_a_scene_is_turned_to_face_it() -> None:
     room = parts(ROOM, *TABLE, *CABINET)
     found = converted(room, **{"as": "scene"})
-    assert "was turned to face it" in " ".join(found.why)
+    assert "its faces were flipped towards it" in " ".join(found.why)
     assert (distance(found, FREE) > 0).all()
     assert (distance(found, MATTER) < 0).all()
 
@@ -179,5 +179,5 @@ def test_faces_that_are_turned_among_their_neighbors_are_turned_back(share: floa
     turned = np.random.default_rng(4).random(len(ball.faces)) < share
     faces = np.where(turned[:, None], ball.faces[:, ::-1], ball.faces)
     found = converted(trimesh.Trimesh(ball.vertices, faces, process=False))
-    assert any("was turned round, to agree" in why for why in found.why)
+    assert any("was flipped to match" in why for why in found.why)
     np.testing.assert_array_equal(found.tensors["faces"], converted(ball).tensors["faces"])

@@ -110,7 +110,7 @@ def test_single_precision_far_away_is_said_with_how_much() -> None:
     far.apply_translation([50_000.0, 0.0, 0.0])
     (warning,) = converted(far.export(file_type="stl")).warnings
     assert warning.startswith("FAR_FROM_ORIGIN: ")
-    assert "in steps of 0.0039" in warning
+    assert "single precision has steps of 0.0039" in warning
 
 
 def test_a_mesh_written_from_afar_is_read_where_it_was(tmp_path: Path) -> None:

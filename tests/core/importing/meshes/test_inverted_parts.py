@@ -36,7 +36,7 @@ def test_any_parts_may_be_inside_out() -> None:
     for inverted in (*((number,) for number in range(5)), (0, 1, 2), (0, 3, 4), (1, 2, 4)):
         found = converted(table(inverted), **{"as": "object"})
         np.testing.assert_allclose(distance(found, PROBES), expected, atol=1e-6)
-        assert any("turned round" in why for why in found.why)
+        assert any("flipped" in why for why in found.why)
 
 
 def test_the_parts_of_another_part_are_told_when_that_one_is_right() -> None:
@@ -55,7 +55,7 @@ def test_a_closed_cavity_stays_free() -> None:
     found = converted(together(shell, cavity))
     assert distance(found, np.array([[0.0, 0.0, 0.0]]))[0] == pytest.approx(0.5, abs=1e-6)
     assert distance(found, np.array([[0.75, 0.0, 0.0]]))[0] == pytest.approx(-0.25, abs=1e-6)
-    assert not any("turned round" in why for why in found.why)
+    assert not any("flipped" in why for why in found.why)
 
 
 def test_things_in_a_room_may_be_inside_out() -> None:
@@ -75,7 +75,7 @@ def test_a_sheet_keeps_its_faces() -> None:
     flat.apply_translation([0.0, 0.0, -1.0])
     given = together(sheet, flat)
     found = converted(given)
-    assert not any("turned round" in why for why in found.why)
+    assert not any("flipped" in why for why in found.why)
 
 
 def facing(mesh: trimesh.Trimesh, axis: int, sign: int) -> trimesh.Trimesh:
@@ -90,5 +90,5 @@ def test_sheets_that_face_each_other_keep_their_faces() -> None:
     shell.invert()
     lower, upper = parts([[0.02, 1.0, 0.3], [0.6, 2.0, 0.32]]), parts([[0.02, 1.0, 0.4], [0.6, 2.0, 0.42]])
     found = converted(together(shell, parts(*TABLE), facing(lower, 2, 1), facing(upper, 2, -1)), **{"as": "scene"})
-    assert not any("turned round" in why for why in found.why)
+    assert not any("flipped" in why for why in found.why)
     assert distance(found, np.array([[0.3, 1.5, 0.36]]))[0] == pytest.approx(0.04, abs=1e-6)

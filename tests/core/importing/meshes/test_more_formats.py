@@ -180,7 +180,7 @@ def test_unusual_beginnings_are_recognized(text: str, kind: str) -> None:
         ("v 0 0 1\n", "v 0 0 1\nv nan nan nan\n", ""),
         ("v 0 0 1\n", "v 0 0 1\nv 1 nan 2\nf 1 2 5\n", "1 triangles with such a corner"),
         ("f 1 3 2\n", "f 1 3 2\nf 1 1 2\n", "1 triangles without an area"),
-        ("f 1 3 2\n", "f 1 3 2\nf 3 2 1\n", "1 triangles that are there twice"),
+        ("f 1 3 2\n", "f 1 3 2\nf 3 2 1\n", "1 duplicate triangles"),
         ("f 1 3 2\n", "f 1 3 2\nl 1 2\np 1\n", "lines"),
     ],
 )
@@ -197,7 +197,7 @@ def test_a_double_sided_mesh_has_one_side() -> None:
     found = converted(bytes(both.export(file_type="stl")))
     assert len(found.tensors["faces"]) == len(BALL.faces)
     assert found.why[1] == "watertight"
-    assert f"ignored: the other side of {len(BALL.faces)} triangles: the mesh is double-sided" in found.why
+    assert f"ignored: {len(BALL.faces)} triangles of the other side: the mesh is double-sided" in found.why
 
 
 def test_what_changes_the_shape_and_is_not_read_is_warned_of() -> None:
@@ -246,7 +246,7 @@ def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
     data = b"made by a program".ljust(80) + struct.pack("<I", 2) + 2 * facet
     found = read_mesh("stl", memoryview(data + bytes(7)))
     np.testing.assert_array_equal(found.faces, read_mesh("stl", memoryview(data)).faces)
-    assert found.left_out == ("7 bytes behind the triangles",)
+    assert found.left_out == ("7 bytes after the triangles",)
     with pytest.raises(FieldFormatError, match="ends within its 2 facets"):
         read_mesh("stl", memoryview(data[:-7]))
 
@@ -260,5 +260,5 @@ def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
 )
 def test_decimal_commas_are_named(format_: str, text: str) -> None:
     assert sniff_format(text.encode()) == format_
-    with pytest.raises(FieldFormatError, match="decimals have points, not commas"):
+    with pytest.raises(FieldFormatError, match="write decimal points, not commas"):
         read_mesh(format_, memoryview(text.encode()))

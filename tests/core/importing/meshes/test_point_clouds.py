@@ -97,9 +97,19 @@ HALF_ZERO = np.where(np.arange(2000)[:, None] % 2 == 0, directions(2000), 0.0)
     ("points", "normals", "reason", "says"),
     [
         (directions(50), directions(50), "POINT_CLOUD_TOO_SMALL", "50 of 50 points"),
-        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points that are no finite numbers"),
-        (np.zeros((500, 3)), directions(500), "POINT_CLOUD_TOO_SMALL", "the 500 points lie at 1 places"),
-        (np.tile(directions(9), (100, 1)), np.tile(directions(9), (100, 1)), "POINT_CLOUD_TOO_SMALL", "at 9 places"),
+        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points with NaN or infinity"),
+        (
+            np.zeros((500, 3)),
+            directions(500),
+            "POINT_CLOUD_TOO_SMALL",
+            "the 500 points have only 1 different positions",
+        ),
+        (
+            np.tile(directions(9), (100, 1)),
+            np.tile(directions(9), (100, 1)),
+            "POINT_CLOUD_TOO_SMALL",
+            "only 9 different positions",
+        ),
         (LINE, directions(500), "POINT_CLOUD_TOO_SMALL", "on one line"),
         (1e-30 * directions(500), directions(500), "MESH_INVALID", "its diagonal is"),
         (np.zeros((0, 3)), None, "MESH_INVALID", "no triangles"),
@@ -121,7 +131,7 @@ def test_clouds_of_no_surface(
 
 def test_points_without_a_normal_are_left_out_and_counted() -> None:
     found = converted(ply(directions(2000), HALF_ZERO))
-    assert "ignored: 1000 points whose normals are zero or no finite numbers" in found.why
+    assert "ignored: 1000 points whose normals are zero, NaN or infinity" in found.why
 
 
 def boxes(*sizes: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
@@ -153,11 +163,11 @@ def turned(normals: NDArray[np.float64], which: NDArray[np.bool_]) -> NDArray[np
 @pytest.mark.parametrize(
     ("points", "normals", "says"),
     [
-        (BALL, turned(BALL, BALL[:, 2] > 0), "one patch meets another"),
-        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "one patch meets another"),
-        (BALL, turned(BALL, BALL[:, 0] > 0.8), "one patch meets another"),
+        (BALL, turned(BALL, BALL[:, 2] > 0), "at the border of two patches"),
+        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "at the border of two patches"),
+        (BALL, turned(BALL, BALL[:, 0] > 0.8), "at the border of two patches"),
         (BALL, turned(BALL, np.random.default_rng(0).random(len(BALL)) < 0.5), "mixed at one place"),
-        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "looks inward"),
+        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "points inward"),
     ],
 )
 def test_normals_that_are_turned_in_patches_are_turned_back(
@@ -202,7 +212,7 @@ def test_who_insists_is_given_the_surface_of_turned_normals() -> None:
 def test_a_refusal_s_own_hint_comes_out_of_the_gate(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError) as caught:
         import_field(saved(tmp_path, ply(1e-30 * BALL, BALL)), tmp_path / "out")
-    assert caught.value.hint == "Give it in another unit, or without stray points."
+    assert caught.value.hint == "Give the mesh in another unit, or remove stray points."
 
 
 # Normals that the file does not have, or that are not of its points.
@@ -247,7 +257,7 @@ def test_the_cloud_of_a_room_is_measured_from_within() -> None:
     points = np.where(inner[:, None], shell - [2.0, 0.0, 0.2], shell)
     normals = np.where(inner[:, None], sides, -sides)
     found = convert_mesh("ply", memoryview(ply(points)), UploadDescription(as_="scene"))
-    assert "as a scene" in found.warnings[0]
+    assert "as for a scene" in found.warnings[0]
     assert outward(found, points, normals) > 0.97
 
 
@@ -274,5 +284,5 @@ def test_a_pcd_file_says_where_its_sensor_stood() -> None:
     assert sensor("1 2 3 1 0 0 0") == [1.0, 2.0, 3.0]
     assert sensor("0 0 0 1 0 0 0") is None  # what writers put where nothing is known
     assert sensor("0 0 0 1 0 0 0", rows=20) == [0.0, 0.0, 0.0]  # a depth image, in its camera's frame
-    with pytest.raises(FieldFormatError, match="makes no sense"):
+    with pytest.raises(FieldFormatError, match="invalid line"):
         sensor("a b c 1 0 0 0")
