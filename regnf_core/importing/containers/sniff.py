@@ -8,7 +8,7 @@ import struct
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
-MESH_FORMATS = ("glb", "gltf", "obj", "pcd", "ply", "stl", "xyz")
+MESH_FORMATS = ("glb", "gltf", "las", "obj", "pcd", "ply", "stl", "xyz")
 
 _OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
@@ -34,6 +34,8 @@ def sniff_mesh(head: bytes) -> str | None:
     """
     if head.startswith(b"glTF"):
         return "glb"
+    if head.startswith(b"LASF"):
+        return "las"
     if _is_binary_stl(head):
         return "stl"
     text = head.lstrip(_BLANK)
@@ -158,7 +160,7 @@ _OTHER_FILES = (
 _BLANK = b"\xef\xbb\xbf \t\r\n"
 _SHAPE_WITHIN = 512
 _SHAPES = (
-    *((b"LASF", "a LAS or LAZ cloud of points"), (b"ASTM-E57", "an E57 cloud of points")),
+    (b"ASTM-E57", "an E57 cloud of points"),
     *((b"PXR-USDC", "a USD scene"), (b"#usda", "a USD scene"), (b"Kaydara FBX", "an FBX scene")),
     *((b"; FBX ", "an FBX scene"), (b"BLENDER", "a Blender file"), (b"3D Geometry File Format", "a Rhino file")),
     *((b"ISO-10303-21", "a STEP model of CAD"), (b"0 SECTION 2 ", "a DXF drawing")),

@@ -6,21 +6,23 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from regnf_core.importing.meshes.glb import read_glb, read_gltf
+from regnf_core.importing.meshes.las import read_las
 from regnf_core.importing.meshes.ply import read_ply
 from regnf_core.importing.meshes.point_files import read_pcd, read_xyz
 from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, read_obj, read_stl
 
-CLOUD_FORMATS = ("ply", "pcd", "xyz")
+CLOUD_FORMATS = ("ply", "pcd", "xyz", "las")
 """Formats that may hold points alone."""
 _IN_PARTS: dict[str, Callable[[memoryview, Siblings], Geometry]] = {"glb": read_glb, "gltf": read_gltf}
 _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
+    "las": read_las,
     "obj": read_obj,
     "pcd": read_pcd,
     "ply": read_ply,
     "stl": read_stl,
     "xyz": read_xyz,
 }
-_AT_FIXED_BYTES = frozenset({"glb", "stl"})
+_AT_FIXED_BYTES = frozenset({"glb", "las", "stl"})
 _BLANK, _MOST_BLANKS = b"\xef\xbb\xbf \t\r\n", 4096
 MESH_READERS = (*_WHOLE, *_IN_PARTS)
 """The names that ``sniff_format`` gives files with a reader here."""

@@ -5,7 +5,7 @@ import { queueWords } from './documents.js';
 import { number } from './format.js';
 import { sha256Of } from './sha256.js';
 
-const OF_NO_SIDE = /\.(glb|gltf|ply|obj|stl|pcd|xyz|pts|txt)$/i; // files that do not say where free space is
+const OF_NO_SIDE = /\.(glb|gltf|ply|obj|stl|pcd|xyz|pts|txt|las|laz)$/i; // files that do not say where free space is
 
 /**
  * The document of the file's field once it is ready. role: what it will be used as, scene or object.

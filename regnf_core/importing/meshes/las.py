@@ -1,0 +1,44 @@
+"""LAS and LAZ: clouds of laser scanners, read by laspy in parts. Of many points every n-th is taken."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+
+from regnf_core.importing.meshes.triangle_files import Geometry, malformed, unsupported
+
+_TAKEN = 2_000_000
+"""Points, about: a surface shows no more of them."""
+_AT_ONCE = 500_000
+
+
+def read_las(data: memoryview) -> Geometry:
+    """The points of a LAS or LAZ file, in the unit of its coordinates. Memory does not grow with their number.
+
+    Raises FieldFormatError: MESH_INVALID, FORMAT_NOT_SUPPORTED.
+    """
+    import laspy
+
+    points = []
+    try:
+        with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
+            count = file.header.point_count
+            step = max(1, math.ceil(count / _TAKEN))
+            scales, offsets = np.array(file.header.scales), np.array(file.header.offsets)
+            if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales != 0.0).all()):
+                raise malformed("the LAS header has an invalid scale or offset")
+            for part in file.chunk_iterator(_AT_ONCE):
+                points.append(np.column_stack([part.X, part.Y, part.Z])[::step] * scales + offsets)
+    except laspy.errors.LaspyException as error:
+        raise malformed(f"the LAS file cannot be read: {error}") from error
+    except NotImplementedError as error:
+        raise unsupported(f"the LAS file has a part that is not supported: {error}") from error
+    except (ValueError, OverflowError, MemoryError, RuntimeError, EOFError, OSError) as error:
+        raise malformed("the LAS file ends early or is damaged") from error
+    found = np.concatenate(points) if points else np.zeros((0, 3))
+    if sum(map(len, points)) < count // step:
+        raise malformed(f"the LAS file ends before the {count} points of its header")
+    left_out = (f"{step - 1} of {step} points",) if step > 1 else ()
+    return Geometry(found, np.zeros((0, 3), np.int64), left_out=left_out)
