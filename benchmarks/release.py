@@ -38,9 +38,9 @@ PAIRS, OTHERS, PEERS = "exact/pairs.json", "exact/wrong_objects.json", "exact/pe
 BOP = {"ycbv": "YCB-V", "lmo": "LM-O", "tyol": "TYO-L"}
 TABLES = {
     "right": "your data",
-    "answers": "answers about the right object, random rooms",
-    "wrong": "requested",
-    "variants": "candidates",
+    "answers": "answer, random rooms",
+    "wrong": "what is requested",
+    "variants": "two candidates",
     "peers": "method",
     "time": "registration",
 }
@@ -65,11 +65,11 @@ _PEERS = {
     "ransac_icp normalized scaled": "the same, with scale in RANSAC and ICP",
     "splatreg robust normalized": "splatreg, clouds of one size",
 }
-_CUSHION = "the same, an armchair with its cushion for the one without, or the reverse"
+_CUSHION = "the same: an armchair with its cushion for the one without, or the reverse"
 TIMED = {
-    "small, model kept": "the demo's pair, the object's model kept",
-    "small, cold": "the same, the object's model made",
-    "full-size, model kept": "room and object of neus-facto's full size, the object's model kept",
+    "small, model kept": "the demo's pair, with a kept object model",
+    "small, cold": "the same, with making the object model",
+    "full-size, model kept": "neus-facto networks of the default size, with a kept object model",
 }
 _README = ("exact", "images/rendered", "images/tsdf", "recording/rendered", "recording/tsdf", "nothing/rendered",
            "kitchen", "bop/ycbv")  # fmt: skip
@@ -183,8 +183,8 @@ def _right() -> Iterator[Row]:
         what, figures = f"{title}, real depth images, masks", _right_figures(runs, _near("listed"))
         yield _row(f"right/bop/{name}", what, figures, runs, "bop", source)
     for halves, what, right in (
-        ("interleaved", "a recorded kitchen, other frames of the same pass", "right"),
-        ("apart", "the same, seen from another side, after removing drift", "right_within_drift"),
+        ("interleaved", "a recorded kitchen, map from other frames of the same pass", "right"),
+        ("apart", "a recorded kitchen, map from another side, drift removed", "right_within_drift"),
     ):
         runs = [run for run in read(KITCHEN) if run["halves"] == halves]
         figures = _right_figures([run for run in runs if run["shown"]], itemgetter(right))
@@ -201,7 +201,7 @@ def _answers() -> Iterator[Row]:
         runs = [run for run in _asked("right") if run["verdict"] == verdict]
         wrong = [run["listed_mssd"] for run in runs if not is_right(run)]
         off = math.ceil(100 * max(wrong, default=0.0))
-        figures = {"wrong": _wrong_of(len(wrong), len(runs)), "these are off by less than": f"{off} %"}
+        figures = {"wrong": _wrong_of(len(wrong), len(runs)), "largest error of these": f"{off} %"}
         yield _row(f"answers/{verdict}", f"`{verdict}`", figures, runs, "worlds", WORLDS)
 
 
@@ -225,8 +225,8 @@ def _variants() -> Iterator[Row]:
     favored = _of(sum(run["difference"]["favor"] > 0.0 for run in told), len(told))
     said = _of(sum(not run["difference"]["distinguishable"] for run in unseen), len(unseen))
     for name, what, figure, runs in (
-        ("told", "`distinguishable`: the evidence favors the right one", favored, told),
-        ("unseen", "the difference was not seen: not `distinguishable`", said, unseen),
+        ("told", "where `distinguishable` is true: the right one is favored", favored, told),
+        ("unseen", "where the difference was not observed: `distinguishable` is false", said, unseen),
     ):
         yield _row(f"variants/{name}", what, {"how often": figure}, runs, "worlds", WORLDS)
 
@@ -235,7 +235,7 @@ def _peers() -> Iterator[Row]:
     for group, what in _PEERS.items():
         runs = [run for run in read(PEERS) if run["group"] == group]
         error = statistics.median(run["mssd_share"] for run in runs if "mssd_share" in run)
-        figures = {"solved": _share(runs, _near("mssd_share")), "median error of its poses": f"{100 * error:.2g} %"}
+        figures = {"solved": _share(runs, _near("mssd_share")), "median error": f"{100 * error:.2g} %"}
         yield _row(f"peers/{group}", what, figures, runs, "peers", PEERS)
 
 

@@ -119,8 +119,11 @@ def check_access(settings: Settings) -> None:
     ALLOWED_HOSTS_UNUSABLE: see there.
     """
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
+        address = settings.publish or settings.host
+        passed_on = settings.behind_proxy and is_loopback(address)
+        others = f"a proxy passes requests on to {address}" if passed_on else f"{address} can be reached from other machines"
         raise StartError(
-            f"{settings.publish or settings.host} can be reached from other machines, and no token is configured",
+            f"{others}, and no token is configured",
             reason="UNAUTHENTICATED_PUBLIC_BIND",
             hint="Set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind a proxy that authenticates.",
         )

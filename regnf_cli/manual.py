@@ -66,7 +66,8 @@ def _known(name: str, pages: dict[str, Path]) -> str:
     found = [one for one in pages if one.rpartition("/")[2] == asked]
     if len(found) == 1:
         return found[0]
-    hint = suggestion(asked, pages) or "`regnf manual` lists all pages."
+    several = " and ".join(f"`{one}`" for one in found)
+    hint = f"There are {several}." if found else suggestion(asked, pages) or "`regnf manual` lists all pages."
     raise InvalidInputError(f"{name}: no such page of the manual", reason="MANUAL_PAGE_UNKNOWN", hint=hint)
 
 

@@ -23,7 +23,8 @@ def test_a_page_is_printed_as_it_is_written(run: Run) -> None:
     for name in ("families", "docs/families.md", "how-to/library", "library"):
         page = "docs/families.md" if "families" in name else "docs/how-to/library.md"
         assert run("manual", name).stdout.strip() == (ROOT / page).read_text().strip()
-    for name, hint in (("familys", "`families`"), ("../README", "`regnf manual`")):
+    several = "There are `concepts/verdicts` and `how-to/verdicts`"
+    for name, hint in (("familys", "`families`"), ("../README", "`regnf manual`"), ("verdicts", several)):
         ended = run("manual", name)
         assert (ended.code, "MANUAL_PAGE_UNKNOWN" in ended.stderr, hint in ended.stderr) == (2, True, True)
 

@@ -17,26 +17,17 @@ STALE = {f"time/{case}": _BUSY for case in ("small, model kept", "small, cold", 
 
 DEFINITIONS: dict[str, tuple[str, ...]] = {
     "the limit of a correct pose": ("5 % of the",),
-    "the confidence of a bound or an ellipsoid": ("one-sided 95 % bound", "in its 95 % ellip"),
+    "the confidence of a bound": ("one-sided 95 % bound",),
     "what is said of the scale": ("tells the scale within 1 %",),
-    "features of the verdict": (
-        "within 2 % and 4 % of", "farther than 4 % outside", "of which 30 % of the samples",
-        "more than 3 % of the diameter off it",
-    ),
+    "a feature of the verdict": ("more than 3 % of the diameter off it",),
     "the preset `paper`, its settings": (
-        "outside the box grown by 5 %", "|S| ≤ 0.1 %", "fewer than 80 % of |r| within 1.5 %", "of all above 3 %",
+        "outside the box enlarged by 5 %", "fewer than 80 % of |r| within 1.5 %", "of all above 3 %",
     ),
     "settings of fits, editing, pictures and readers": (
         "after 3, 10 and 30 %", "from 15 % of the training", "grown by 5 % of", "within 1.5 % of the diagonal",
         "more than 5 % of an object's matter", "or 1 % of the diagonal", "at 1.5 % of the diameter",
     ),
-    "settings of the recorded rooms": ("20 % larger and shifted by up to 5 %",),
-    "what a seed of the random worlds draws": (
-        "room 60 %, table top 26 %, shelf 14 %", "45 % meshes", "structured light (45 %", "time of flight (30 %",
-        "stereo (25 %", "black objects (10 %)", "glossy ones (8 %)", "none in 45 %; else 0.05 to 1 %", "dense in 15 %",
-        "60 % its own mesh", "28 % fused", "12 % cut", "10 to 20 % too long", "off by up to 5 %",
-        "level 50 %, the object's 30 %, any 20 %",
-    ),
+    "settings of the recorded rooms": ("20 % larger than the thing, and shifted by up to 5 %",),
     "an example of what is printed": ("73 % of the volume is free, 23 % unobserved",),
     "what a case and a symmetry of the random worlds are": (
         "30 % (long), 25 % (short) or 12 % (single)", "99 % of the exact mesh within 1 %", "within 3 % count as round",
@@ -45,15 +36,7 @@ DEFINITIONS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Figures that are no measurements: what they are, and the phrases that they stand in."""
 
-WITHOUT_ROW = (
-    "random worlds 95 % of the true poses", "it holds 89 %, single views 81 %",
-    "5 to 10 % of the diameter off", "6 to 10 % of the diameter off",
-    "94 to 99 of 100 seeds", "up to 1 % low on thin-legged", "registrations reach 99 %", "detection 65 % at most",
-    "diameter 70 % at most", "| 0.19 % | 0.53 % |", "| 0.11 % | 0.41 % |", "| 0.14 % | 0.28 % |",
-)  # fmt: skip
-"""Measurements that no row has: a page should lose them, or a row get them."""
-
-PHRASES = [*(phrase for phrases in DEFINITIONS.values() for phrase in phrases), *WITHOUT_ROW]
+PHRASES = [phrase for phrases in DEFINITIONS.values() for phrase in phrases]
 FIGURE = re.compile(r"\b\d[\d,]* +of +\d[\d,]*(?: +\(\d+(?:\.\d+)? %\))?|(?<![\d.])\d+(?:\.\d+)? *%")
 PAGES = [ROOT / "README.md", *(page for page in sorted(DOCS.rglob("*.md")) if "adr" not in page.parts)]
 
@@ -95,7 +78,7 @@ def words_of(text: str) -> str:
 
 
 def phrase_around(words: str, figure: re.Match[str]) -> str | None:
-    """The phrase of the tables above that has the figure at this place."""
+    """The phrase of the table above that has the figure at this place."""
     for phrase in PHRASES:
         first = max(0, figure.end() - len(phrase))
         if first <= words.find(phrase, first, figure.start() + len(phrase)) <= figure.start():

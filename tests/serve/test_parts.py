@@ -52,7 +52,7 @@ def test_beyond_loopback_a_proxy_stands_before_it() -> None:
     tokens = frozenset({"lab:a-long-random-string"})
     with pytest.raises(StartError, match=r"^0\.0\.0\.0 can be reached from other machines"):
         check_access(Settings(host="0.0.0.0", api_tokens=tokens))
-    with pytest.raises(StartError) as caught:
+    with pytest.raises(StartError, match=r"^a proxy passes requests on to 127\.0\.0\.1, and no token") as caught:
         check_access(Settings(behind_proxy=True))
     assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
     for open_to_all in ({"api_tokens": tokens}, {"allow_unauthenticated": True}):
