@@ -246,5 +246,5 @@ def claim_storage(redis: Redis, storage_id: str, adopt: str | None = None) -> No
     raise StorageMismatchError(
         f"this Redis has the records of the storage {known}, but the storage here is {storage_id}. Check "
         "REGNF_REDIS_URL, REGNF_STORAGE_URL and REGNF_STATE_DIR: all processes of a service need the same values. To "
-        "use this Redis with this storage, start once with REGNF_ADOPT_STORAGE={storage_id}"
+        f"use this Redis with this storage, start once with REGNF_ADOPT_STORAGE={storage_id}"
     )

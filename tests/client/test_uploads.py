@@ -129,7 +129,7 @@ def test_nothing_is_sent_of_what_the_service_has(world: World, transport: AppTra
     assert job.status == "accepted"
     assert counted.bytes < 2000
     assert [method for method, _ in counted.requests] == ["GET", "PATCH", "GET", "POST"], "the smaller file first"
-    with pytest.raises(ServiceError, match=r"room\.safetensors: the service holds") as caught:
+    with pytest.raises(ServiceError, match=r"room\.safetensors: the service has the same file") as caught:
         client(transport).upload(room, {"level_mask": 3})
     assert caught.value.reason == "FIELD_DESCRIPTION_DIFFERS"
     assert [one.label for one in client(transport).fields()] == ["chair.safetensors", "room.safetensors"]

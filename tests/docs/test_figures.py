@@ -11,14 +11,13 @@ from benchmarks import release
 from regnf_core.version import ENGINE_REVISION
 from tests.docs.pages import DOCS, ROOT
 
-_BUSY = "measured on an idle machine; side by side, this engine takes 0.99 of that time"
-STALE = {f"time/{case}": _BUSY for case in ("small, model kept", "small, cold", "full-size, model kept")}
+STALE: dict[str, str] = {}
 """Rows of release.json that are not of the shipped engine, by id, and why."""
 
 DEFINITIONS: dict[str, tuple[str, ...]] = {
     "the limit of a correct pose": ("5 % of the",),
     "the confidence of a bound": ("one-sided 95 % bound",),
-    "what is said of the scale": ("tells the scale within 1 %",),
+    "what is said of the scale": ("tells the scale within 1 %", "determines the scale within 1 %"),
     "a feature of the verdict": ("more than 3 % of the diameter off it",),
     "the preset `paper`, its settings": (
         "outside the box enlarged by 5 %", "fewer than 80 % of |r| within 1.5 %", "of all above 3 %",

@@ -66,7 +66,7 @@ def test_who_is_told_to_stop_waits_no_longer(waits: list[float]) -> None:
 def test_a_refusal_and_its_end_are_logged_once(waits: list[float], caplog: pytest.LogCaptureFixture) -> None:
     retry_until_available("the claim", Refusals(5))
     assert [record.message for record in caplog.records] == [
-        f"the claim: Redis refuses, trying until it does not: {FULL}",
+        f"the claim: Redis refuses the command; trying again: {FULL}",
         "the claim: done after 5 refusals",
     ]
 

@@ -56,7 +56,7 @@ def test_a_device_that_is_not_there_is_refused(device: Any) -> None:
     ("source", "description", "reason", "says"),
     [
         (CHAIR, "z up", "INVALID_DESCRIPTION", "the description is a str"),
-        ("https://example.org/chair.glb", None, "FILE_NOT_FOUND", "download the file"),
+        ("https://example.org/chair.glb", None, "FILE_NOT_FOUND", "Download the file"),
     ],
 )
 def test_what_is_no_description_or_no_file(source: Any, description: Any, reason: str, says: str) -> None:
