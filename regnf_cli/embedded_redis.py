@@ -121,7 +121,9 @@ def check_access(settings: Settings) -> None:
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
         address = settings.publish or settings.host
         passed_on = settings.behind_proxy and is_loopback(address)
-        others = f"a proxy passes requests on to {address}" if passed_on else f"{address} can be reached from other machines"
+        others = (
+            f"a proxy passes requests on to {address}" if passed_on else f"{address} can be reached from other machines"
+        )
         raise StartError(
             f"{others}, and no token is configured",
             reason="UNAUTHENTICATED_PUBLIC_BIND",

@@ -17,7 +17,7 @@ STALE: dict[str, str] = {}
 DEFINITIONS: dict[str, tuple[str, ...]] = {
     "the limit of a correct pose": ("5 % of the",),
     "the confidence of a bound": ("one-sided 95 % bound",),
-    "what is said of the scale": ("tells the scale within 1 %", "determines the scale within 1 %"),
+    "what is said of the scale": ("determines the scale within 1 %",),
     "a feature of the verdict": ("more than 3 % of the diameter off it",),
     "the preset `paper`, its settings": (
         "outside the box enlarged by 5 %", "fewer than 80 % of |r| within 1.5 %", "of all above 3 %",

@@ -138,7 +138,9 @@ def test_a_thing_in_an_image_is_registered_where_the_camera_saw_it(scene: Path, 
     made = engine.register(scene, object_, model, request, lambda *_: None, tmp_path, {})
     told = json.loads((tmp_path / "result.json").read_text())
     assert (told["verdict"], told["camera"]["frame"], told["camera"]["object_unit_m"]) == ("registered", "b", 0.001)
-    assert any("unit is" in warning and "mm" in warning for warning in told["fields"]["scene"]["warnings"]), told["fields"]
+    assert any("unit is" in warning and "mm" in warning for warning in told["fields"]["scene"]["warnings"]), told[
+        "fields"
+    ]
     truth = shots(2)[1].T_camera_object
     assert error_m(told["camera"]["T_camera_object"]["matrix"], truth) < 0.01
     assert "overlay.png" in made.to_come
