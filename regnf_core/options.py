@@ -181,9 +181,9 @@ class RegistrationOptions(_Group):
     preset: Preset = "robust"
     """The method. `robust` needs no initial guess. `paper` is the published method."""
     up_axis: Axis | None = None
-    """The vertical axis of scene and object. `robust`: only rotations about this axis are searched, which is faster, and
-    no pose is tilted by more than 30 degrees; null searches all orientations. `paper`: it defines the ground and the side
-    from which the cameras look; null means z."""
+    """The vertical axis of scene and object. `robust`: only rotations about this axis are searched, which is faster,
+    and no pose is tilted by more than 30 degrees; null searches all orientations. `paper`: it defines the ground and
+    the side from which the cameras look; null means z."""
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
     initialization: InitializationOptions = field(default_factory=InitializationOptions)
     optimization: OptimizationOptions = field(default_factory=OptimizationOptions)
