@@ -50,7 +50,7 @@ class PartedField(Protocol):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The scene, then an edit's object each; an edit that has none (a removal) has the scene's field."""
+        """The scene's field, then one field per edit: that of its object, or the scene's for a removal."""
         ...
 
     def part_at(self, points: Tensor) -> Tensor:

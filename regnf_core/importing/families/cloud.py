@@ -62,7 +62,7 @@ def convert_cloud(
     unit = (points - low) / diagonal
     places = np.unique(unit, axis=0)  # a tree cannot part points at one place: each would be compared with each
     sensor = None if geometry.sensor is None else (geometry.sensor - low) / diagonal
-    made, warnings = _oriented(unit, given.normals, sensor, overrides)
+    made, warnings = oriented_cloud(unit, given.normals, sensor, overrides)
     if made.within and overrides.as_ is None:
         overrides = replace(overrides, as_="scene")
     tree = cKDTree(places)
@@ -88,7 +88,7 @@ def convert_cloud(
     return replace(found, why=why, warnings=(*found.warnings, *warnings, f"SURFACE_RECONSTRUCTED: {text}"))
 
 
-def _oriented(
+def oriented_cloud(
     points: Float64Array, normals: Float64Array | None, sensor: Float64Array | None, overrides: UploadDescription
 ) -> tuple[Oriented, tuple[str, ...]]:
     """Normals that look to free space, and what was done. points: (N, 3), with a diagonal of one."""

@@ -55,7 +55,7 @@ def shared_entries(overrides: UploadDescription, bounds: Sequence[Sequence[float
 
 
 def entries_at(entries: dict[str, Any], origin: Sequence[float] | None) -> dict[str, Any]:
-    """The shared entries of a function whose coordinates begin at ``origin``, a place in those of the file.
+    """The shared entries of a function whose coordinates begin at ``origin``, given in the coordinates of the file.
 
     The field stays in the file's frame: its placement adds the origin again, in float64. None: nothing was subtracted.
     """

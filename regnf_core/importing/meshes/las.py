@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from regnf_core.importing.meshes.triangle_files import Geometry, malformed, unsu
 _TAKEN = 2_000_000
 """Points, about: a surface shows no more of them."""
 _AT_ONCE = 500_000
+_HEADER, _SIZES_AT, _RECORD = 227, 94, 54
+"""Bytes of the smallest header and of a record's own header; where its size, the points' place and the count of records
+stand."""
 
 
 def read_las(data: memoryview) -> Geometry:
@@ -21,6 +25,7 @@ def read_las(data: memoryview) -> Geometry:
     """
     import laspy
 
+    _require_header(data)
     points = []
     try:
         with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
@@ -42,3 +47,12 @@ def read_las(data: memoryview) -> Geometry:
         raise malformed(f"the LAS file ends before the {count} points of its header")
     left_out = (f"{step - 1} of {step} points",) if step > 1 else ()
     return Geometry(found, np.zeros((0, 3), np.int64), left_out=left_out)
+
+
+def _require_header(data: memoryview) -> None:
+    """Raise FieldFormatError (MESH_INVALID) for counts that the file has no room for: the library would read them."""
+    if len(data) < _HEADER:
+        raise malformed("the LAS file ends within its header")
+    header_size, start, records = struct.unpack_from("<HII", data, _SIZES_AT)
+    if not _HEADER <= header_size <= start <= len(data) or records * _RECORD > start - header_size:
+        raise malformed("the LAS header has sizes that do not fit the file")

@@ -216,7 +216,7 @@ def test_ply_vertices_with_lists_are_read() -> None:
 @pytest.mark.parametrize(
     ("head", "named"),
     [
-        *((b"LASF\0\0", "LAS"), (b"ASTM-E57", "E57"), (b"PXR-USDC\0", "USD"), (b"#usda 1.0\n", "USD")),
+        *((b"ASTM-E57", "E57"), (b"PXR-USDC\0", "USD"), (b"#usda 1.0\n", "USD")),
         *((b"Kaydara FBX Binary  \0", "FBX"), (b"ISO-10303-21;\nHEADER;", "STEP")),
         *((b"# vtk DataFile Version 3.0\n", "VTK"), (b'<?xml version="1.0"?>\n<VTKFile type="PolyData">', "VTK")),
         *((b'<?xml version="1.0"?>\n<robot name="r">', "URDF"), (b"BLENDER-v300", "Blender")),
