@@ -69,18 +69,18 @@ def fit_their_points(points: Float64Array, normals: Float64Array) -> bool:
 
 
 def oriented(
-    points: Float64Array, lines: Float64Array | None, sensor: Float64Array | None, within: bool | None
+    points: Float64Array, given: Float64Array | None, sensor: Float64Array | None, within: bool | None
 ) -> Oriented:
     """The normals of points (N, 3), with a diagonal of one.
 
-    lines: (N, 3) normals of unknown side; None: they are estimated · sensor: (3,), where all points were measured from
+    given: (N, 3) normals of unknown side; None: they are estimated · sensor: (3,), where all points were measured from
     · within: whether they are of a scene that was measured from within; None: by what can be seen.
     """
-    if lines is None:
-        lines = _planes(points, points)[0]
+    lines = _planes(points, points)[0]
     if sensor is not None:
-        looks = ((sensor - points) * lines).sum(axis=1)
-        return Oriented(np.where(looks[:, None] >= 0.0, lines, -lines), None, "the position of the sensor")
+        own = lines if given is None else given
+        looks = ((sensor - points) * own).sum(axis=1)
+        return Oriented(np.where(looks[:, None] >= 0.0, own, -own), None, "the position of the sensor")
     few = _few(len(points))
     some, along = points[few], lines[few]
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
@@ -96,6 +96,8 @@ def oriented(
         _, nearest = cKDTree(some).query(points, k=4)
         agree = np.einsum("nki,ni->n", sided[nearest], lines)
         normals = np.where(agree[:, None] >= 0.0, lines, -lines)
+    if given is not None:
+        normals = given * np.where((given * normals).sum(axis=1) >= 0.0, 1.0, -1.0)[:, None]
     where = "inside the cloud, as for a scene" if within else "outside of the cloud, as for an object"
     other = "object" if within else "scene"
     towards = (

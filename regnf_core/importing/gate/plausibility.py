@@ -137,7 +137,7 @@ def check_plausibility(
     Raises FieldFormatError: FIELD_NOT_FINITE, FIELD_NOT_A_FUNCTION when a point's distance depends on which others are
     evaluated, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
     """
-    field, _ = near_origin(field)
+    field, origin = near_origin(field)
     lower, upper = field.bounds[0].float(), field.bounds[1].float()
     generator = torch.Generator().manual_seed(seed)
     points = lower + (upper - lower) * torch.rand(samples, 3, generator=generator)  # (N, 3)
@@ -160,7 +160,8 @@ def check_plausibility(
         "gradient_p90": high,
         **measured_enclosure(points, distance, surface, median, (lower, upper)),
     }
-    return measured, _warnings(measured), torch.stack([surface.amin(0), surface.amax(0)]).tolist()
+    corners = torch.stack([surface.amin(0), surface.amax(0)]).double().cpu() + origin
+    return measured, _warnings(measured), corners.tolist()
 
 
 def _no_surface(distance: Tensor, is_mesh: bool) -> FieldFormatError:

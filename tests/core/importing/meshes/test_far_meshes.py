@@ -146,3 +146,11 @@ def test_a_pose_far_away_is_that_at_the_origin(tmp_path: Path) -> None:
 def _moved(*shift: float) -> np.ndarray:
     matrix: np.ndarray = trimesh.transformations.translation_matrix(shift)
     return matrix
+
+
+def test_the_report_s_surface_lies_where_the_file_has_it(tmp_path: Path) -> None:
+    """A box is written by these numbers."""
+    report = convert(saved(tmp_path, ply(UTM, "binary_little_endian")), tmp_path / "out", None)
+    low, high = np.array(report["surface_bounds"])
+    np.testing.assert_allclose(low, at(UTM).min(axis=0), rtol=0, atol=0.1)
+    np.testing.assert_allclose(high, at(UTM).max(axis=0), rtol=0, atol=0.1)
