@@ -38,7 +38,7 @@ _APART = 0.7
 """Neighbors that face the other way lie beside the others where the middles of both are so many radii apart."""
 _BORDERS, _WRONG_EDGES, _BOTH_WAYS = 0.01, 0.2, 0.5
 """Shares of the points, of those at edges and of the points. Chosen on the same clouds as measured on: 22 shapes,
-1,000 and 30,000 points, noise of 0, 0.3 and 1 spacings. At edges whole clouds reached 0.17. Refused in vain were 1,000
+1,000 and 30,000 points, noise of 0, 0.3 and 1 spacings. At edges whole clouds reached 0.17. Turned in vain were 1,000
 points of a sheet of 0.5 mm and of 200 blades; patches on thin objects with few points are often missed."""
 _FEWEST, _ALL, _FEWEST_EDGES = 3, 0.9, 50
 """A point at an edge has so many neighbors across it; so many of them agree; so many such points are enough."""
