@@ -97,6 +97,16 @@ def convert(
         ),
     ] = None,
     axes: CameraAxes = None,
+    transform: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of Gaussian splats: write them moved by this pose, as .ply. A JSON file with a 4 x 4 matrix, or the "
+            "result.json of a registration, whose T_object_scene is used.",
+            parser=existing,
+            metavar="JSON",
+        ),
+    ] = None,
+    inverse: Annotated[bool, typer.Option("--inverse", help="Move by the inverse of --transform.")] = False,
 ) -> None:
     """Write a field as a regnf field file (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid
     (.npz).
@@ -109,6 +119,9 @@ def convert(
         raise InvalidOptionsError("--images and --cameras need a regnf field file (.safetensors) as the output")
     if images is not None and cameras is not None:
         raise InvalidOptionsError("--images and --cameras: give only one of them; images have more information")
+    if transform is not None or inverse:
+        _moved(field, output, transform, inverse)
+        return
     said = with_cameras(description, intrinsics, None if cameras is None else axes)
     if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
         raise InvalidOptionsError("--intrinsics needs --cameras; --camera-axes needs --cameras or --images")
@@ -118,6 +131,16 @@ def convert(
         _to_safe_field(source, output, images, cameras, opengl=axes == "opengl")
     else:
         _evaluated(source, output, resolution)
+
+
+def _moved(field: Path, output: Path, transform: Path | None, inverse: bool) -> None:
+    from regnf_core.importing.splats.moving import pose_in, write_moved
+
+    if transform is None or output.suffix.lower() != ".ply":
+        raise InvalidOptionsError("--inverse needs --transform, which needs .ply as the output")
+    with err.status("moving"):
+        count = write_moved(field, output, pose_in(transform, inverse))
+    _told(output, f"{count:,} Gaussians")
 
 
 def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None, opengl: bool) -> None:

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.random_worlds.mesh import Array, ExactScene, ExactView
 from benchmarks.worlds.rendering import Size, intrinsics_of, jumps
-from regnf_data.fusing import BlockGrid, fuse_blocks, import_own, open3d
+from regnf_core.importing.fusing import BlockGrid, open3d
+from regnf_data.fusing import fuse_blocks, import_own
 from regnf_data.posed_images import PosedImages
 
 # Errors of the camera's estimated poses, and where they carry what was measured.

@@ -36,6 +36,11 @@ class TensorSource:
         self._archive = archive
         self._budget = budget
 
+    @property
+    def left(self) -> int:
+        """Bytes of the budget."""
+        return self._budget
+
     def array(self, name: str, value: object) -> Float32Array:
         """The tensor called ``name`` as a contiguous float32 array of its own shape.
 

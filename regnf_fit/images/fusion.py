@@ -19,7 +19,8 @@ from torch import Tensor
 from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
 from regnf_core.schema.safe_format import read_description, write_safe_field
-from regnf_data.fusing import BlockGrid, Progress, fuse_blocks
+from regnf_core.importing.fusing import BlockGrid, Progress
+from regnf_data.fusing import fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
 from regnf_fit.images.observing import attach_observation

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+import zlib
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
@@ -40,7 +41,7 @@ def sniff_mesh(head: bytes) -> str | None:
         return "stl"
     text = head.lstrip(_BLANK)
     if re.match(rb"ply[ \t]*[\r\n]", text):
-        return "ply"
+        return "splat-ply" if _SPLAT_PROPERTY.search(text) else "ply"
     if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS):
         return "gltf"
     if _is_pcd(text):
@@ -121,6 +122,64 @@ def _is_binary_stl(head: bytes) -> bool:
     return True
 
 
+# Gaussian splats. Two of their formats have no magic number.
+
+GAUSSIANS = b"KHR_gaussian_splatting"
+"""The extension of glTF files that hold splats."""
+MARKED_BYTES = 1 << 20
+"""In which it stands, by the order of all writers."""
+SPLAT_FORMATS = ("splat-ply", "splat", "ksplat", "spz", "sog")
+_SPLAT_PROPERTY = re.compile(rb"property \w+ (f_dc_0|packed_position)\s")
+_SPLAT_ROW = struct.Struct("<6f8B")
+_KSPLAT = struct.Struct("<2BxxIIIIH")
+_NGSP = b"NGSP"
+_MOST_SECTIONS, _SPLAT_ROWS = 1024, 8
+
+
+def sniff_splats(head: bytes) -> str | None:
+    """One of SPLAT_FORMATS, or None: PLY files are told by their header, see ``sniff_mesh``."""
+    if head.startswith(_NGSP):
+        return "spz"
+    text = head.lstrip(_BLANK)
+    if text.startswith(b"{") and b'"means"' in text and b'"scales"' in text:
+        return "sog"
+    if len(head) >= HEAD_BYTES and head[:1] == b"\0":
+        major, minor, most, sections, splats, count, level = _KSPLAT.unpack_from(head)
+        told = (major, minor) == (0, 1) and 0 < sections <= most <= _MOST_SECTIONS
+        return "ksplat" if told and 0 < count <= splats and level <= 2 else None
+    return "splat" if _is_splat(head) else None
+
+
+def splat_format(data: bytes | memoryview) -> str | None:
+    """The format in which a whole file holds Gaussian splats, one of SPLAT_FORMATS, "glb" or "gltf"; None: in none."""
+    kind = sniff_format(bytes(data[:HEAD_BYTES]))
+    if kind in SPLAT_FORMATS:
+        return kind
+    return kind if kind in ("glb", "gltf") and GAUSSIANS in bytes(data[:MARKED_BYTES]) else None
+
+
+def _is_splat(head: bytes) -> bool:
+    """Rows of 32 bytes: numbers of a place, three lengths, and a quaternion of length one in bytes."""
+    if len(head) < _SPLAT_ROWS * _SPLAT_ROW.size or (len(head) < HEAD_BYTES and len(head) % _SPLAT_ROW.size):
+        return False
+    for number in range(_SPLAT_ROWS):
+        *values, _, _, _, _, w, x, y, z = _SPLAT_ROW.unpack_from(head, _SPLAT_ROW.size * number)
+        place, scales = values[:3], values[3:]
+        length = math.hypot(*(part / 128.0 - 1.0 for part in (w, x, y, z)))
+        if not all(math.isfinite(value) and abs(value) < 1e6 for value in place) or abs(length - 1.0) > 0.03:
+            return False
+        if not all(math.isfinite(value) and 1e-12 < value < 1e4 for value in scales):
+            return False
+    return True
+
+
+def _is_packed_spz(head: bytes) -> bool:
+    try:
+        return zlib.decompressobj(31).decompress(head, len(_NGSP)) == _NGSP
+    except zlib.error:
+        return False
+
+
 HEAD_BYTES = 4096
 """How many first bytes are looked at: text may have a license before its first statement."""
 
@@ -177,7 +236,7 @@ tag may have XML's own lines before it."""
 
 def sniff_format(head: bytes) -> str | None:
     """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, a mesh's format, one
-    of ``RUN_ARCHIVES``, or None for what is not taken.
+    of ``SPLAT_FORMATS`` or of ``RUN_ARCHIVES``, or None for what is not taken.
 
     ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
     about the rest of the file.
@@ -195,9 +254,11 @@ def sniff_format(head: bytes) -> str | None:
         return None if head.startswith(_OLD_TORCH_TAR) else "tar"
     for magic, packing in _PACKED:
         if head.startswith(magic):
-            return packing
+            return "spz" if packing == "gzip" and _is_packed_spz(head) else packing
     if head.startswith(_SQLITE_MAGIC):
         return "sqlite"
+    if (splats := sniff_splats(head)) is not None:
+        return splats
     if head[8:9] == b"{":
         return "safetensors"
     return "onnx" if _ONNX.match(head) else sniff_mesh(head)

@@ -14,6 +14,7 @@ from regnf_core.importing.families import (
     pin_slam,
     sdfstudio,
     siren,
+    splatfacto,
     unsupported,
 )
 from regnf_core.importing.families.converted import ConvertedField
@@ -34,6 +35,7 @@ FAMILIES: tuple[Family, ...] = (
     deepsdf.convert_blocks,
     siren.convert,
     pin_slam.convert,
+    splatfacto.convert,
     unsupported.refuse,
 )
 

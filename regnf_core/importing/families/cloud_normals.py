@@ -86,7 +86,7 @@ def oriented(
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     signs = np.ones(len(some))
     if not within:
-        signs, unseen = _signs(some, along, middle + _AWAY * _directions(_OUTSIDE), middle)
+        signs, unseen = _signs(some, along, middle + _AWAY * directions(_OUTSIDE), middle)
         within = within is None and unseen > _UNSEEN
     if within:
         signs, _ = _signs(some, along, _free_places(some), None)
@@ -121,7 +121,7 @@ def _planes(points: Float64Array, places: Float64Array) -> tuple[Float64Array, F
     return axes[:, :, 0], apart, near
 
 
-def _directions(count: int) -> Float64Array:
+def directions(count: int) -> Float64Array:
     """(count, 3): spread evenly over the unit sphere, by the golden angle."""
     number = np.arange(count) + 0.5
     height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + 5.0**0.5) * number

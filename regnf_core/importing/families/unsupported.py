@@ -37,7 +37,6 @@ _KNOWN = (
         ("feature_octree", "geo_decoder"),
     ),
     _Known("NICE-SLAM's, grids of occupancies", _MESH, ("c", "decoder_state_dict")),
-    _Known("nerfstudio's splatfacto, Gaussians without a surface", _MESH, ("pipeline",), ("_model.gauss_params.",)),
     _Known(
         "nerfstudio's nerfacto, a radiance field without distances",
         "train neus-facto, or export a mesh (ns-export tsdf or poisson), and give the mesh",

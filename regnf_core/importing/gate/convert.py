@@ -22,7 +22,14 @@ from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.field_notes import WARNINGS, kept_warnings
-from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
+from regnf_core.importing.containers.sniff import (
+    GAUSSIANS,
+    HEAD_BYTES,
+    MARKED_BYTES,
+    RUN_ARCHIVES,
+    SPLAT_FORMATS,
+    sniff_format,
+)
 from regnf_core.importing.cost.mesh_work import Calls
 from regnf_core.importing.families.converted import AmbiguousError, untold_error
 from regnf_core.importing.gate.picture import PICTURE_NAME, candidate_name
@@ -52,8 +59,10 @@ _PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
 """Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
 _SMALL_PICTURE = Calls((40_000, 37_000), (12_000,))
 """About as many points as a small picture takes."""
-_THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz", "las"}
-"""May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
+_THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz", "las", *SPLAT_FORMATS}
+"""May be, or hold, clouds of points or Gaussian splats; the library that makes their surface needs threads."""
+_THREADED_MARKS = (GAUSSIANS, b"gauss_params")
+"""What stands near the beginning of other files with Gaussian splats: glTF files, checkpoints."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
@@ -251,7 +260,8 @@ def main(arguments: list[str]) -> int:
     out_dir = Path(arguments[0])
     # Opened while all is still allowed: a folder on the way may be open to this process's privileges only.
     opened = [os.open(path, os.O_RDONLY) for path in arguments[1:]]
-    threads = sniff_format(os.pread(opened[0], HEAD_BYTES, 0)) in _THREADED_FORMATS
+    head = os.pread(opened[0], MARKED_BYTES, 0)
+    threads = sniff_format(head[:HEAD_BYTES]) in _THREADED_FORMATS or any(mark in head for mark in _THREADED_MARKS)
     isolation = confine(limits, request["parent_pid"], opened, out_dir, threads)
     upload, *others = (Path(f"/proc/self/fd/{number}") for number in opened)
     named = {part: (request[part], others.pop(0)) for part in ("settings", "cameras") if request[part] is not None}

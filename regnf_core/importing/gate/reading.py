@@ -5,11 +5,11 @@ from __future__ import annotations
 import mmap
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.sniff import HEAD_BYTES, MESH_FORMATS, explain_refusal, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, MESH_FORMATS, explain_refusal, sniff_format, splat_format
 from regnf_core.importing.gate.report import ImportLimits
 
 if TYPE_CHECKING:
@@ -69,6 +69,8 @@ def read_upload(
     required = settings is not None and len(files) == 1 and files[0].name == settings[0]
     translated = _Translation(files, said, description or {}, required)
     path = upload if opened.name is None else new_file(folder)
+    if (kind := splat_format(opened.data)) is not None:
+        return _read_splats(kind, opened, said, trajectory, limits)
     converted = _convert(opened, path, translated, limits)
     converted = translated.noted(converted, opened.name)
     if trajectory is None:
@@ -106,6 +108,22 @@ def _found_cameras(
 def with_unused_cameras(converted: ConvertedField, why: str) -> ConvertedField:
     """The field with a warning: cameras that cannot be used, or need not, are no reason to refuse it."""
     return replace(converted, warnings=(*converted.warnings, f"CAMERAS_NOT_USED: {why}"))
+
+
+def _read_splats(
+    kind: str, opened: OpenedUpload, said: UploadDescription, given: Trajectory | None, limits: ImportLimits
+) -> ReadUpload:
+    """By the cameras that came with them, or those that the trainer of 3DGS keeps beside them, in the same frame."""
+    from regnf_core.importing.families.gaussian_splats import convert_splats, read_splats
+    from regnf_core.importing.observing.reading import read_trajectory
+    from regnf_core.importing.run.opened import TRAINED_CAMERAS
+
+    beside = [file for file in opened.settings if PurePosixPath(file.name).name == TRAINED_CAMERAS]
+    cameras = given or (read_trajectory(beside, said.cameras) if beside else None)
+    origin = f"a {kind} file" if opened.name is None else opened.name[-200:]
+    splats = read_splats(kind, opened.data, opened.siblings)
+    converted = convert_splats(splats, origin, said, cameras, limits.tensor_bytes)
+    return ReadUpload(converted, said, None, None)
 
 
 class _Translation:

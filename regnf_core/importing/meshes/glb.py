@@ -344,6 +344,14 @@ def read_gltf(data: memoryview, siblings: Siblings | None = None) -> Geometry:
     return _geometry(_document(data), None, siblings or {})
 
 
+def gltf_parts(data: memoryview) -> tuple[dict[str, Any], memoryview | None]:
+    """The document and the binary chunk of a .glb file, or of a .gltf file, which has none.
+
+    Raises FieldFormatError (MESH_INVALID).
+    """
+    return _chunks(data) if bytes(data[:4]) == b"glTF" else (_document(data), None)
+
+
 def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> Geometry:
     try:
         return _scene(document, Accessors(document, binary, siblings))

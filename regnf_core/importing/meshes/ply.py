@@ -29,15 +29,12 @@ from regnf_core.importing.meshes.triangle_files import (
 ByteOrder = Literal["<", ">"]
 
 _MAX_HEADER = 1 << 16
-_MAX_PARTS = 64
+_MAX_PARTS = 256
 _CODES = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
 _CODES |= {"i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64"}
 _TYPES = {name: code for code, names in _CODES.items() for name in names.split()}
 _FORMATS: dict[str, ByteOrder | None] = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"(?:^|\n)end_header[ \t]*\r?\n")
-
-_SPLAT = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
-"""Of the points that are Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +60,7 @@ class _Element:
 
 
 def _read_header(data: memoryview) -> tuple[ByteOrder | None, tuple[_Element, ...], int]:
-    """The byte order, None for text; the elements; the header's bytes.
-
-    Raises FieldFormatError: MESH_INVALID, or FAMILY_NOT_SUPPORTED for Gaussian splats.
-    """
+    """The byte order, None for text; the elements; the header's bytes. Raises FieldFormatError (MESH_INVALID)."""
     head = bytes(data[:_MAX_HEADER])
     end = _END.search(head)
     if end is None:
@@ -96,9 +90,6 @@ def _elements(lines: list[list[str]]) -> tuple[_Element, ...]:
         raise malformed("the PLY header has an element twice, or too many elements")
     for element in elements:
         properties = [p.name for p in element.properties]
-        if set(properties) >= _SPLAT:
-            message = "Gaussian splats, which have no surface; extract a mesh from them, and give the mesh"
-            raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
         if not properties or len(properties) > _MAX_PARTS or len(set(properties)) != len(properties):
             raise malformed(f"the PLY element {element.name[:40]} has no properties, too many, or one twice")
         if any((p.count_type or "").startswith("f") for p in element.properties):
@@ -122,7 +113,7 @@ class _Body:
     def _type(self, code: str) -> np.dtype[Any]:
         return np.dtype(np.float64 if self._order is None else self._order + code)
 
-    def _table(self, element: _Element, corners: int = 0) -> Any | None:
+    def table(self, element: _Element, corners: int = 0) -> Any | None:
         """(count,) rows by name if every list has ``corners`` items; None, nothing taken, if not."""
         fields: list[tuple[Any, ...]] = []
         for p in element.properties:
@@ -167,7 +158,7 @@ class _Body:
         """The columns (count,) of an element's single values; lists beside them are passed over."""
         names = [p.name for p in element.properties if p.count_type is None]
         if len(names) == len(element.properties):
-            rows = self._table(element)
+            rows = self.table(element)
             if rows is None:
                 raise element.cut_short()
             return {name: rows[name].astype(np.float64) for name in names}
@@ -178,7 +169,7 @@ class _Body:
     def triangles(self, element: _Element, name: str) -> Int64Array:
         """(F, 3) indices from the lists called ``name``, longer ones as fans."""
         for corners in _USUAL_CORNERS:
-            rows = self._table(element, corners)
+            rows = self.table(element, corners)
             if rows is not None:
                 require_room(0, (corners - 2) * element.count)
                 return fans(_whole(rows[name]))
@@ -191,6 +182,31 @@ class _Body:
             require_room(0, triangles)
             found.append(fan(polygon))
         return np.concatenate(found)
+
+
+class PlyTables:
+    """A PLY file whose rows all have one length: no element has a list."""
+
+    def __init__(self, data: memoryview) -> None:
+        """Raises FieldFormatError (MESH_INVALID)."""
+        order, self._elements, size = _read_header(data)
+        self._body = _Body(data[size:], order)
+
+    def count(self, name: str) -> int:
+        """How many rows of an element the header claims; 0 where it has none."""
+        return next((element.count for element in self._elements if element.name == name), 0)
+
+    def rows(self) -> dict[str, npt.NDArray[Any]]:
+        """(count,) of each element, by name. Raises FieldFormatError (MESH_INVALID)."""
+        found = {}
+        for element in self._elements:
+            if any(p.count_type is not None for p in element.properties):
+                raise malformed(f"the PLY element {element.name[:40]} has a list")
+            rows = self._body.table(element)
+            if rows is None:
+                raise element.cut_short()
+            found[element.name] = rows
+        return found
 
 
 def _whole(values: npt.NDArray[Any]) -> Int64Array:

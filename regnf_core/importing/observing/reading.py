@@ -262,6 +262,8 @@ def _read(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory
             return _of_arrays(name, ArraySource(file.data, _ARRAY_BYTES), said)
         if looks_like_json(file.data):
             keys = Keys(name, read_json(name, file.data))
+            if isinstance(keys.tree, list):
+                return _of_list(keys)
             if is_trajectory(keys):
                 return read_trajectory_json(keys, _said(said), said.axes)
     return _of_text(files, said)
@@ -271,6 +273,27 @@ def _rank(name: str) -> tuple[int, str]:
     """Known names first."""
     known = PurePosixPath(name).name
     return (_KNOWN_NAMES.index(known) if known in _KNOWN_NAMES else len(_KNOWN_NAMES)), name
+
+
+def _of_list(keys: Keys) -> Trajectory:
+    """The cameras.json of 3DGS: a list of cameras, each with its place and its axes in the world, OpenCV's."""
+    if len(keys.tree) > MOST_CAMERAS:
+        raise malformed(f"{keys.file} lists more than {MOST_CAMERAS} cameras")
+    poses, intrinsics = [], []
+    for index, one in enumerate(keys.tree):
+        camera = Keys(keys.file, one, f"{index}.")
+        rows, place = camera.matrix("rotation", 3, 3), camera.numbers("position")
+        sizes = [camera.number(name) for name in ("fx", "fy", "width", "height")]
+        if rows is None or place is None or len(place) != 3 or None in sizes:
+            raise malformed(f"{keys.file}: camera {index} has no rotation, position, fx, fy, width or height")
+        fx, fy, width, height = (float(size or 0.0) for size in sizes)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rows, place
+        poses.append(pose)
+        intrinsics.append(Intrinsics(fx, fy, width / 2, height / 2, width, height))
+    if not poses:
+        raise malformed(f"{keys.file} has no camera pose")
+    return trajectory_of(keys.file, np.stack(poses), intrinsics, None)
 
 
 def _of_text(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory | None:

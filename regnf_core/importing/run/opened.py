@@ -19,7 +19,7 @@ from regnf_core.library_entries import shown_path
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
     (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
-    (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz"),
+    (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz", ".splat", ".ksplat", ".spz"),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
 _TENSORS_ELSEWHERE = "optimizerparameters schedulerparameters latentcodes reconstructions normalizationparameters"
@@ -44,6 +44,11 @@ _STEP_WORD = re.compile(r"(?<![a-z])(epochs?|ep|steps?|iterations?|iters?|it)(?=
 _STANDING = {"best": 1, "current": 3, "last": 4, "latest": 4, "final": 5}
 """Words in place of a number: where they stand beside numbered files, which have 2."""
 _STANDING_WORD = re.compile(r"(?<![a-z])(best|current|last|latest|final)(?![a-z])", re.IGNORECASE)
+_TRAINED_SPLATS = re.compile(r"(?:^|/)point_cloud/iteration_([0-9]{1,18})/[^/]+$")
+"""Where the trainers of 3DGS and 2DGS put their steps; the cloud beside them is what they began with."""
+TRAINED_CAMERAS = "cameras.json"
+"""Beside such steps: the cameras of the training, in the same frame."""
+_SOG_TEXT, _SOG_IMAGE = "meta.json", "means_l.webp"
 _SHOWN = 6
 
 
@@ -67,6 +72,7 @@ def choose_checkpoint(names: Iterable[str]) -> str:
         raise FieldFormatError(
             f"no file of the run is a checkpoint; the importer looked for {ends}", reason="RUN_WITHOUT_CHECKPOINT"
         )
+    tier = [one for one in tier if _TRAINED_SPLATS.search(one.name)] or tier
     if len({candidate.series for candidate in tier}) > 1:
         shown = ", ".join(sorted(shown_path(candidate.name) for candidate in tier)[:_SHOWN])
         message = f"{len(tier)} files of the run may be the checkpoint: {shown}; give one of them alone"
@@ -90,6 +96,8 @@ def _first_tier(names: Iterable[str]) -> list[_Candidate]:
 
 def _candidate(path: PurePosixPath, end: str) -> _Candidate:
     stem = path.name[: -len(end)]
+    if found := _TRAINED_SPLATS.search(str(path)):
+        return _Candidate(str(path), (str(path.parent.parent), stem, end), (2, (int(found[1]),)))
     if not _OF_TRAINING.search(f"{path.parent.name}/{stem}"):
         return _Candidate(str(path), (str(path.parent), stem, end), (0, ()))
     words = [word.lower() for word in _STANDING_WORD.findall(stem)]
@@ -143,8 +151,9 @@ def choose_settings(names: Collection[str], checkpoint: str) -> tuple[str, ...]:
     here = PurePosixPath(checkpoint)
     known = [name for name in names if name != checkpoint]
     chosen: dict[str, str] = {}
+    own = TRAINED_CAMERAS if _TRAINED_SPLATS.search(checkpoint) else f"LatentCodes/{here.stem}.pth"
     for folder in list(here.parents)[:_LEVELS]:
-        for pattern in (*RUN_FILES, f"LatentCodes/{here.stem}.pth"):
+        for pattern in (*RUN_FILES, own):
             for name in sorted(known):
                 path = PurePosixPath(name)
                 if path.is_relative_to(folder) and _fits(path.relative_to(folder), pattern):
@@ -175,8 +184,8 @@ def _role(path: PurePosixPath) -> str:
 
 MAX_SETTINGS_BYTES = 64 << 20
 """All settings together: latent codes of a thousand shapes are the largest."""
-_WITH_OTHER_FILES = frozenset({".gltf", ".glb"})
-_OTHER_ENDS = frozenset({".bin"})
+_OTHER_ENDS = {".gltf": ".bin", ".glb": ".bin", ".json": ".webp"}
+"""Of a file that refers to others, what these end in."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +220,7 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     archive, members = _opened(data, most)
     if archive is None:
         return OpenedUpload(data, members=members)
-    name = choose_checkpoint(archive.sizes)
+    name = _sog(archive.sizes) or choose_checkpoint(archive.sizes)
     settings = choose_settings(archive.sizes, name)
     _require_few(archive, settings)
     siblings = _siblings(archive, name)
@@ -281,7 +290,17 @@ def _too_large(message: str) -> FieldFormatError:
 def _siblings(archive: ZipRun | TarRun, name: str) -> dict[str, str]:
     """Names in the archive by their names as a mesh in it would write them."""
     path = PurePosixPath(name)
-    if path.suffix.lower() not in _WITH_OTHER_FILES:
+    if path.suffix.lower() not in _OTHER_ENDS:
         return {}
     near = [each for each in map(PurePosixPath, archive.sizes) if each.is_relative_to(path.parent) and each != path]
-    return {str(each.relative_to(path.parent)): str(each) for each in near if each.suffix.lower() in _OTHER_ENDS}
+    return {
+        str(each.relative_to(path.parent)): str(each)
+        for each in near
+        if each.suffix.lower() == _OTHER_ENDS[path.suffix.lower()]
+    }
+
+
+def _sog(names: Collection[str]) -> str | None:
+    """The text of Gaussian splats whose numbers are in images beside it (SOG)."""
+    texts = [str(path) for path in map(PurePosixPath, names) if path.name == _SOG_TEXT]
+    return next((text for text in texts if str(PurePosixPath(text).parent / _SOG_IMAGE) in names), None)
