@@ -9,6 +9,7 @@
 #include "minimize.h"
 #include "near.h"
 #include "discs.h"
+#include "gaussians.h"
 #include "mesh.h"
 #include "voxel_blocks.h"
 
@@ -115,5 +116,5 @@ const regnf_steps REGNF_STEPS(REGNF_SET) = {
     block_slots,
     mesh_nodes,     grow_mesh,   mesh_at, mesh_closest, mesh_winding,
     nearest,        nearest_to_cells,
-    kernel_sums,    nearest_discs,
+    kernel_sums,    nearest_discs,  gaussian_depths,
 };

@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-#define REGNF_LAYOUT 8 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
+#define REGNF_LAYOUT 9 /* changes whenever a structure below does; regnf_core/native/library.py has the same */
 
 /* All arrays are the caller's, in one piece each, and are only read. */
 typedef struct {
@@ -147,7 +147,7 @@ typedef struct {
     float *costs, *of_scene, *of_object; /* means of |r| */
 } regnf_history;
 
-/* One set of the steps; see steps.h, minimize.h, distances.h, voxel_blocks.h, near.h, discs.h and mesh.h. */
+/* One set of the steps; see steps.h, minimize.h, distances.h, voxel_blocks.h, near.h, discs.h, gaussians.h and mesh.h. */
 typedef struct {
     /* Where the samples of one surface are at all poses, (poses, samples, 3); and their residuals from the other one's
      * distances and gradients there. With NULL for both, its model is asked. */
@@ -178,6 +178,8 @@ typedef struct {
     void (*kernel_sums)(const float *x, const float *u, int64_t n, const float *factors, const float *weights,
                         int64_t lengths, float *out);
     void (*discs)(const float *seen, const float *normals, int64_t n, int64_t size, float radius, int64_t *nearest);
+    void (*gaussian_depths)(const float *ellipses, const int32_t *boxes, int64_t n, int64_t width, int64_t height,
+                            float layer, float *work, float *depths, float *colors);
 } regnf_steps;
 
 #define REGNF_JOIN(a, b) a##b

@@ -20,7 +20,7 @@ SWITCH = "REGNF_NATIVE"
 NOT_BUILT = "was not built"
 _PLAIN = "plain"
 """The variant for what all processors of a kind have."""
-_LAYOUT = 8
+_LAYOUT = 9
 """Of the structures in field.h."""
 
 Evaluate = Callable[[int, int, int, int, "int | None"], int]
@@ -55,6 +55,7 @@ _STEPS: dict[str, tuple[Any, ...]] = {
     "nearest_to_cells": (ctypes.c_int, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS),
     "kernel_sums": (None, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS, _ADDRESS, _COUNT, _ADDRESS),
     "discs": (None, _ADDRESS, _ADDRESS, _COUNT, _COUNT, ctypes.c_float, _ADDRESS),
+    "gaussian_depths": (None, _ADDRESS, _ADDRESS, _COUNT, _COUNT, _COUNT, ctypes.c_float, *(_ADDRESS,) * 3),
 }
 
 

@@ -260,7 +260,7 @@ def _read(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory
         name = PurePosixPath(file.name).name
         if name.lower().endswith(".npz"):
             return _of_arrays(name, ArraySource(file.data, _ARRAY_BYTES), said)
-        if looks_like_json(file.data):
+        if looks_like_json(file.data) or bytes(file.data[:64]).lstrip()[:2] == b"[{":
             keys = Keys(name, read_json(name, file.data))
             if isinstance(keys.tree, list):
                 return _of_list(keys)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.importing.splats.gaussians import Doubles, Floats, Splats
+from regnf_core.native.library import Variant, variant
 
 _BLUR = 0.3
 """Variance of a pixel's filter, pixels squared, as in 3DGS."""
@@ -74,6 +75,9 @@ def depth_image(splats: Prepared, camera: Camera, layer: float) -> tuple[Floats,
     """
     width, height = camera.size
     seen = _projected(splats, camera)
+    compiled = variant()
+    if compiled is not None:
+        return _compiled(compiled, seen, width, height, layer)
     images = _Images(width, height, layer)
     counts = (seen.high - seen.low).prod(axis=1)
     ends = np.cumsum(counts)
@@ -88,6 +92,20 @@ def depth_image(splats: Prepared, camera: Camera, layer: float) -> tuple[Floats,
         if len(part.depth):
             images.blend(part)
     return images.finished()
+
+
+def _compiled(
+    compiled: Variant, seen: _Ellipses, width: int, height: int, layer: float
+) -> tuple[Floats, npt.NDArray[np.uint8]]:
+    """The same by compiled code, in a tenth of the time."""
+    parts = (seen.center, seen.conic, seen.depth[:, None], seen.slope, seen.opacity[:, None], seen.color)
+    ellipses = np.ascontiguousarray(np.concatenate(parts, axis=1), np.float32)
+    boxes = np.stack([seen.low[:, 0], seen.high[:, 0], seen.low[:, 1], seen.high[:, 1]], axis=1).astype(np.int32)
+    work, depths = np.zeros((height, width, 4), np.float32), np.zeros((height, width), np.float32)
+    colors = np.zeros((height, width, 3), np.float32)
+    given, made = (ellipses.ctypes.data, boxes.ctypes.data), (work.ctypes.data, depths.ctypes.data, colors.ctypes.data)
+    compiled.steps.gaussian_depths(*given, len(ellipses), width, height, layer, *made)
+    return depths, (255.0 * colors).clip(0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -238,6 +238,22 @@ class Seen:
         column, row = np.where(inside[:, None], pixel, 0.0).astype(int).T
         return np.where(inside, self.depth[row, column], np.nan).astype(np.float64), own
 
+    def ahead(self, x: Doubles, y: Doubles, z: Doubles) -> Floats:
+        """(X, Y, Z): how far the surface that is seen lies behind the places of a grid, by depth; infinity where there
+        is none in their direction, NaN beside the image."""
+        M = (self.camera.matrix @ self.camera.T_camera_world[:3]).astype(np.float32)
+        x, y, z = (axis.astype(np.float32) for axis in (x, y, z))
+        u, v, own = (
+            (row[0] * x)[:, None, None] + (row[1] * y)[:, None] + (row[2] * z + row[3]) for row in M
+        )  # homogeneous
+        height, width = self.depth.shape
+        inside = (own > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < width * own) & (v < height * own)
+        with np.errstate(all="ignore"):
+            column, row = (np.where(inside, part / own, 0.0).astype(np.int32) for part in (u, v))
+        column, row = np.minimum(column, width - 1), np.minimum(row, height - 1)
+        there = np.where(self.depth > 0.0, self.depth, np.float32(np.inf))[row, column]
+        return np.where(inside, there - own, np.float32(np.nan)).astype(np.float32)
+
 
 def drawn(splats: Prepared, cameras: list[Camera], voxel: float, workers: int) -> list[Seen]:
     """The images of all cameras, ``workers`` at a time: numpy lets others run meanwhile."""

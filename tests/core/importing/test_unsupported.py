@@ -16,7 +16,6 @@ ONE = torch.ones(4)
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "nerfacto": ({"step": 1, "pipeline": {"_model.field.mlp_base.params": ONE}}, "nerfacto"),
     "nerfacto, distributed": ({"pipeline": {"module._model.field.mlp_base.0.weight": ONE}}, "nerfacto"),
-    "splatfacto": ({"pipeline": {"_model.gauss_params.means": ONE}}, "Gaussians"),
     "SHINE-Mapping": ({"iters": 9, "feature_octree": {"a": ONE}, "geo_decoder": {"lout.weight": ONE}}, "SHINE"),
     "Co-SLAM, fused": ({"pose": {}, "model": {"embed_fn.params": ONE, "decoder.sdf_net.model.params": ONE}}, "Co-SLAM"),
     "NICE-SLAM": ({"c": {"grid_fine": ONE}, "decoder_state_dict": {"a": ONE}}, "NICE-SLAM"),
@@ -48,16 +47,6 @@ def test_named_with_what_to_do_instead(case: str, tmp_path: Path) -> None:
     assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
     assert name in str(caught.value)
     assert "mesh" in str(caught.value)
-
-
-def test_gaussian_splats_are_no_point_cloud(tmp_path: Path) -> None:
-    names = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "rot_0")
-    header = ["ply", "format binary_little_endian 1.0", "element vertex 1"]
-    lines = [*header, *(f"property float {name}" for name in names), "end_header", ""]
-    (tmp_path / "upload").write_bytes("\n".join(lines).encode() + bytes(4 * len(names)))
-    with pytest.raises(FieldFormatError, match="Gaussian splats") as caught:
-        convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
-    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
 
 
 def test_a_program_of_torchscript_is_named(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from regnf_core.importing.splats import drawing
 from regnf_core.importing.splats.drawing import Camera, depth_image, prepared
 from regnf_core.importing.splats.gaussians import Doubles, Splats
 from regnf_core.importing.splats.views import Seen, agreed, cameras_for, given_cameras, region_of
+from regnf_core.native.library import variant
 
 LAYER = 0.01
 CAMERA = Camera(np.eye(4), (30.0, 32.0), (16.0, 12.0), (32, 24))
@@ -72,14 +73,30 @@ def slow_depth(splats: Splats, column: int, row: int) -> float:
     return float(np.dot(weights, [depth for depth, _ in taken]) / sum(weights)) if half else 0.0
 
 
-@pytest.mark.parametrize("at_once", [1 << 21, 500])
-def test_each_pixel_is_that_of_a_slow_reference(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing, "_FRAGMENTS", at_once)
+@pytest.mark.parametrize(("at_once", "compiled"), [(1 << 21, False), (500, False), (0, True)])
+def test_each_pixel_is_that_of_a_slow_reference(at_once: int, compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if compiled and variant() is None:
+        pytest.skip("the compiled code was not built")
+    if not compiled:
+        monkeypatch.setattr(drawing, "variant", lambda: None)
+        monkeypatch.setattr(drawing, "_FRAGMENTS", at_once)
     splats = random_splats(300, 1)
     depth, _ = depth_image(prepared(splats), CAMERA, LAYER)
     random = np.random.default_rng(0)
     for column, row in zip(random.integers(32, size=60), random.integers(24, size=60), strict=True):
         assert depth[row, column] == pytest.approx(slow_depth(splats, int(column), int(row)), rel=1e-3)
+
+
+def test_compiled_code_draws_what_arrays_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    if variant() is None:
+        pytest.skip("the compiled code was not built")
+    splats = prepared(random_splats(3000, 2))
+    depth, color = depth_image(splats, CAMERA, LAYER)
+    monkeypatch.setattr(drawing, "variant", lambda: None)
+    expected, shown = depth_image(splats, CAMERA, LAYER)
+    assert (depth > 0).all()
+    np.testing.assert_allclose(np.quantile(np.abs(depth - expected), 0.99), 0.0, atol=1e-4)
+    assert np.abs(color.astype(int) - shown).max() <= 1
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0.4, 0, 1), (0, -0.7, 1), (0.5, 0.5, 0.8)])
