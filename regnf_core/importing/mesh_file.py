@@ -46,7 +46,7 @@ def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
     ending = named.suffix.lower().removeprefix(".")
     format_ = sniff_format(data[:HEAD_BYTES]) or (ending if ending in MESH_READERS else None)
     if format_ not in MESH_READERS:
-        reason, detail = explain_refusal(data[:HEAD_BYTES])
+        reason, detail = explain_refusal(data[:HEAD_BYTES], named.name)
         raise FieldFormatError(f"{named.name}: {detail}", reason=reason)
     beside = {}
     if format_ == "gltf":

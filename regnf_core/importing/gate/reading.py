@@ -173,7 +173,7 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
         from regnf_core.importing.families.mesh import convert_mesh
 
         return convert_mesh(kind, data, describe(Facts()), limits.refused_beyond_s, opened.siblings)
-    reason, detail = explain_refusal(head)
+    reason, detail = explain_refusal(head, opened.name or "")
     raise FieldFormatError(detail, reason=reason)
 
 
