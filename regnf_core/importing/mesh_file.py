@@ -53,7 +53,7 @@ def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
         beside = {one.name: memoryview(one.read_bytes()) for one in named.parent.iterdir() if one.suffix == ".bin"}
     try:
         with np.errstate(all="ignore"):
-            geometry = read_mesh(format_, memoryview(data), beside)
+            geometry = read_mesh(format_, memoryview(data), beside, named)
     except FieldFormatError as error:
         raise error.told(f"{named.name}: {error}") from error
     if len(geometry.faces) == 0:

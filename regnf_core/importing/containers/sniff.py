@@ -10,9 +10,10 @@ from regnf_core.importing.containers.refused import is_package, refused
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
-MESH_FORMATS = ("glb", "gltf", "las", "obj", "pcd", "ply", "stl", "xyz")
+MESH_FORMATS = ("e57", "glb", "gltf", "las", "npy", "obj", "pcd", "ply", "stl", "xyz")
 
 _OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
+_MAGICS = ((b"glTF", "glb"), (b"LASF", "las"), (b"ASTM-E57", "e57"), (b"\x93NUMPY", "npy"))
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
 _MAX_STL_FACETS = 1 << 26
@@ -34,10 +35,9 @@ def sniff_mesh(head: bytes) -> str | None:
 
     Text may begin with a byte-order mark, blank lines and comments: the first statement decides, wherever it stands.
     """
-    if head.startswith(b"glTF"):
-        return "glb"
-    if head.startswith(b"LASF"):
-        return "las"
+    for magic, format_ in _MAGICS:
+        if head.startswith(magic):
+            return format_
     if _is_binary_stl(head):
         return "stl"
     text = head.lstrip(_BLANK)

@@ -52,7 +52,7 @@ _PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
 """Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
 _SMALL_PICTURE = Calls((40_000, 37_000), (12_000,))
 """About as many points as a small picture takes."""
-_THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz", "las"}
+_THREADED_FORMATS = RUN_ARCHIVES | {"e57", "las", "npy", "pcd", "ply", "xyz"}
 """May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 

@@ -110,8 +110,8 @@ TUM = "".join(
 ).encode()
 BINARY, ASCII = pcd(AROUND, AROUND, "binary"), pcd(AROUND, AROUND, "ascii")
 CLOUDS = {
-    "MESH_TOO_LARGE": [BINARY.replace(b"POINTS 400", b"POINTS 99999999")],
     "MESH_INVALID": [
+        BINARY.replace(b"POINTS 400", b"POINTS 99999999"),
         *(BINARY[:-1], ASCII[:-300], pcd(AROUND, AROUND, "binary_compressed")[:-1]),
         ASCII.replace(b"0.7 -", b"0.7 -" + b"x" * 20000),
         *(BINARY.replace(b"POINTS 400", b"POINTS -400"), BINARY.replace(b"COUNT 1", b"COUNT 9")),
