@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.npz import array_header
 from regnf_core.importing.meshes.thinning import Thinning, lines_of, rows_of_text
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, unsupported
@@ -16,6 +17,7 @@ from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, m
 # LZF, the compression of PCD files, by its published layout: literals, and copies of what was unpacked before.
 
 _LITERALS, _LONG = 32, 7
+_MOST_UNPACKED = 2 << 30
 
 
 def unpack_lzf(packed: memoryview, size: int) -> memoryview:
@@ -83,7 +85,7 @@ class _Header:
 
 
 def read_pcd(data: memoryview) -> Geometry:
-    """The points of a PCD file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
+    """The points of a PCD file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE for what unpacks to too much."""
     header = _header(data)
     body = data[header.size :]
     thinning = Thinning(header.points)
@@ -161,6 +163,8 @@ def _unpacked(header: _Header, body: memoryview) -> memoryview:
     packed, size = (int.from_bytes(body[at : at + 4], "little") for at in (0, 4))
     if len(body) < 8 or packed > len(body) - 8 or size != header.points * header.row.itemsize:
         raise malformed("the PCD file's compressed points have another size than the header states")
+    if size > _MOST_UNPACKED:
+        raise FieldFormatError(f"the PCD file unpacks to {size} bytes; save it as binary", reason="MESH_TOO_LARGE")
     return unpack_lzf(body[8 : 8 + packed], size)
 
 
