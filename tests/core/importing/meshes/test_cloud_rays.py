@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.cloud import convert_cloud
+from regnf_core.importing.families.cloud_rays import observed_by_rays
 from regnf_core.importing.meshes.triangle_files import Geometry
-from regnf_core.importing.observing.by_rays import observed_by_rays
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.description import FREE, OBSERVATION, SURFACE, UNSEEN, ObservationGrid
 
