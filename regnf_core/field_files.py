@@ -27,16 +27,17 @@ def require_field_file(path: Path) -> None:
     Each names the path; for the folder of a training run and its config.yml, the hint names the checkpoint inside.
     """
     require_file(path)
-    if path.suffix.lower() in _TEXT_SUFFIXES:
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    if sniff_format(head) is not None:
+        return
+    reason, message = explain_refusal(head, path.name)
+    if path.suffix.lower() in _TEXT_SUFFIXES and reason != "FORMAT_NOT_SUPPORTED":
         found = checkpoint_below(path.parent)
         hint = f"Did you mean {found}?" if found else "Give the checkpoint to which it belongs."
         message = f"{path}: a text file ({path.suffix}), expected a field: regnf field file, checkpoint or mesh"
         raise FieldFormatError(message, reason="FORMAT_NOT_RECOGNIZED", hint=hint)
-    with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    if sniff_format(head) is None:
-        reason, message = explain_refusal(head)
-        raise FieldFormatError(f"{path}: {message}", reason=reason)
+    raise FieldFormatError(f"{path}: {message}", reason=reason)
 
 
 def require_file(path: Path) -> None:

@@ -46,14 +46,14 @@ def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
     ending = named.suffix.lower().removeprefix(".")
     format_ = sniff_format(data[:HEAD_BYTES]) or (ending if ending in MESH_READERS else None)
     if format_ not in MESH_READERS:
-        reason, detail = explain_refusal(data[:HEAD_BYTES])
+        reason, detail = explain_refusal(data[:HEAD_BYTES], named.name)
         raise FieldFormatError(f"{named.name}: {detail}", reason=reason)
     beside = {}
     if format_ == "gltf":
         beside = {one.name: memoryview(one.read_bytes()) for one in named.parent.iterdir() if one.suffix == ".bin"}
     try:
         with np.errstate(all="ignore"):
-            geometry = read_mesh(format_, memoryview(data), beside)
+            geometry = read_mesh(format_, memoryview(data), beside, named)
     except FieldFormatError as error:
         raise error.told(f"{named.name}: {error}") from error
     if len(geometry.faces) == 0:

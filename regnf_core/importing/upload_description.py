@@ -175,6 +175,8 @@ class UploadDescription(_Said):
     """Row-major 4x4 matrix of a similarity transform. It maps points of the field's frame to the dataset's."""
     as_: Annotated[Literal["scene", "object"] | None, Field(alias="as")] = None
     """scene: a surface seen from inside, such as a room. object: a surface seen from outside."""
+    sensor: _Corner | None = None
+    """The position from which all points of a cloud were measured, in the file's coordinates."""
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=MOST_OF_LABEL, pattern=LABEL_PATTERN)] | None = None

@@ -40,7 +40,7 @@ _PARSER_ERRORS = (
 """What numpy and Python's parser of literals raise for headers that are malformed."""
 
 
-def _header(name: str, data: memoryview) -> tuple[np.dtype[np.generic], tuple[int, ...], bool, int]:
+def array_header(name: str, data: memoryview) -> tuple[np.dtype[np.generic], tuple[int, ...], bool, int]:
     """Of the array ``name``: its type, its shape, whether it is in Fortran's order, and where its numbers begin."""
     file = io.BytesIO(data[: npy.MAGIC_LEN + 4 + _MAX_HEADER])
     malformed_header = FieldFormatError(f"{name} has no valid header of an array of numbers", reason="NPY_MALFORMED")
@@ -127,7 +127,7 @@ class ArraySource:
         if self._unpacked < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
         raw = member.content(self._data)
-        dtype, shape, fortran_order, data_at = _header(name, raw)
+        dtype, shape, fortran_order, data_at = array_header(name, raw)
         require_possible(name, shape)
         count = math.prod(shape)
         if most is not None and count > most:

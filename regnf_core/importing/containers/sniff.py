@@ -7,11 +7,14 @@ import re
 import struct
 import zlib
 
+from regnf_core.importing.containers.refused import is_package, refused
+
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
-MESH_FORMATS = ("glb", "gltf", "las", "obj", "pcd", "ply", "stl", "xyz")
+MESH_FORMATS = ("e57", "glb", "gltf", "las", "npy", "obj", "pcd", "ply", "stl", "xyz")
 
 _OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
+_MAGICS = ((b"glTF", "glb"), (b"LASF", "las"), (b"ASTM-E57", "e57"), (b"\x93NUMPY", "npy"))
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
 _MAX_STL_FACETS = 1 << 26
@@ -33,16 +36,15 @@ def sniff_mesh(head: bytes) -> str | None:
 
     Text may begin with a byte-order mark, blank lines and comments: the first statement decides, wherever it stands.
     """
-    if head.startswith(b"glTF"):
-        return "glb"
-    if head.startswith(b"LASF"):
-        return "las"
+    for magic, format_ in _MAGICS:
+        if head.startswith(magic):
+            return format_
     if _is_binary_stl(head):
         return "stl"
     text = head.lstrip(_BLANK)
     if re.match(rb"ply[ \t]*[\r\n]", text):
         return "splat-ply" if _SPLAT_PROPERTY.search(text) else "ply"
-    if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS):
+    if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS) and b'"geometricError"' not in text:
         return "gltf"
     if _is_pcd(text):
         return "pcd"
@@ -184,54 +186,24 @@ HEAD_BYTES = 4096
 """How many first bytes are looked at: text may have a license before its first statement."""
 
 _SQLITE_MAGIC = b"SQLite format 3\x00"
-_VDB_MAGICS = (b" BDV", b"NanoVDB")
 _ZIP_LOCAL_HEADER = b"PK\x03\x04"
 _ZIP_NAME_AT = 30
 _TORCH_MEMBERS = frozenset(
     b"data.pkl data .data version byteorder .format_version .storage_alignment constants.pkl code".split()
 )
-_ONNX = re.compile(rb"\x08[\x03-\x1f][\x12\x1a\x22\x28\x32\x3a\x42]")
-"""A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
-_PACKAGES = ((b"[Content_Types].xml", "a 3MF model, or an office document"), (b"3D/", "a 3MF model"))
-_KERAS_MEMBERS = (b"metadata.json", b"config.json", b"model.weights.h5")
+_ONNX = re.compile(rb"\x08[\x03-\x1f](?!\x12[\x80-\xff]*[\x01-\x7f]\n)[\x12\x1a\x22\x28\x32\x3a\x42]")
+"""A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's. Core ML's
+has a message there, which begins with its first field, where ONNX has a name."""
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
 """Formats in which a whole training run may be given."""
 _PACKED = ((b"\x1f\x8b\x08", "gzip"), (b"BZh", "bzip2"), (b"\xfd7zXZ\x00", "xz"))
 _TAR_MAGIC, _TAR_MAGIC_AT, _OLD_TORCH_TAR = b"ustar", 257, b"sys_info\0"
-_PICTURE = "picture; expected a field: a checkpoint, a regnf field file, a mesh or a grid"
-_PAGE = "an HTML page, not a field; the download failed, or it needs a login"
 BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n")
 """How recordings of robots begin, beside those that are SQLite databases."""
 RECORDINGS = (*BAGS, _ZIP_LOCAL_HEADER)
 """How files begin that may be recordings, whatever else they look like."""
-_OTHER_FILES = (
-    *((magic, "a recording of a robot, not a field; upload it with POST /recordings") for magic in BAGS),
-    (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, then give it again"),
-    *((b"<!doctype html", _PAGE), (b"<html", _PAGE)),
-    (b"<?xml", "an XML document, not a field; export a model as .glb, .ply, .obj or .stl"),
-    *((b"\x89PNG", f"a PNG {_PICTURE}"), (b"\xff\xd8\xff", f"a JPEG {_PICTURE}")),
-    *((b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file in it"), (b"%PDF", "a PDF document, not a field")),
-    (b"\x89HDF", "an HDF5 file, as Keras writes it; export the network as ONNX, or save its arrays with numpy.savez"),
-    (b"\x08\x01\x12", "a TensorFlow model; export the network as ONNX"),
-)
-"""Files that people give by mistake: their first bytes, and what they are."""
 _BLANK = b"\xef\xbb\xbf \t\r\n"
-_SHAPE_WITHIN = 512
-_SHAPES = (
-    (b"ASTM-E57", "an E57 cloud of points"),
-    *((b"PXR-USDC", "a USD scene"), (b"#usda", "a USD scene"), (b"Kaydara FBX", "an FBX scene")),
-    *((b"; FBX ", "an FBX scene"), (b"BLENDER", "a Blender file"), (b"3D Geometry File Format", "a Rhino file")),
-    *((b"ISO-10303-21", "a STEP model of CAD"), (b"0 SECTION 2 ", "a DXF drawing")),
-    *((b"AutoCAD Binary DXF", "a DXF drawing"), (b"AC10", "a DWG drawing"), (b"#X3D", "an X3D scene")),
-    *((b"# vtk DataFile", "a VTK file"), (b"<VTKFile", "a VTK file"), (b"#VRML", "a VRML scene")),
-    *((b"<X3D", "an X3D scene"), (b"<amf", "an AMF model"), (b"<robot", "a URDF robot, which names its meshes")),
-    *((b"<sdf", "a Gazebo model, which names its meshes"), (b"<mujoco", "a MuJoCo model, which names its meshes")),
-    (b"<COLLADA", "a COLLADA scene"),
-    *((b"# Octomap", "an OctoMap"), (b"#binvox", "a binvox grid"), (b"NRRD000", "an NRRD volume")),
-)
-"""Shapes in formats that are not read: how they begin, white space between words being one blank, and what they are. A
-tag may have XML's own lines before it."""
 
 
 def sniff_format(head: bytes) -> str | None:
@@ -246,10 +218,9 @@ def sniff_format(head: bytes) -> str | None:
     if head.startswith(_LEGACY_MAGIC):
         return "torch-legacy"
     if head.startswith(_ZIP_LOCAL_HEADER):
-        first = _first_name(head)
-        if first.endswith(b".npy"):
+        if _first_name(head).endswith(b".npy"):
             return "npz"
-        return None if first in _KERAS_MEMBERS or _package(first) else "zip"
+        return None if is_package(head) else "zip"
     if head[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC):
         return None if head.startswith(_OLD_TORCH_TAR) else "tar"
     for magic, packing in _PACKED:
@@ -264,49 +235,20 @@ def sniff_format(head: bytes) -> str | None:
     return "onnx" if _ONNX.match(head) else sniff_mesh(head)
 
 
-def explain_refusal(head: bytes) -> tuple[str, str]:
-    """The reason and a sentence for a file that ``sniff_format`` does not name."""
+def explain_refusal(head: bytes, name: str = "") -> tuple[str, str]:
+    """The reason and a sentence for a file that ``sniff_format`` does not name. name: of the file, where it is known;
+    it is asked where the bytes tell nothing."""
     if not head:
         return "FILE_EMPTY", "the file is empty"
     if head.startswith(_OLD_TORCH_TAR):
         return "LEGACY_TORCH_FILE", "a tar archive of PyTorch before version 0.1.10; save it again"
     if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
         return "RAW_PICKLE", "a plain pickle; only files written by torch.save (1.6 or later) are supported"
-    if head.startswith(_VDB_MAGICS):
-        return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
-    if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head) in _KERAS_MEMBERS:
-        return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays with numpy.savez"
-    if _OFF.match(head.lstrip(_BLANK)):
-        return "FORMAT_NOT_SUPPORTED", "an OFF mesh; export it as .glb, .ply, .obj or .stl"
-    begin = b" ".join(head[:_SHAPE_WITHIN].lstrip(_BLANK).lower().split())
-    for magic, what in _SHAPES:
-        if begin.startswith(magic.lower()) or (begin.startswith(b"<") and magic[:1] == b"<" and magic.lower() in begin):
-            return "FORMAT_NOT_SUPPORTED", f"{what}; export it as .glb, .ply, .obj or .stl"
-    if head.startswith(_ZIP_LOCAL_HEADER) and (package := _package(_first_name(head))):
-        return "FORMAT_NOT_SUPPORTED", f"{package}; export it as .glb, .ply, .obj or .stl"
-    if head.startswith(b"\x93NUMPY"):
-        message = (
-            "a single numpy array; a grid also needs its origin and spacing: numpy.savez(file, sdf=array, "
-            "origin=..., spacing=...)"
-        )
-        return "FORMAT_NOT_SUPPORTED", message
-    if head[4:8] == b"TFL3":
-        return "FORMAT_NOT_SUPPORTED", "a TensorFlow Lite model; export the network as ONNX"
-    for magic, what in _OTHER_FILES:
-        if head.lstrip(_BLANK)[: len(magic)].lower() == magic.lower():
-            return "FORMAT_NOT_RECOGNIZED", what
-    return (
+    return refused(head, name) or (
         "FORMAT_NOT_RECOGNIZED",
         "not a supported format; supported are torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of "
         "a run",
     )
-
-
-def _package(first: bytes) -> str | None:
-    """What a zip with this first member is that is no run: a model of one file."""
-    if first.lower().endswith((b".usd", b".usda", b".usdc")):
-        return "a USDZ scene"
-    return next((what for name, what in _PACKAGES if first.startswith(name)), None)
 
 
 def _first_name(head: bytes) -> bytes:

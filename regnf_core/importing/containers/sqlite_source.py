@@ -43,10 +43,22 @@ _LIMITS = {
 }
 
 
+_OTHERS = (
+    (
+        {"Node", "Link", "Data"},
+        "an RTAB-Map database; give its cloud or mesh (rtabmap-export --cloud, --mesh), or its depth images and poses "
+        "(rtabmap-export --images --poses) as a recording",
+    ),
+    ({"topics", "messages"}, "a recording of a robot; upload it with POST /recordings"),
+    ({"cameras", "images", "keypoints"}, "a COLMAP database, which has no surface; give the fused cloud or the mesh"),
+)
+"""Databases of other programs, by tables that they have."""
+
+
 class TableSource:
     """The plain tables of a SQLite file.
 
-    Raises FieldFormatError: TENSOR_TOO_LARGE, FILE_TRUNCATED, SQLITE_MALFORMED or SQLITE_NOT_PLAIN.
+    Raises FieldFormatError: TENSOR_TOO_LARGE, FILE_TRUNCATED, SQLITE_MALFORMED, SQLITE_NOT_PLAIN, FAMILY_NOT_SUPPORTED.
     """
 
     def __init__(self, data: memoryview) -> None:
@@ -92,6 +104,10 @@ class TableSource:
     def _read_schema(self) -> frozenset[str]:
         """The tables' names: each entry makes a table or an index of one, by what it says and by what it is."""
         tables = set()
+        names = {row[0] for row in self._connection.execute("SELECT name FROM sqlite_master LIMIT 1000")}
+        for known, what in _OTHERS:
+            if known <= names:
+                raise FieldFormatError(what, reason="FAMILY_NOT_SUPPORTED")
         for count, (kind, name, statement) in enumerate(
             self._connection.execute("SELECT type, name, sql FROM sqlite_master")
         ):

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.cost.mesh_work import FINEST, SPAN, affordable_depth
 from regnf_core.importing.families.cloud_normals import Oriented, fit_their_points, oriented
-from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.cloud_rays import observed_by_rays
+from regnf_core.importing.families.converted import ConvertedField, observed_field
 from regnf_core.importing.families.triangles import mesh_field, require_extent
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
@@ -54,6 +55,8 @@ def convert_cloud(
     Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_TOO_SMALL, IMPORT_TOO_COSTLY beyond ``work_s`` estimated seconds,
     and what ``overrides`` is refused for.
     """
+    if overrides.sensor is not None:
+        geometry, overrides = replace(geometry, sensor=np.array(overrides.sensor)), replace(overrides, sensor=None)
     given, dropped = _usable(geometry)
     points = given.vertices
     _require_surface(np.unique(points, axis=0), len(points))
@@ -61,14 +64,17 @@ def convert_cloud(
     require_extent(diagonal)
     unit = (points - low) / diagonal
     places = np.unique(unit, axis=0)  # a tree cannot part points at one place: each would be compared with each
-    sensor = None if geometry.sensor is None else (geometry.sensor - low) / diagonal
+    sensors = given.sensor
+    known = sensors is not None and bool(np.isfinite(sensors).all())
+    sensor = (sensors - low) / diagonal if sensors is not None and known else None
     made, warnings = oriented_cloud(unit, given.normals, sensor, overrides)
-    if made.within and overrides.as_ is None:
+    if made.within is not False and overrides.as_ is None:  # where a sensor looked is free space, within or around
         overrides = replace(overrides, as_="scene")
     tree = cKDTree(places)
     depth = affordable_depth(unit, work_s)
     vertices, faces = _poisson(unit, made.normals, depth)
-    reach = max(_REACH_SPACINGS * float(np.median(tree.query(places, k=2)[0][:, 1])), _REACH_SHARE)
+    spacing = float(np.median(tree.query(places, k=2)[0][:, 1]))
+    reach = max(_REACH_SPACINGS * spacing, _REACH_SHARE)
     near = tree.query(vertices, distance_upper_bound=reach)[0] < reach
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
@@ -85,7 +91,20 @@ def convert_cloud(
     )
     if depth < FINEST:
         text += f"; it is {width} instead of {1 << FINEST}, because its points fill too many cells"
-    return replace(found, why=why, warnings=(*found.warnings, *warnings, f"SURFACE_RECONSTRUCTED: {text}"))
+    found = replace(found, why=why, warnings=(*found.warnings, *warnings, f"SURFACE_RECONSTRUCTED: {text}"))
+    return found if sensors is None else _observed(found, points, sensors, spacing * diagonal)
+
+
+def _observed(found: ConvertedField, points: Float64Array, sensors: Float64Array, spacing: float) -> ConvertedField:
+    """The field with what was seen from the positions of the sensor. points, sensors: (N, 3), the file's frame."""
+    placement = found.description.get("placement")
+    origin = np.zeros(3) if placement is None else np.array(placement["transform"])[:3, 3]
+    origin = origin / found.description["world_scale"]
+    seen = observed_by_rays(points - origin, sensors - origin, spacing)
+    if seen is None:
+        return replace(found, why=(*found.why, "no observation: the points are not visible from the sensor's position"))
+    stood = len(np.unique(sensors[np.isfinite(sensors).all(axis=1)], axis=0))
+    return observed_field(found, *seen, f"by the rays from {stood} positions of the sensor")
 
 
 def oriented_cloud(
@@ -134,7 +153,10 @@ def _usable(geometry: Geometry) -> tuple[Geometry, tuple[str, ...]]:
     sound = np.flatnonzero(placed)
     if len(sound) > _MAX_POINTS:
         sound = sound[np.random.default_rng(0).permutation(len(sound))[:_MAX_POINTS]]
-    return Geometry(points[sound], geometry.faces, None if normals is None else normals[sound]), dropped
+    sensor = None if geometry.sensor is None else np.broadcast_to(geometry.sensor, points.shape)[sound]
+    return replace(
+        geometry, vertices=points[sound], normals=None if normals is None else normals[sound], sensor=sensor
+    ), dropped
 
 
 def _require_surface(places: Float64Array, points: int) -> None:

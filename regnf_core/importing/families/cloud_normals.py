@@ -73,8 +73,9 @@ def oriented(
 ) -> Oriented:
     """The normals of points (N, 3), with a diagonal of one.
 
-    given: (N, 3) normals of unknown side; None: they are estimated · sensor: (3,), where all points were measured from
-    · within: whether they are of a scene that was measured from within; None: by what can be seen.
+    given: (N, 3) normals of unknown side; None: they are estimated · sensor: (3,), where all points were measured from,
+    or (N, 3), where each was · within: whether they are of a scene that was measured from within; None: by what can be
+    seen.
     """
     lines = _planes(points, points)[0]
     if sensor is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -20,17 +21,18 @@ def convert_mesh(
     overrides: UploadDescription,
     work_s: float = math.inf,
     siblings: Siblings | None = None,
+    path: Path | None = None,
 ) -> ConvertedField:
     """The exact distance to the mesh in ``data``, a file of the format that ``sniff_format`` named.
 
-    siblings: the files that came with it in one archive, by their names relative to it.
+    siblings: the files that came with it in one archive, by their names relative to it · path: where ``data`` is.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED,
     POINT_CLOUD_TOO_SMALL, IMPORT_TOO_COSTLY beyond ``work_s`` estimated seconds, and what ``overrides`` is
     refused for.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are refused as not finite
-        geometry = read_mesh(format_, data, siblings)
+        geometry = read_mesh(format_, data, siblings, path)
     if len(geometry.faces) > 0:
         return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
     if format_ not in CLOUD_FORMATS or len(geometry.vertices) == 0:

@@ -160,7 +160,7 @@ class _Translation:
 
 
 def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: ImportLimits) -> ConvertedField:
-    """By the format's own reader. path: the upload itself, or where a field file out of an archive may be written."""
+    """By the format's own reader. path: the upload itself, or where a file out of an archive may be written."""
     from regnf_core.importing.families.safe_field import convert_safe_field
     from regnf_core.importing.settings.facts import Facts
 
@@ -190,8 +190,10 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
     if kind in MESH_FORMATS:
         from regnf_core.importing.families.mesh import convert_mesh
 
-        return convert_mesh(kind, data, describe(Facts()), limits.refused_beyond_s, opened.siblings)
-    reason, detail = explain_refusal(head)
+        if kind == "e57" and opened.name is not None:
+            path.write_bytes(data)
+        return convert_mesh(kind, data, describe(Facts()), limits.refused_beyond_s, opened.siblings, path)
+    reason, detail = explain_refusal(head, opened.name or "")
     raise FieldFormatError(detail, reason=reason)
 
 

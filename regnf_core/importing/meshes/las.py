@@ -1,17 +1,15 @@
-"""LAS and LAZ: clouds of laser scanners, read by laspy in parts. Of many points every n-th is taken."""
+"""LAS and LAZ: clouds of laser scanners, read by laspy in parts."""
 
 from __future__ import annotations
 
 import io
-import math
 import struct
 
 import numpy as np
 
+from regnf_core.importing.meshes.thinning import Thinning
 from regnf_core.importing.meshes.triangle_files import Geometry, malformed, unsupported
 
-_TAKEN = 2_000_000
-"""Points, about: a surface shows no more of them."""
 _AT_ONCE = 500_000
 _HEADER, _SIZES_AT, _RECORD = 227, 94, 54
 """Bytes of the smallest header and of a record's own header; where its size, the points' place and the count of records
@@ -30,12 +28,14 @@ def read_las(data: memoryview) -> Geometry:
     try:
         with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as file:
             count = file.header.point_count
-            step = max(1, math.ceil(count / _TAKEN))
+            thinning, read = Thinning(count), 0
             scales, offsets = np.array(file.header.scales), np.array(file.header.offsets)
             if not (np.isfinite(scales).all() and np.isfinite(offsets).all() and (scales != 0.0).all()):
                 raise malformed("the LAS header has an invalid scale or offset")
             for part in file.chunk_iterator(_AT_ONCE):
-                points.append(np.column_stack([part.X, part.Y, part.Z])[::step] * scales + offsets)
+                kept = thinning.kept(read, read + len(part))
+                points.append(np.column_stack([part.X, part.Y, part.Z])[kept] * scales + offsets)
+                read += len(part)
     except laspy.errors.LaspyException as error:
         raise malformed(f"the LAS file cannot be read: {error}") from error
     except NotImplementedError as error:
@@ -43,10 +43,9 @@ def read_las(data: memoryview) -> Geometry:
     except (ValueError, OverflowError, MemoryError, RuntimeError, EOFError, OSError) as error:
         raise malformed("the LAS file ends early or is damaged") from error
     found = np.concatenate(points) if points else np.zeros((0, 3))
-    if sum(map(len, points)) < count // step:
+    if read < count:
         raise malformed(f"the LAS file ends before the {count} points of its header")
-    left_out = (f"{step - 1} of {step} points",) if step > 1 else ()
-    return Geometry(found, np.zeros((0, 3), np.int64), left_out=left_out)
+    return Geometry(found, np.zeros((0, 3), np.int64), left_out=thinning.left_out)
 
 
 def _require_header(data: memoryview) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.meshes.point_files import numbers_of
+from regnf_core.importing.meshes.thinning import Thinning, numbers_of, rows_of_text
 from regnf_core.importing.meshes.triangle_files import (
     Float64Array,
     Geometry,
@@ -219,6 +219,7 @@ def _whole(values: npt.NDArray[Any]) -> Int64Array:
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 _COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _MAX_ROWS = 50_000_000
+_PLACES, _NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 
 
 def read_ply(data: memoryview) -> Geometry:
@@ -227,6 +228,8 @@ def read_ply(data: memoryview) -> Geometry:
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE.
     """
     order, elements, size = _read_header(data)
+    if _is_large_cloud(elements):
+        return _thinned(data[size:], order, elements)
     body = _Body(data[size:], order)
     vertices, normals, colors = np.zeros((0, 3)), None, None
     faces = np.zeros((0, 3), np.int64)
@@ -235,9 +238,9 @@ def read_ply(data: memoryview) -> Geometry:
         if element.name == "vertex":
             require_room(element.count, 0)
             table = body.scalars(element)
-            vertices = _columns(table, ("x", "y", "z"))
-            if {"nx", "ny", "nz"} <= table.keys():
-                normals = _columns(table, ("nx", "ny", "nz"))
+            vertices = _columns(table, _PLACES)
+            if set(_NORMALS) <= table.keys():
+                normals = _columns(table, _NORMALS)
             colors = _colors(table, element)
         elif element.name == "face":
             require_room(0, element.count)
@@ -256,6 +259,39 @@ def read_ply(data: memoryview) -> Geometry:
     if body.flat_faces:
         left_out.append(f"{body.flat_faces} faces of fewer than three corners")
     return Geometry(vertices, faces, normals, colors, tuple(left_out))
+
+
+def _is_large_cloud(elements: tuple[_Element, ...]) -> bool:
+    """Whether the file holds points alone, more than are kept, in rows of one length at its beginning."""
+    faces = sum(element.count for element in elements if element.name in ("face", "tristrips"))
+    first = elements[0] if elements else _Element("", 0, ())
+    plain = all(p.count_type is None for p in first.properties)
+    return faces == 0 and first.name == "vertex" and Thinning(first.count).step > 1 and plain
+
+
+def _thinned(body: memoryview, order: ByteOrder | None, elements: tuple[_Element, ...]) -> Geometry:
+    """The points that are kept of many."""
+    element = elements[0]
+    names = [p.name for p in element.properties]
+    wanted = [*_PLACES, *(_NORMALS if set(_NORMALS) <= set(names) else ())]
+    if not set(wanted) <= set(names):
+        raise malformed("PLY vertices without x, y, z")
+    thinning = Thinning(element.count)
+    if order is None:
+        rows, read = rows_of_text(body, len(names), thinning, "PLY")
+        if read < element.count:
+            raise element.cut_short()
+        found = rows[:, [names.index(name) for name in wanted]]
+    else:
+        row = np.dtype([(p.name, order + p.type) for p in element.properties])
+        if element.count * row.itemsize > len(body):
+            raise element.cut_short()
+        table, kept = np.frombuffer(body, row, element.count), thinning.kept(0, element.count)
+        found = np.stack([table[name][kept].astype(np.float64) for name in wanted], axis=1)
+    left_out = (*thinning.left_out, *(f"elements {one.name[:40]}" for one in elements[1:]))
+    return Geometry(
+        found[:, :3], np.zeros((0, 3), np.int64), found[:, 3:] if len(wanted) > 3 else None, left_out=left_out
+    )
 
 
 def _colors(table: dict[str, Float64Array], element: _Element) -> Float64Array | None:

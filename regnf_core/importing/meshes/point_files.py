@@ -1,19 +1,23 @@
-"""PCD (Point Cloud Library): points and their normals, as text, binary or compressed."""
+"""Points and their normals: PCD (Point Cloud Library) as text, binary or compressed, lines of numbers, .npy."""
 
 from __future__ import annotations
 
 import math
 import re
-import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, not_numbers, require_room
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.npz import array_header
+from regnf_core.importing.meshes.thinning import Thinning, lines_of, rows_of_text
+from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, unsupported
 
 # LZF, the compression of PCD files, by its published layout: literals, and copies of what was unpacked before.
 
 _LITERALS, _LONG = 32, 7
+_MOST_UNPACKED = 2 << 30
 
 
 def unpack_lzf(packed: memoryview, size: int) -> memoryview:
@@ -56,19 +60,6 @@ def _faulty() -> Exception:
     return malformed("the PCD file's compressed points have another uncompressed size than the header states")
 
 
-# Numbers between spaces, as many text formats have them.
-
-
-def numbers_of(text: bytes, format_: str) -> Float64Array:
-    """All numbers of a text. Raises FieldFormatError (MESH_INVALID) where a word is none."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            return np.fromstring(text.decode("ascii"), dtype=np.float64, sep=" ")
-    except (ValueError, DeprecationWarning) as error:
-        raise not_numbers(f"the {format_} file holds a word that is not a number", text) from error
-
-
 _MAX_HEADER, _MAX_FIELDS, _MAX_COLUMNS = 1 << 14, 64, 1 << 10
 _TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
     (sign.upper(), size): f"<{sign}{size}" for sign in ("i", "u") for size in (1, 2, 4, 8)
@@ -94,23 +85,29 @@ class _Header:
 
 
 def read_pcd(data: memoryview) -> Geometry:
-    """The points of a PCD file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
+    """The points of a PCD file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE for what unpacks to too much."""
     header = _header(data)
-    require_room(header.points, 0)
     body = data[header.size :]
-    if header.data == "binary_compressed":
-        table = _from_columns(header, _unpacked(header, body))
-    else:
-        if header.data == "ascii":  # as if every number were one of float64
-            header = replace(header, types=dict.fromkeys(header.types, np.dtype(np.float64)))
-            body = numbers_of(bytes(body), "PCD").data.cast("B")
-        if header.points * header.row.itemsize > len(body):
+    thinning = Thinning(header.points)
+    names = [*_PLACES, *(_NORMALS if header.counts.keys() >= set(_NORMALS) else ())]
+    if header.data == "ascii":
+        rows, read = rows_of_text(body, sum(header.counts.values()), thinning, "PCD")
+        if read < header.points:
             raise malformed("the PCD file ends within its points")
-        rows = np.frombuffer(body, header.row, header.points) if header.points else np.zeros(0, header.row)
-        table = {name: rows[name][:, 0].astype(np.float64) for name in header.counts}
-    normals = np.stack([table[name] for name in _NORMALS], axis=1) if table.keys() >= set(_NORMALS) else None
-    points = np.stack([table[name] for name in _PLACES], axis=1)
-    return Geometry(points, np.zeros((0, 3), np.int64), normals, sensor=header.sensor)
+        starts = dict(zip(header.counts, np.cumsum([0, *header.counts.values()]), strict=False))
+        found = rows[:, [starts[name] for name in names]]
+    else:
+        if header.data == "binary_compressed":
+            table = _columns_of(header, _unpacked(header, body))
+        else:
+            if header.points * header.row.itemsize > len(body):
+                raise malformed("the PCD file ends within its points")
+            whole = np.frombuffer(body, header.row, header.points) if header.points else np.zeros(0, header.row)
+            table = {name: whole[name][:, 0] for name in header.counts}
+        kept = thinning.kept(0, header.points)
+        found = np.stack([table[name][kept].astype(np.float64) for name in names], axis=1)
+    normals = found[:, 3:] if len(names) > 3 else None
+    return Geometry(found[:, :3], np.zeros((0, 3), np.int64), normals, left_out=thinning.left_out, sensor=header.sensor)
 
 
 def _header(data: memoryview) -> _Header:
@@ -166,15 +163,17 @@ def _unpacked(header: _Header, body: memoryview) -> memoryview:
     packed, size = (int.from_bytes(body[at : at + 4], "little") for at in (0, 4))
     if len(body) < 8 or packed > len(body) - 8 or size != header.points * header.row.itemsize:
         raise malformed("the PCD file's compressed points have another size than the header states")
+    if size > _MOST_UNPACKED:
+        raise FieldFormatError(f"the PCD file unpacks to {size} bytes; save it as binary", reason="MESH_TOO_LARGE")
     return unpack_lzf(body[8 : 8 + packed], size)
 
 
-def _from_columns(header: _Header, body: memoryview) -> dict[str, Float64Array]:
+def _columns_of(header: _Header, body: memoryview) -> dict[str, Any]:
     """Compressed points lie field by field."""
     table, at = {}, 0
     for name, count in header.counts.items():
         type_ = header.types[name]
-        table[name] = np.frombuffer(body, type_, header.points * count, at)[::count].astype(np.float64)
+        table[name] = np.frombuffer(body, type_, header.points * count, at)[::count]
         at += header.points * count * type_.itemsize
     return table
 
@@ -183,6 +182,9 @@ def _from_columns(header: _Header, body: memoryview) -> dict[str, Float64Array]:
 
 _COMMENT = re.compile(rb"(?:#|//)[^\n]*")
 _MOST_COLUMNS = 16
+_SEPARATORS = bytes.maketrans(b",;", b"  ")
+_FIRST_LINES = 1 << 16
+"""Bytes in which the first line of numbers is."""
 _UNIT = 0.02
 """How far from one a normal's length may be; of so many ..."""
 _SHARE = 0.9
@@ -190,24 +192,30 @@ _SHARE = 0.9
 
 
 def read_xyz(data: memoryview) -> Geometry:
-    """The points of a text file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
-    text = _COMMENT.sub(b"", bytes(data)).replace(b",", b" ").replace(b";", b" ").lstrip()
-    first, _, rest = text.partition(b"\n")
-    if len(first.split()) == 1:  # .pts begins with the number of points
-        text = rest.lstrip()
-        first = text.partition(b"\n")[0]
-    columns = len(first.split())
+    """The points of a text file. Raises FieldFormatError: MESH_INVALID."""
+    columns = start = at = 0
+    for line in bytes(data[:_FIRST_LINES]).splitlines(keepends=True):
+        at += len(line)
+        columns = len(_plain(line).split())
+        if columns == 1 and not start:  # .pts begins with the number of points
+            start = at
+        elif columns:
+            break
     if not 3 <= columns <= _MOST_COLUMNS:
         raise malformed(f"lines of {columns} numbers are not points")
-    require_room(text.count(b"\n"), 0)
-    numbers = numbers_of(text, "point")
-    if len(numbers) % columns:
-        raise malformed("the lines of the points have different lengths")
-    rows = numbers.reshape(-1, columns)
-    require_room(len(rows), 0)
+    body = data[start:]
+    thinning = Thinning(lines_of(body))
+    rows, _ = rows_of_text(body, columns, thinning, "point", _plain)
     if _are_poses(rows):
         raise malformed("the lines are camera poses (KITTI or TUM), not points; give camera poses with --cameras")
-    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows))
+    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows), left_out=thinning.left_out)
+
+
+def _plain(text: bytes) -> bytes:
+    """Without comments, and with blanks between the numbers."""
+    if b"#" in text or b"//" in text:
+        text = _COMMENT.sub(b"", text)
+    return text.translate(_SEPARATORS)
 
 
 def _are_poses(rows: Float64Array) -> bool:
@@ -232,3 +240,21 @@ def _normals(rows: Float64Array) -> Float64Array | None:
         if _of_length_one(found):
             return found
     return None
+
+
+# A bare .npy array: (N, 3) points, or (N, 6) with their normals.
+
+
+def read_npy(data: memoryview) -> Geometry:
+    """The points of an array. Raises FieldFormatError: MESH_INVALID, FORMAT_NOT_SUPPORTED, and what its header may."""
+    dtype, shape, fortran_order, start = array_header("the array", data)
+    if len(shape) != 2 or shape[1] not in (3, 6) or dtype.kind != "f":
+        message = f"a single numpy array of {dtype.name}, shape {shape}; a cloud is real numbers of shape (N, 3), or "
+        message += "(N, 6) with normals; a grid also needs its origin and spacing: numpy.savez(file, sdf=array, "
+        raise unsupported(message + "origin=..., spacing=...)")
+    if shape[0] * shape[1] * dtype.itemsize != len(data) - start:
+        raise malformed(f"the array has another size than its shape {shape}")
+    thinning = Thinning(shape[0])
+    rows = np.frombuffer(data[start:], dtype).reshape(shape, order="F" if fortran_order else "C")
+    found = rows[thinning.kept(0, shape[0])].astype(np.float64)
+    return Geometry(found[:, :3], np.zeros((0, 3), np.int64), _normals(found), left_out=thinning.left_out)

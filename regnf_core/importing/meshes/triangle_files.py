@@ -39,7 +39,7 @@ class Geometry:
     not_applied: tuple[str, ...] = ()
     """The same of what changes the shape: it is warned of."""
     sensor: Float64Array | None = None
-    """(3,) from where all points were measured, where the file says so."""
+    """(3,) from where all points were measured, where the file says so; or (V, 3) from where each was, NaN: unknown."""
 
 
 def not_numbers(message: str, text: bytes) -> FieldFormatError:

@@ -19,7 +19,7 @@ from regnf_core.library_entries import shown_path
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
     (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
-    (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz", ".splat", ".ksplat", ".spz"),
+    (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz", ".e57", ".splat", ".ksplat", ".spz"),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
 _TENSORS_ELSEWHERE = "optimizerparameters schedulerparameters latentcodes reconstructions normalizationparameters"

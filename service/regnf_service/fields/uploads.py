@@ -52,6 +52,7 @@ class Upload:
         self._bytes = 0
         self._pending = bytearray()
         self._recognized = False
+        self._name = ""
 
     async def __aenter__(self) -> Self:
         return self
@@ -63,7 +64,8 @@ class Upload:
                 await UPLOADS.run(self._opened.close)
 
     def begin(self, filename: str) -> None:
-        """A part of a form has come. A field's name promises nothing."""
+        """A part of a form has come. A field's name promises nothing, but may say what a refused file is."""
+        self._name = filename
 
     async def feed(self, data: bytes | bytearray) -> None:
         """Take the next bytes.
@@ -98,7 +100,7 @@ class Upload:
         head = bytes(self._pending[:HEAD_BYTES])
         self.format = sniff_format(head)
         if self.format is None:
-            _, sentence = explain_refusal(head)
+            _, sentence = explain_refusal(head, self._name)
             raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.")
         self._recognized = True
 

@@ -245,3 +245,39 @@ def test_a_map_far_from_the_origin_is_the_same_map(tmp_path: Path) -> None:
     points = torch.from_numpy(CENTER + np.random.default_rng(0).uniform(-RADIUS, RADIUS, (500, 3)))
     torch.testing.assert_close(far.signed_distance(points + shift), near.signed_distance(points), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(far.bounds, near.bounds + shift, atol=1e-6, rtol=0.0)
+
+
+def test_a_map_of_the_published_schema_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As nvblox's serializer creates its tables, and as it writes numbers: in quotes."""
+    columns = "param_name TEXT PRIMARY KEY UNIQUE NOT NULL,value_string TEXT,value_int INT,value_float FLOAT"
+    index = "index_x, index_y, index_z"
+    blocks = f"{index.replace(',', ' INT NOT NULL,')} INT NOT NULL,data BLOB,PRIMARY KEY({index})"
+    published = f"CREATE TABLE tsdf_layer_metadata({columns});CREATE TABLE tsdf_layer_data({blocks});"
+    found = []
+    for name, tables, size in (("ours", TABLES, 8 * SIZE), ("published", published, f"{8 * SIZE:.6f}")):
+        monkeypatch.setattr("tests.core.importing.test_nvblox.TABLES", tables)
+        data = write_map(tmp_path / name, block_size=size).read_bytes()
+        found.append(nvblox.convert_database(TableSource(memoryview(data)), 1 << 24, nvblox.UploadDescription()))
+    assert found[0].description == found[1].description
+    np.testing.assert_array_equal(found[0].tensors["values"], found[1].tensors["values"])
+
+
+@pytest.mark.parametrize(
+    ("tables", "named"),
+    [
+        (("Node", "Link", "Data", "Word"), "rtabmap-export"),
+        (("topics", "messages", "metadata"), "POST /recordings"),
+        (("cameras", "images", "keypoints", "matches"), "COLMAP"),
+    ],
+)
+def test_databases_of_other_programs_are_named(tmp_path: Path, tables: tuple[str, ...], named: str) -> None:
+    connection = sqlite3.connect(tmp_path / "m")
+    for table in tables:
+        connection.execute(f"CREATE TABLE {table} (id INTEGER NOT NULL, pose BLOB, PRIMARY KEY (id))")
+    connection.execute(f"CREATE TRIGGER added BEFORE INSERT ON {tables[0]} WHEN new.id < 0 BEGIN SELECT 1; END")
+    connection.commit()
+    connection.close()
+    data = (tmp_path / "m").read_bytes()
+    with pytest.raises(FieldFormatError, match=named) as caught:
+        TableSource(memoryview(data))
+    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from regnf_core.importing.meshes import las, read_mesh
+from regnf_core.importing.meshes import las, read_mesh, thinning
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.in_process import convert
 from tests.core.importing.meshes.test_point_clouds import directions
@@ -41,11 +41,11 @@ def test_points_are_those_that_were_written(compressed: bool, tmp_path: Path) ->
 
 
 def test_of_many_points_some_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(las, "_TAKEN", 1000)
+    monkeypatch.setattr(thinning, "MOST_KEPT", 1000)
     monkeypatch.setattr(las, "_AT_ONCE", 900)
     found = read_mesh("las", memoryview(written(PLACE + directions(3000), compressed=True)))
     assert 1000 <= len(found.vertices) <= 1004
-    assert found.left_out == ("2 of 3 points",)
+    assert found.left_out == ("2 of each 3 points",)
 
 
 @pytest.mark.parametrize("compressed", [False, True], ids=["las", "laz"])

@@ -14,7 +14,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import read_mesh
 from regnf_core.importing.meshes.point_files import unpack_lzf
@@ -110,8 +110,8 @@ TUM = "".join(
 ).encode()
 BINARY, ASCII = pcd(AROUND, AROUND, "binary"), pcd(AROUND, AROUND, "ascii")
 CLOUDS = {
-    "MESH_TOO_LARGE": [BINARY.replace(b"POINTS 400", b"POINTS 99999999")],
     "MESH_INVALID": [
+        BINARY.replace(b"POINTS 400", b"POINTS 99999999"),
         *(BINARY[:-1], ASCII[:-300], pcd(AROUND, AROUND, "binary_compressed")[:-1]),
         ASCII.replace(b"0.7 -", b"0.7 -" + b"x" * 20000),
         *(BINARY.replace(b"POINTS 400", b"POINTS -400"), BINARY.replace(b"COUNT 1", b"COUNT 9")),
@@ -211,34 +211,6 @@ def test_ply_vertices_with_lists_are_read() -> None:
     header = PLY_TRIANGLE.replace("property float z\n", "property float z\nproperty list uchar int views\n")
     data = header.replace("0 0 0\n1 0 0\n0 1 0\n", "0 0 0 2 7 8\n1 0 0 0\n0 1 0 1 9\n")
     np.testing.assert_array_equal(read_mesh("ply", memoryview(data.encode())).vertices[1], [1.0, 0.0, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("head", "named"),
-    [
-        *((b"ASTM-E57", "E57"), (b"PXR-USDC\0", "USD"), (b"#usda 1.0\n", "USD")),
-        *((b"Kaydara FBX Binary  \0", "FBX"), (b"ISO-10303-21;\nHEADER;", "STEP")),
-        *((b"# vtk DataFile Version 3.0\n", "VTK"), (b'<?xml version="1.0"?>\n<VTKFile type="PolyData">', "VTK")),
-        *((b'<?xml version="1.0"?>\n<robot name="r">', "URDF"), (b"BLENDER-v300", "Blender")),
-        *((b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"), (b"# Octomap OcTree binary file\n", "OctoMap")),
-        *((b"NRRD0004\n", "NRRD"), (b"\xef\xbb\xbf\r\n<robot name='arm'>", "URDF")),
-        *((b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo"), (b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF")),
-        *((b"AC1032\0\0", "DWG"), (b"#X3D V3.0 utf8\n", "X3D")),
-        *((b"\xef\xbb\xbf<?xml version='1.0'?>\n<COLLADA version='1.4.1'>", "COLLADA"), (b"COFF BINARY\n", "OFF")),
-        *((b"OFF8 12 0\n", "OFF"), (b"# a license\n\nSTCNOFF\n8 12 0\n", "OFF")),
-    ],
-)
-def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
-    assert sniff_format(head + bytes(500)) is None
-    reason, detail = explain_refusal(head)
-    assert reason == "FORMAT_NOT_SUPPORTED"
-    assert named in detail
-    assert detail.endswith("export it as .glb, .ply, .obj or .stl") or named == "numpy.savez"
-
-
-def test_a_text_that_names_another_program_is_not_that_programs_file() -> None:
-    for text in (b'{"note": "made with Blender"}', b"my notes on #usda and LASF files\n", b"# a <robot in a comment\n"):
-        assert explain_refusal(text)[0] == "FORMAT_NOT_RECOGNIZED"
 
 
 def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
