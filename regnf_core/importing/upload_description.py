@@ -175,6 +175,9 @@ class UploadDescription(_Said):
     """Row-major 4x4 matrix of a similarity transform. It maps points of the field's frame to the dataset's."""
     as_: Annotated[Literal["scene", "object"] | None, Field(alias="as")] = None
     """scene: a surface seen from inside, such as a room. object: a surface seen from outside."""
+    node: Annotated[str, Len(1, 512)] | None = None
+    """Of a scene of several nodes the one to import, with all below it: its name, or the names of a path to it with
+    ``/`` between them. A prim of USD, a product of STEP, an object of 3MF, or a link of URDF."""
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=MOST_OF_LABEL, pattern=LABEL_PATTERN)] | None = None

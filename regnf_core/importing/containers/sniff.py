@@ -8,7 +8,7 @@ import struct
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
-MESH_FORMATS = ("glb", "gltf", "las", "obj", "pcd", "ply", "stl", "xyz")
+MESH_FORMATS = ("3mf", "glb", "gltf", "las", "obj", "pcd", "ply", "step", "stl", "urdf", "usd", "xyz")
 
 _OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
@@ -25,6 +25,9 @@ _OBJ_FEW = 8
 _LONG_COMMENT = 2048
 """Bytes of comments, and nothing else, before the first statement: of the formats taken only OBJ has such."""
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
+_NAMED = ((b"PXR-USDC", "usd"), (b"#usda", "usd"), (b"ISO-10303-21", "step"), (b"<robot", "urdf"))
+_XML_OWN = re.compile(rb"<\?.*?\?>|<!--.*?-->", re.DOTALL)
+"""Of an XML document, what may come before its first element."""
 
 
 def sniff_mesh(head: bytes) -> str | None:
@@ -39,6 +42,9 @@ def sniff_mesh(head: bytes) -> str | None:
     if _is_binary_stl(head):
         return "stl"
     text = head.lstrip(_BLANK)
+    begin = _XML_OWN.sub(b"", text).lstrip() if text.startswith(b"<") else text
+    if named := next((format_ for magic, format_ in _NAMED if begin.startswith(magic)), None):
+        return named
     if re.match(rb"ply[ \t]*[\r\n]", text):
         return "ply"
     if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS):
@@ -133,7 +139,8 @@ _TORCH_MEMBERS = frozenset(
 )
 _ONNX = re.compile(rb"\x08[\x03-\x1f][\x12\x1a\x22\x28\x32\x3a\x42]")
 """A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
-_PACKAGES = ((b"[Content_Types].xml", "a 3MF model, or an office document"), (b"3D/", "a 3MF model"))
+_PACKAGES = ((b"[Content_Types].xml", "3mf"), (b"_rels/", "3mf"), (b"3D/", "3mf"))
+"""The first member of zip files that are a model, or an office document: what they are read as."""
 _KERAS_MEMBERS = (b"metadata.json", b"config.json", b"model.weights.h5")
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
@@ -161,12 +168,11 @@ _BLANK = b"\xef\xbb\xbf \t\r\n"
 _SHAPE_WITHIN = 512
 _SHAPES = (
     (b"ASTM-E57", "an E57 cloud of points"),
-    *((b"PXR-USDC", "a USD scene"), (b"#usda", "a USD scene"), (b"Kaydara FBX", "an FBX scene")),
-    *((b"; FBX ", "an FBX scene"), (b"BLENDER", "a Blender file"), (b"3D Geometry File Format", "a Rhino file")),
-    *((b"ISO-10303-21", "a STEP model of CAD"), (b"0 SECTION 2 ", "a DXF drawing")),
+    *((b"Kaydara FBX", "an FBX scene"), (b"; FBX ", "an FBX scene"), (b"BLENDER", "a Blender file")),
+    *((b"3D Geometry File Format", "a Rhino file"), (b"0 SECTION 2 ", "a DXF drawing")),
     *((b"AutoCAD Binary DXF", "a DXF drawing"), (b"AC10", "a DWG drawing"), (b"#X3D", "an X3D scene")),
     *((b"# vtk DataFile", "a VTK file"), (b"<VTKFile", "a VTK file"), (b"#VRML", "a VRML scene")),
-    *((b"<X3D", "an X3D scene"), (b"<amf", "an AMF model"), (b"<robot", "a URDF robot, which names its meshes")),
+    *((b"<X3D", "an X3D scene"), (b"<amf", "an AMF model")),
     *((b"<sdf", "a Gazebo model, which names its meshes"), (b"<mujoco", "a MuJoCo model, which names its meshes")),
     (b"<COLLADA", "a COLLADA scene"),
     *((b"# Octomap", "an OctoMap"), (b"#binvox", "a binvox grid"), (b"NRRD000", "an NRRD volume")),
@@ -190,7 +196,7 @@ def sniff_format(head: bytes) -> str | None:
         first = _first_name(head)
         if first.endswith(b".npy"):
             return "npz"
-        return None if first in _KERAS_MEMBERS or _package(first) else "zip"
+        return None if first in _KERAS_MEMBERS else _package(first) or "zip"
     if head[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC):
         return None if head.startswith(_OLD_TORCH_TAR) else "tar"
     for magic, packing in _PACKED:
@@ -221,8 +227,6 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
     for magic, what in _SHAPES:
         if begin.startswith(magic.lower()) or (begin.startswith(b"<") and magic[:1] == b"<" and magic.lower() in begin):
             return "FORMAT_NOT_SUPPORTED", f"{what}; export it as .glb, .ply, .obj or .stl"
-    if head.startswith(_ZIP_LOCAL_HEADER) and (package := _package(_first_name(head))):
-        return "FORMAT_NOT_SUPPORTED", f"{package}; export it as .glb, .ply, .obj or .stl"
     if head.startswith(b"\x93NUMPY"):
         message = (
             "a single numpy array; a grid also needs its origin and spacing: numpy.savez(file, sdf=array, "
@@ -242,10 +246,10 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
 
 
 def _package(first: bytes) -> str | None:
-    """What a zip with this first member is that is no run: a model of one file."""
+    """The format of a zip with this first member that is no run, but a model of one file."""
     if first.lower().endswith((b".usd", b".usda", b".usdc")):
-        return "a USDZ scene"
-    return next((what for name, what in _PACKAGES if first.startswith(name)), None)
+        return "usd"
+    return next((format_ for name, format_ in _PACKAGES if first.startswith(name)), None)
 
 
 def _first_name(head: bytes) -> bytes:

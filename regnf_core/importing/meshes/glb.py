@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import unquote
 
@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.meshes import meshopt
+from regnf_core.importing.meshes.scene import MAX_NODES, Nodes, Part, assembled, required
 from regnf_core.importing.meshes.triangle_files import (
     MAX_TRIANGLES,
     Float64Array,
@@ -40,7 +42,9 @@ _CONTRADICTIONS = (AttributeError, IndexError, KeyError, OverflowError, TypeErro
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _MAX_ITEMS = 3 * MAX_TRIANGLES
-COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+DRACO = "KHR_draco_mesh_compression"
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
 class Accessors:
@@ -53,6 +57,8 @@ class Accessors:
         self._binary = binary
         self._siblings = siblings
         self._read: dict[int, memoryview] = {}
+        self._unpacked: dict[int, memoryview] = {}
+        self._decoded: dict[int, Float64Array] = {}
 
     def array(self, number: object, width: int) -> Float64Array:
         """The items (N, width) of accessor ``number``.
@@ -67,7 +73,11 @@ class Accessors:
         if count > _MAX_ITEMS:
             raise malformed(f"a glTF accessor of {count} items")
         items = np.zeros((count, width))
-        if "bufferView" in accessor:
+        if number in self._decoded:
+            items = self._decoded[_whole(number)]
+            if items.shape != (count, width):
+                raise malformed("a glTF accessor contradicts its compressed mesh")
+        elif "bufferView" in accessor:
             items = self._items(accessor, component, count, width)
         if "sparse" in accessor:
             said = accessor["sparse"]
@@ -82,26 +92,50 @@ class Accessors:
             items = np.maximum(items / float(np.iinfo(np.dtype(component)).max), -1.0)
         return items
 
-    def is_stored(self, number: object) -> bool:
-        """Whether accessor ``number`` has numbers of its own."""
-        accessor = self._accessors[_whole(number)]
-        return "bufferView" in accessor or "sparse" in accessor
+    def unpack(self, primitive: dict[str, Any]) -> None:
+        """Decode what Draco has packed of a primitive; its accessors then give that."""
+        packed, position = primitive.get("extensions", {}).get(DRACO), primitive["attributes"]["POSITION"]
+        if packed is None or position in self._decoded or "bufferView" in self._accessors[_whole(position)]:
+            return  # not compressed, or decoded before, or also there without compression
+        if primitive.get("mode", _TRIANGLES) != _TRIANGLES:
+            raise unsupported("the glTF file has triangle strips compressed by Draco: export it without compression")
+        library = required("DracoPy", "a glTF file with Draco compression")
+        try:
+            mesh = library.decode(bytes(self._view(_whole(packed["bufferView"]))))
+            for key, unique in packed["attributes"].items():
+                items = np.asarray(mesh.get_attribute_by_unique_id(unique)["data"], np.float64)
+                self._decoded[_whole(primitive["attributes"][key])] = items.reshape(len(items), -1)
+            self._decoded[_whole(primitive["indices"])] = np.asarray(mesh.faces, np.float64).reshape(-1, 1)
+        except (library.FileTypeException, AttributeError, RuntimeError, ValueError) as error:
+            raise malformed("the glTF file's mesh is no sound Draco data") from error
 
     def _items(self, said: dict[str, Any], component: str, count: int, width: int) -> Float64Array:
         """(count, width) numbers of a buffer view, from a byte offset on."""
-        view, item = self._views[_whole(said["bufferView"])], np.dtype(component).itemsize * width
-        data = self._view(view)
+        number, item = _whole(said["bufferView"]), np.dtype(component).itemsize * width
+        view, data = self._views[number], self._view(number)
         stride, start = _whole(view.get("byteStride", item)), _whole(said.get("byteOffset", 0))
         if stride < item or start + stride * max(count - 1, 0) + item * min(count, 1) > len(data):
             raise malformed("a glTF accessor extends beyond its buffer view")
         items = np.ndarray((count, width), component, data, start, (stride, np.dtype(component).itemsize))
         return items.astype(np.float64)
 
-    def _view(self, view: dict[str, Any]) -> memoryview:
-        if any(name in view.get("extensions", {}) for name in COMPRESSED):
-            raise unsupported("the glTF file's buffers are compressed: export it without mesh compression")
-        data = self._buffer(_whole(view["buffer"]))
-        start, size = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])
+    def _view(self, number: int) -> memoryview:
+        view = self._views[number]
+        packed = next((view["extensions"][name] for name in MESHOPT if name in view.get("extensions", {})), None)
+        if packed is None:
+            return self._part(view)
+        if number not in self._unpacked:
+            count, stride = _whole(packed["count"]), _whole(packed["byteStride"])
+            if count > _MAX_ITEMS:
+                raise malformed(f"a glTF buffer view of {count} items")
+            how = str(packed["mode"]), str(packed.get("filter", "NONE"))
+            self._unpacked[number] = meshopt.decoded(self._part(packed), count, stride, *how)
+        return self._unpacked[number]
+
+    def _part(self, said: dict[str, Any]) -> memoryview:
+        """The bytes of a buffer that a view names."""
+        data = self._buffer(_whole(said["buffer"]))
+        start, size = _whole(said.get("byteOffset", 0)), _whole(said["byteLength"])
         if start + size > len(data):
             raise malformed("a glTF buffer view extends beyond its buffer")
         return data[start : start + size]
@@ -147,9 +181,6 @@ def _whole(value: object) -> int:
 
 # The colors of a glTF document's vertices: their own times the material's, linear light as sRGB. No textures.
 
-_GRAY = 0.8
-"""Of parts without any color, beside others that have one."""
-
 
 def _primitive_colors(
     document: dict[str, Any], primitive: dict[str, Any], accessors: Accessors, vertices: int
@@ -185,7 +216,6 @@ def _factor(document: dict[str, Any], primitive: dict[str, Any]) -> Float64Array
 INSTANCES = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
 CENTER = "CESIUM_RTC"
-_MAX_NODES = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,32 +230,48 @@ class PlacedMesh:
     joints: Float64Array | None = None
 
 
-def placed_meshes(document: dict[str, Any], accessors: Accessors) -> Iterator[PlacedMesh]:
-    """Every visible node's mesh.
+def placed_meshes(
+    document: dict[str, Any], accessors: Accessors, asked: str | None
+) -> tuple[Iterable[PlacedMesh], tuple[str, ...]]:
+    """The meshes of the visible nodes, or of the one that is asked for, and what is told of them.
 
-    Raises FieldFormatError (MESH_INVALID) for a graph that is not a tree; KeyError, TypeError ... for faulty JSON.
+    Raises FieldFormatError (MESH_INVALID) for a graph that is not a tree, INVALID_DESCRIPTION for a name of no node;
+    KeyError, TypeError ... for faulty JSON.
     """
-    nodes = document.get("nodes", [])
-    if not nodes:  # meshes that no node places
-        yield from (PlacedMesh(number, np.eye(4)[None]) for number in range(len(document.get("meshes", []))))
-        return
-    if len(nodes) > _MAX_NODES:
-        raise malformed(f"a glTF scene of {len(nodes)} nodes")
+    given, named = document.get("nodes", []), Nodes()
+    if not given:  # meshes that no node places
+        meshes = document.get("meshes", [])
+        for mesh in meshes[:MAX_NODES]:
+            named.add(mesh.get("name"), shapes=1)
+        read, notes = named.chosen(asked)
+        return (PlacedMesh(number, np.eye(4)[None]) for number in range(len(meshes)) if read[number]), notes
+    if len(given) > MAX_NODES:
+        raise malformed(f"a glTF scene of {len(given)} nodes")
     center = _translation(document.get("extensions", {}).get(CENTER, {}).get("center", (0.0, 0.0, 0.0)))
     scenes = document.get("scenes", [])
-    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(nodes)
-    drawn = dict(_visited(nodes, roots, center))
+    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(given)
+    drawn = dict(_visited(given, roots, center))
     poses = dict(drawn)
-    if any("skin" in nodes[number] for number in drawn):  # a joint may stand in no scene, or be invisible
-        poses |= dict(_visited(nodes, _without_parent(nodes), center, hidden=True))
-    for number, pose in drawn.items():
-        node = nodes[number]
-        if "mesh" not in node:
-            continue
-        if type(node["mesh"]) is not int or node["mesh"] < 0:
-            raise malformed("a glTF node refers to a mesh that does not exist")
-        joints = None if "skin" not in node else _joints(document["skins"][node["skin"]], poses, accessors)
-        yield PlacedMesh(node["mesh"], pose @ _instances(node, accessors), node.get("weights"), joints)
+    if any("skin" in given[number] for number in drawn):  # a joint may stand in no scene, or be invisible
+        poses |= dict(_visited(given, _without_parent(given), center, hidden=True))
+    above = {child: number for number in drawn for child in given[number].get("children", [])}
+    numbers: dict[int, int] = {}
+    for number in drawn:
+        name = given[number].get("name")
+        numbers[number] = named.add(name, numbers.get(above.get(number, -1), -1), "mesh" in given[number])
+    read, notes = named.chosen(asked)
+    shown = (number for number in drawn if "mesh" in given[number] and read[numbers[number]])
+    return (_placed(document, number, poses, accessors) for number in shown), notes
+
+
+def _placed(
+    document: dict[str, Any], number: int, poses: dict[int, Float64Array], accessors: Accessors
+) -> PlacedMesh:
+    node = document["nodes"][number]
+    if type(node["mesh"]) is not int or node["mesh"] < 0:
+        raise malformed("a glTF node refers to a mesh that does not exist")
+    joints = None if "skin" not in node else _joints(document["skins"][node["skin"]], poses, accessors)
+    return PlacedMesh(node["mesh"], poses[number] @ _instances(node, accessors), node.get("weights"), joints)
 
 
 def _visited(
@@ -316,9 +362,8 @@ def _rotations(quaternions: npt.NDArray[np.float64]) -> Float64Array:
 _HEADER, _CHUNK_HEADER = 12, 8
 _JSON, _BIN = b"JSON", b"BIN\0"
 _MAX_JSON = 64 << 20
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _IGNORED = {"animations": "animations", "images": "textures"}
-_APPLIED = frozenset({INSTANCES, VISIBILITY, CENTER, *COMPRESSED})
+_APPLIED = frozenset({INSTANCES, VISIBILITY, CENTER, DRACO, *MESHOPT})
 _NO_SHAPE = (
     *("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "MSFT_packing_", "ADOBE_materials_"),
     *("KHR_lights_", "EXT_lights_", "KHR_techniques_webgl", "EXT_materials_", "CESIUM_primitive_outline", "VRM"),
@@ -329,24 +374,24 @@ _NO_SHAPE = (
 """Beginnings of the names of extensions that leave triangles where they are. All others are said."""
 
 
-def read_glb(data: memoryview, siblings: Siblings | None = None) -> Geometry:
-    """The triangles of a .glb file's scene. ``siblings``: the files that came with it, by name.
+def read_glb(data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
+    """The triangles of a .glb file's scene. ``siblings``: the files that came with it, by name · node: the one to read.
 
-    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, FORMAT_NOT_SUPPORTED for compressed buffers, or
-    MESH_EXTERNAL_REFERENCE for buffers in files that did not come with it.
+    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, FORMAT_NOT_SUPPORTED for unknown extensions,
+    MESH_EXTERNAL_REFERENCE for buffers in files that did not come with it, or INVALID_DESCRIPTION for a wrong node.
     """
     document, binary = _chunks(data)
-    return _geometry(document, binary, siblings or {})
+    return _geometry(document, binary, siblings or {}, node)
 
 
-def read_gltf(data: memoryview, siblings: Siblings | None = None) -> Geometry:
+def read_gltf(data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
     """The triangles of a .gltf file's scene, its buffers within it or beside it. Raises as :func:`read_glb`."""
-    return _geometry(_document(data), None, siblings or {})
+    return _geometry(_document(data), None, siblings or {}, node)
 
 
-def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> Geometry:
+def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings, node: str | None) -> Geometry:
     try:
-        return _scene(document, Accessors(document, binary, siblings))
+        return _scene(document, Accessors(document, binary, siblings), node)
     except _CONTRADICTIONS as error:
         raise malformed(f"the glTF document contradicts itself ({type(error).__name__})") from error
 
@@ -381,57 +426,41 @@ def _document(text: memoryview) -> dict[str, Any]:
     return document
 
 
-def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
+def _scene(document: dict[str, Any], accessors: Accessors, asked: str | None) -> Geometry:
     required, used = (
         [str(name)[:60] for name in document.get(key, []) if not str(name).startswith(_NO_SHAPE)]
         for key in ("extensionsRequired", "extensionsUsed")
     )
-    if unknown := [name for name in required if name not in _APPLIED or name in COMPRESSED]:
+    if unknown := [name for name in required if name not in _APPLIED]:
         raise unsupported(f"the glTF file needs the extension {unknown[0]}, which is not read: export it without")
-    vertices: list[Float64Array] = []
-    faces: list[Int64Array] = []
-    colors: list[Float64Array | None] = []
     flat: set[str] = set()
-    so_far = triangles = 0
-    for placed in placed_meshes(document, accessors):
-        mesh = document["meshes"][placed.mesh]
-        for primitive in mesh["primitives"]:
-            if (mode := primitive.get("mode", _TRIANGLES)) not in (_TRIANGLES, _STRIP, _FAN):
-                flat.add("points" if mode == 0 else "lines")
-                continue
-            _require_plain(primitive, accessors)
-            places = _morphed(primitive, placed.weights or mesh.get("weights"), accessors)
-            corners = _triangles(primitive, accessors, len(places))
-            if len(corners) and (corners.min() < 0 or corners.max() >= len(places)):
-                raise malformed("a glTF face refers to a vertex that does not exist")
-            painted = _primitive_colors(document, primitive, accessors, len(places))
-            count = len(placed.matrices) if placed.joints is None else 1
-            require_room(so_far + count * len(places), triangles + count * len(corners))
-            for matrix in placed.matrices[:count]:
-                if placed.joints is not None:
-                    places, matrix = _skinned(places, primitive, placed.joints, accessors), np.eye(4)
-                turned = np.linalg.det(matrix[:3, :3]) < 0  # a mirrored node turns its faces round
-                vertices.append(places @ matrix[:3, :3].T + matrix[:3, 3])
-                colors.append(painted)
-                faces.append((corners[:, ::-1] if turned else corners) + so_far)
-                so_far, triangles = so_far + len(places), triangles + len(corners)
-    empty = np.zeros((0, 3))
-    parts = zip(colors, vertices, strict=True)
-    shown = [np.full((len(part), 3), _GRAY) if color is None else color for color, part in parts]
-    return Geometry(
-        np.concatenate([empty, *vertices]),
-        np.concatenate([empty.astype(np.int64), *faces]),
-        colors=None if all(color is None for color in colors) else np.concatenate(shown),
+    placed, notes = placed_meshes(document, accessors, asked)
+    found = assembled(_parts(document, accessors, placed, flat), notes=notes)
+    return replace(
+        found,
         left_out=(*sorted(flat), *(word for key, word in _IGNORED.items() if document.get(key))),
         not_applied=tuple(f"extension {name}" for name in used if name not in _APPLIED),
     )
 
 
-def _require_plain(primitive: dict[str, Any], accessors: Accessors) -> None:
-    """Raise FieldFormatError (FORMAT_NOT_SUPPORTED) where the vertices are in compressed form alone."""
-    packed = [name for name in primitive.get("extensions", {}) if name in COMPRESSED]
-    if packed and not accessors.is_stored(primitive["attributes"]["POSITION"]):
-        raise unsupported(f"the glTF file's meshes are compressed by {packed[0]}: export it without compression")
+def _parts(
+    document: dict[str, Any], accessors: Accessors, placed: Iterable[PlacedMesh], flat: set[str]
+) -> Iterator[Part]:
+    """The triangles of each primitive of the meshes, at their places; what else there is goes to ``flat``."""
+    for one in placed:
+        mesh = document["meshes"][one.mesh]
+        for primitive in mesh["primitives"]:
+            if (mode := primitive.get("mode", _TRIANGLES)) not in (_TRIANGLES, _STRIP, _FAN):
+                flat.add("points" if mode == 0 else "lines")
+                continue
+            accessors.unpack(primitive)
+            places = _morphed(primitive, one.weights or mesh.get("weights"), accessors)
+            corners = _triangles(primitive, accessors, len(places))
+            painted = _primitive_colors(document, primitive, accessors, len(places))
+            if one.joints is None:
+                yield Part(places, corners, one.matrices, painted)
+            else:
+                yield Part(_skinned(places, primitive, one.joints, accessors), corners, colors=painted)
 
 
 def _morphed(primitive: dict[str, Any], weights: list[float] | None, accessors: Accessors) -> Float64Array:

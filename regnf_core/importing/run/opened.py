@@ -19,7 +19,9 @@ from regnf_core.library_entries import shown_path
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
     (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
-    (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz"),
+    (".urdf",),
+    (".step", ".stp", ".3mf", ".usd", ".usda", ".usdc", ".usdz", ".glb", ".gltf", ".ply", ".obj", ".stl")
+    + (".pcd", ".xyz", ".las", ".laz"),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
 _TENSORS_ELSEWHERE = "optimizerparameters schedulerparameters latentcodes reconstructions normalizationparameters"
@@ -75,7 +77,7 @@ def choose_checkpoint(names: Iterable[str]) -> str:
 
 
 def _first_tier(names: Iterable[str]) -> list[_Candidate]:
-    tiers: tuple[list[_Candidate], ...] = ([], [], [])
+    tiers: tuple[list[_Candidate], ...] = tuple([] for _ in _TIERS)
     for name in names:
         path = PurePosixPath(name)
         if _OTHER_FILES.fullmatch(path.name) or any(part.lower() in _OTHER_FOLDERS for part in path.parts[:-1]):
@@ -175,8 +177,9 @@ def _role(path: PurePosixPath) -> str:
 
 MAX_SETTINGS_BYTES = 64 << 20
 """All settings together: latent codes of a thousand shapes are the largest."""
-_WITH_OTHER_FILES = frozenset({".gltf", ".glb"})
-_OTHER_ENDS = frozenset({".bin"})
+_USD = (".usd", ".usda", ".usdc")
+OTHER_FILES = {".gltf": (".bin",), ".glb": (".bin",), **dict.fromkeys(_USD, _USD)}
+"""By the end of a mesh's name, the ends of the names of files that it may refer to."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +217,7 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     name = choose_checkpoint(archive.sizes)
     settings = choose_settings(archive.sizes, name)
     _require_few(archive, settings)
-    siblings = _siblings(archive, name)
+    siblings = _siblings(archive, name) or _meshes(archive, name, folder)
     taken = archive.take({name, *settings, *siblings.values()}, folder)
     nested, members = _opened(taken[name], most)
     if nested is not None:
@@ -281,7 +284,20 @@ def _too_large(message: str) -> FieldFormatError:
 def _siblings(archive: ZipRun | TarRun, name: str) -> dict[str, str]:
     """Names in the archive by their names as a mesh in it would write them."""
     path = PurePosixPath(name)
-    if path.suffix.lower() not in _WITH_OTHER_FILES:
-        return {}
+    ends = OTHER_FILES.get(path.suffix.lower(), ())
     near = [each for each in map(PurePosixPath, archive.sizes) if each.is_relative_to(path.parent) and each != path]
-    return {str(each.relative_to(path.parent)): str(each) for each in near if each.suffix.lower() in _OTHER_ENDS}
+    return {str(each.relative_to(path.parent)): str(each) for each in near if each.suffix.lower() in ends}
+
+
+def _meshes(archive: ZipRun | TarRun, name: str, folder: Path) -> dict[str, str]:
+    """Names in the archive of the meshes of a robot, by the names that it gives them."""
+    if not name.lower().endswith(".urdf"):
+        return {}
+    from regnf_core.importing.meshes.urdf import endings, mesh_names
+
+    names = sorted(archive.sizes)
+    found = {
+        mesh: [each for end in endings(mesh) for each in names if f"/{each}".endswith(f"/{end}")]
+        for mesh in mesh_names(archive.take({name}, folder)[name])
+    }
+    return {mesh: fitting[0] for mesh, fitting in found.items() if fitting}
