@@ -47,9 +47,7 @@ MESH_READERS = (*_WHOLE, *_OF_NODES)
 """The names that ``sniff_format`` gives files with a reader here."""
 
 
-def read_mesh(
-    format_: str, data: memoryview, siblings: Siblings | None = None, node: str | None = None
-) -> Geometry:
+def read_mesh(format_: str, data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
     """What a file of this format holds. ``siblings``: the files that came with it in one archive, by relative name ·
     node: of a scene, the node to read.
 

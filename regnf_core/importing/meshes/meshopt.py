@@ -27,7 +27,7 @@ def decoded(data: memoryview, count: int, stride: int, mode: str, filter_: str) 
     """The ``count`` items of ``stride`` bytes each. Raises FieldFormatError: MESH_INVALID, FORMAT_NOT_SUPPORTED."""
     try:
         if mode == "ATTRIBUTES":
-            items = _filtered(_attributes(bytes(data), count, stride), filter_)
+            items: npt.NDArray[Any] = _filtered(_attributes(bytes(data), count, stride), filter_)
         elif mode in ("TRIANGLES", "INDICES") and stride in (2, 4) and filter_ == "NONE":
             order = _triangles(bytes(data), count) if mode == "TRIANGLES" else _sequence(bytes(data), count)
             items = np.array(order, np.int64).astype("<u2" if stride == 2 else "<u4")
@@ -35,7 +35,7 @@ def decoded(data: memoryview, count: int, stride: int, mode: str, filter_: str) 
             raise malformed(f"a glTF buffer view with the compression {mode[:20]}, {filter_[:20]}")
     except (IndexError, ValueError) as error:
         raise malformed(_FAULTY) from error
-    return memoryview(np.ascontiguousarray(items)).cast("B")
+    return memoryview(items.tobytes())
 
 
 def _require_version(data: bytes, header: int) -> None:
@@ -101,7 +101,8 @@ def _filtered(items: Bytes, filter_: str) -> npt.NDArray[Any]:
         return items
     if filter_ == "EXPONENTIAL":
         words = items.view("<i4").astype(np.int64)
-        return np.ldexp(((words & 0xFFFFFF) ^ 0x800000) - 0x800000, words >> 24).astype("<f4")
+        numbers: npt.NDArray[Any] = np.ldexp(((words & 0xFFFFFF) ^ 0x800000) - 0x800000, words >> 24).astype("<f4")
+        return numbers
     if filter_ == "OCTAHEDRAL" and stride in (4, 8):
         whole = items.view("i1" if stride == 4 else "<i2")
         x, y, one = (whole[:, axis].astype(np.float64) for axis in range(3))
@@ -114,9 +115,8 @@ def _filtered(items: Bytes, filter_: str) -> npt.NDArray[Any]:
         words = items.view("<i2").astype(np.int64)
         three = words[:, :3] / (np.sqrt(2.0) * (words[:, 3:] | 3))
         largest = np.sqrt(np.maximum(0.0, 1.0 - np.square(three).sum(axis=1)))
-        turned = np.empty((len(words), 4))
-        places = ((words[:, 3:] & 3) + [[1, 2, 3, 0]]) % 4
-        np.put_along_axis(turned, places, np.concatenate((three, largest[:, None]), axis=1), axis=1)
+        columns = (np.arange(4) - 1 - (words[:, 3:] & 3)) % 4
+        turned = np.take_along_axis(np.concatenate((three, largest[:, None]), axis=1), columns, axis=1)
         return np.rint(turned * 32767.0).astype("<i2")
     raise malformed(f"a glTF buffer view with the filter {filter_[:20]}")
 

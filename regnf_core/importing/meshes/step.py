@@ -23,7 +23,7 @@ _OTHER_LENGTH = re.compile(rb"CONVERSION_BASED_UNIT\s*\(\s*'(INCH|FOOT|YARD|MILE
 
 
 def read_step(data: memoryview, _: Siblings | None = None, node: str | None = None) -> Geometry:
-    """The triangles of a STEP file, in meters and its own axes, with the colors of its parts. node: the product to read.
+    """The triangles of a STEP file, in meters, with the colors of its parts. node: the product to read.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, FORMAT_NOT_SUPPORTED without cascadio, INVALID_DESCRIPTION.
     """

@@ -84,7 +84,7 @@ class _Model(PlainXml):
     def end(self, tag: str) -> None:  # type: ignore[override]
         """Nothing is kept."""
 
-    def data(self, data: str) -> None:  # type: ignore[override]
+    def data(self, data: str) -> None:
         """Text has no meaning here."""
 
     def close(self) -> _Model:  # type: ignore[override]

@@ -5,15 +5,13 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from trimesh import creation
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.meshes.scene import ROUND, SECTIONS, Nodes, Part, PlainXml, assembled, parsed
+from regnf_core.importing.meshes.scene import Nodes, Part, PlainXml, assembled, parsed, solid
 from regnf_core.importing.meshes.triangle_files import (
     Float64Array,
     Geometry,
@@ -25,6 +23,8 @@ from regnf_core.importing.meshes.triangle_files import (
 
 _SHAPES = ("visual", "collision")
 """Of a link, the first kind that it has is read."""
+_SIZES = {"box": (("size", 3),), "cylinder": (("radius", 1), ("length", 1)), "sphere": (("radius", 1),)}
+"""Basic shapes, and the attributes that have their sizes, of so many numbers each."""
 
 
 def read_urdf(data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
@@ -41,12 +41,14 @@ def read_urdf(data: memoryview, siblings: Siblings | None = None, node: str | No
         message = f"a URDF robot with moving joints, such as {moving[0].get('name', '')[:60]}, is no rigid object"
         hint = "Give the mesh of one link, or choose a link by the import option node."
         raise FieldFormatError(message, reason="FORMAT_NOT_SUPPORTED", hint=hint)
-    placed = [(nodes.add(name, above, len(_shapes(links[name]))), name, pose) for name, above, pose in _tree(robot, links)]
+    placed = list(_tree(robot, links))
+    for name, above, _ in placed:
+        nodes.add(name, above, len(_shapes(links[name])))
     read, notes = nodes.chosen(node)
     meshes: dict[str, Geometry] = {}
     parts = (
         _part(shape, pose, siblings or {}, meshes)
-        for number, name, pose in placed
+        for number, (name, _, pose) in enumerate(placed)
         if read[number]
         for shape in _shapes(links[name])
     )
@@ -121,22 +123,15 @@ def _origin(element: Element) -> Float64Array:
 def _part(shape: Element, pose: Float64Array, siblings: Siblings, meshes: dict[str, Geometry]) -> Part:
     given = next(iter(_child(shape, "geometry")), shape)
     place = (pose @ _origin(shape))[None]
-    solid: Any
     if given.tag == "mesh":
         name = given.get("filename", "")
         mesh = meshes[name] = meshes.get(name) or _mesh(name, siblings)
         place = place @ np.diag([*_numbers(given, "scale", 3, "1 1 1"), 1.0])
         return Part(mesh.vertices, mesh.faces, place, mesh.colors)
-    if given.tag == "box":
-        solid = creation.box(_numbers(given, "size", 3))
-    elif given.tag == "cylinder":
-        radius, length = (float(_numbers(given, name, 1)[0]) for name in ("radius", "length"))
-        solid = creation.cylinder(radius, length, sections=SECTIONS)
-    elif given.tag == "sphere":
-        solid = creation.icosphere(subdivisions=ROUND, radius=float(_numbers(given, "radius", 1)[0]))
-    else:
+    if given.tag not in _SIZES:
         raise malformed(f"a URDF geometry {given.tag[:20]} that does not exist")
-    return Part(np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int64), place)
+    sizes = np.concatenate([_numbers(given, name, count) for name, count in _SIZES[given.tag]])
+    return Part(*solid(given.tag, *sizes.tolist()), place)
 
 
 def _mesh(name: str, siblings: Siblings) -> Geometry:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import posixpath
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from trimesh import creation
 
 from regnf_core.importing.containers.zip_members import DEFLATED, STORED, read_members
-from regnf_core.importing.meshes.scene import ROUND, SECTIONS, Nodes, Part, assembled, in_meters, required
+from regnf_core.importing.meshes.scene import Nodes, Part, assembled, in_meters, required, solid
 from regnf_core.importing.meshes.triangle_files import (
     Float64Array,
     Geometry,
@@ -57,20 +56,14 @@ def read_usd(data: memoryview, siblings: Siblings | None = None, node: str | Non
         raise malformed("the USD file is damaged") from error
 
 
-def _cone(value: Any) -> Any:
-    cone = creation.cone(value("radius"), value("height"), sections=SECTIONS)
-    cone.apply_translation((0.0, 0.0, -value("height") / 2.0))
-    return cone
-
-
-_SOLIDS: dict[str, Callable[[Callable[[str], Any]], Any]] = {
-    "Cube": lambda value: creation.box(3 * [value("size")]),
-    "Sphere": lambda value: creation.icosphere(subdivisions=ROUND, radius=value("radius")),
-    "Cylinder": lambda value: creation.cylinder(value("radius"), value("height"), sections=SECTIONS),
-    "Capsule": lambda value: creation.capsule(value("height"), value("radius")),
-    "Cone": _cone,
+_SOLIDS = {
+    "Cube": ("box", "size", "size", "size"),
+    "Sphere": ("sphere", "radius"),
+    "Cylinder": ("cylinder", "radius", "height"),
+    "Capsule": ("capsule", "radius", "height"),
+    "Cone": ("cone", "radius", "height"),
 }
-"""Basic shapes along z, from what gives the value of an attribute."""
+"""Basic shapes, and the attributes that have their sizes."""
 
 
 class _Layers:
@@ -215,9 +208,9 @@ class _Scene:
             places = np.asarray(value("points") or [], np.float64).reshape(-1, 3)
             return places, faces[:, ::-1] if flipped else faces
         if kind in _SOLIDS:
-            solid = _SOLIDS[kind](value)
-            turns = {"X": [2, 0, 1], "Y": [1, 2, 0]}.get(value("axis") if kind not in ("Cube", "Sphere") else "Z")
-            places = np.asarray(solid.vertices, np.float64)
-            return places if turns is None else places[:, turns], np.asarray(solid.faces, np.int64)
+            shape, *sizes = _SOLIDS[kind]
+            places, faces = solid(shape, *(float(value(size)) for size in sizes))
+            turns = {"X": [2, 0, 1], "Y": [1, 2, 0]}.get(value("axis") if prim.HasAttribute("axis") else "Z")
+            return places if turns is None else places[:, turns], faces
         self._other.add(f"{kind} prims")
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)

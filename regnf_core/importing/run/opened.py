@@ -20,8 +20,10 @@ _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
     (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
     (".urdf",),
-    (".step", ".stp", ".3mf", ".usd", ".usda", ".usdc", ".usdz", ".glb", ".gltf", ".ply", ".obj", ".stl")
-    + (".pcd", ".xyz", ".las", ".laz"),
+    (
+        *(".step", ".stp", ".3mf", ".usd", ".usda", ".usdc", ".usdz"),
+        *(".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz"),
+    ),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
 _TENSORS_ELSEWHERE = "optimizerparameters schedulerparameters latentcodes reconstructions normalizationparameters"
