@@ -131,7 +131,7 @@ def _visited(
     nodes: list[dict[str, Any]], roots: list[int], above: Float64Array, hidden: bool = False
 ) -> Iterator[tuple[int, Float64Array]]:
     """The nodes below the roots, and from its frame to the scene's (4, 4). hidden: whether invisible ones too."""
-    waiting = [(number, above) for number in roots]
+    waiting = [(number, above) for number in reversed(roots)]
     seen: set[int] = set()
     while waiting:
         number, above = waiting.pop()
@@ -143,7 +143,7 @@ def _visited(
             continue
         matrix = above @ _pose(node)
         yield number, matrix
-        waiting.extend((child, matrix) for child in node.get("children", []))
+        waiting.extend((child, matrix) for child in reversed(node.get("children", [])))
 
 
 def _without_parent(nodes: list[dict[str, Any]]) -> list[int]:

@@ -27,7 +27,8 @@ def decoded(data: memoryview, count: int, stride: int, mode: str, filter_: str) 
     """The ``count`` items of ``stride`` bytes each. Raises FieldFormatError: MESH_INVALID, FORMAT_NOT_SUPPORTED."""
     try:
         if mode == "ATTRIBUTES":
-            items: npt.NDArray[Any] = _filtered(_attributes(bytes(data), count, stride), filter_)
+            with np.errstate(all="ignore"):  # what is damaged may be no number
+                items: npt.NDArray[Any] = _filtered(_attributes(bytes(data), count, stride), filter_)
         elif mode in ("TRIANGLES", "INDICES") and stride in (2, 4) and filter_ == "NONE":
             order = _triangles(bytes(data), count) if mode == "TRIANGLES" else _sequence(bytes(data), count)
             items = np.array(order, np.int64).astype("<u2" if stride == 2 else "<u4")
@@ -142,6 +143,8 @@ def _sequence(data: bytes, count: int) -> list[int]:
         line, number = number & 1, number >> 1
         last[line] = (last[line] + ((number >> 1) ^ -(number & 1))) & 0xFFFFFFFF
         order.append(last[line])
+    if len(data) - at != 4:
+        raise malformed(_FAULTY)
     return order
 
 
@@ -196,4 +199,6 @@ def _triangles(data: bytes, count: int) -> list[int]:
         edges.append((c, b))
         edges.append((a, c))
         order += (a, b, c)
+    if len(data) - at != 16:
+        raise malformed(_FAULTY)
     return order

@@ -14,8 +14,8 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array, malformed, require_room
 
 MAX_NODES = 100_000
-_SHOWN, _SHOWN_LENGTH, _SHOWN_LEVELS = 20, 60, 8
-"""How many names of nodes are shown, of how many characters, and how many names of nodes above."""
+_SHOWN, _SHOWN_LENGTH, _SHOWN_LEVELS = 20, 60, 64
+"""How many names of nodes are shown, of how many characters, and of how many nodes above it a path is made."""
 _GRAY = 0.8
 """Of parts without any color, beside others that have one."""
 _PIECE = 1 << 20
