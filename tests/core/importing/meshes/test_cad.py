@@ -168,8 +168,8 @@ def ten_of_the_next(number: int) -> str:
         (
             "MESH_INVALID",  # ten objects in ten objects in ten ...
             package(
-                f'<resources>{"".join(map(ten_of_the_next, range(20)))}<object id="20">{TETRAHEDRON}</object></resources>'
-                '<build><item objectid="0"/></build>'
+                f'<resources>{"".join(map(ten_of_the_next, range(20)))}<object id="20">{TETRAHEDRON}</object>'
+                '</resources><build><item objectid="0"/></build>'
             ),
         ),
         (
