@@ -69,15 +69,10 @@ def read_mesh_file(path: str | os.PathLike[str], node: str | None = None) -> Geo
 def _beside(path: Path, format_: str, data: memoryview) -> dict[str, memoryview]:
     """The files to which a mesh file may refer, by the names that it gives them."""
     if format_ == "urdf":
-        found = {
-            name: [near / end for end in endings(name) for near in path.resolve().parents[:_LEVELS]]
-            for name in mesh_names(data)
-        }
-        return {
-            name: memoryview(one.read_bytes())
-            for name, places in found.items()
-            if (one := next((place for place in places if place.is_file()), None)) is not None
-        }
-    ends = OTHER_FILES.get(path.suffix.lower(), ()) if format_ in ("gltf", "usd") else ()
-    near = [one for one in path.parent.iterdir() if one.suffix.lower() in ends and one != path] if ends else []
-    return {one.name: memoryview(one.read_bytes()) for one in near}
+        folders = path.resolve().parents[:_LEVELS]
+        places = {name: [near / end for end in endings(name) for near in folders] for name in mesh_names(data)}
+        files = {name: next(filter(Path.is_file, near), None) for name, near in places.items()}
+    else:
+        ends = OTHER_FILES.get(path.suffix.lower(), ()) if format_ in ("gltf", "usd") else ()
+        files = {one.name: one for one in (path.parent.iterdir() if ends else ()) if one.suffix.lower() in ends}
+    return {name: memoryview(file.read_bytes()) for name, file in files.items() if file is not None and file != path}

@@ -93,38 +93,33 @@ def placed_meshes(
     Raises FieldFormatError (MESH_INVALID) for a graph that is not a tree, INVALID_DESCRIPTION for a name of no node;
     KeyError, TypeError ... for faulty JSON.
     """
-    given, named = document.get("nodes", []), Nodes()
-    if not given:  # meshes that no node places
-        meshes = document.get("meshes", [])
-        for mesh in meshes[:MAX_NODES]:
-            named.add(mesh.get("name"), shapes=1)
-        read, notes = named.chosen(asked)
-        return (PlacedMesh(number, np.eye(4)[None]) for number in range(len(meshes)) if read[number]), notes
-    if len(given) > MAX_NODES:
-        raise malformed(f"a glTF scene of {len(given)} nodes")
+    nodes, scenes = document.get("nodes", []), document.get("scenes", [])
+    if not nodes:  # meshes that no node places
+        nodes = [{"mesh": number, "name": mesh.get("name")} for number, mesh in enumerate(document.get("meshes", []))]
+        scenes = []
+    if len(nodes) > MAX_NODES:
+        raise malformed(f"a glTF scene of {len(nodes)} nodes")
     center = _translation(document.get("extensions", {}).get(CENTER, {}).get("center", (0.0, 0.0, 0.0)))
-    scenes = document.get("scenes", [])
-    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(given)
-    drawn = dict(_visited(given, roots, center))
+    roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(nodes)
+    drawn = dict(_visited(nodes, roots, center))
     poses = dict(drawn)
-    if any("skin" in given[number] for number in drawn):  # a joint may stand in no scene, or be invisible
-        poses |= dict(_visited(given, _without_parent(given), center, hidden=True))
-    above = {child: number for number in drawn for child in given[number].get("children", [])}
-    numbers: dict[int, int] = {}
+    if any("skin" in nodes[number] for number in drawn):  # a joint may stand in no scene, or be invisible
+        poses |= dict(_visited(nodes, _without_parent(nodes), center, hidden=True))
+    above = {child: number for number in drawn for child in nodes[number].get("children", [])}
+    named, places = Nodes(), dict[int, int]()
     for number in drawn:
-        name = given[number].get("name")
-        numbers[number] = named.add(name, numbers.get(above.get(number, -1), -1), "mesh" in given[number])
+        outer = places.get(above.get(number, -1), -1)
+        places[number] = named.add(nodes[number].get("name"), outer, "mesh" in nodes[number])
     read, notes = named.chosen(asked)
-    shown = (number for number in drawn if "mesh" in given[number] and read[numbers[number]])
-    return (_placed(document, number, poses, accessors) for number in shown), notes
 
+    def placed(node: dict[str, Any], pose: Float64Array) -> PlacedMesh:
+        if type(node["mesh"]) is not int or node["mesh"] < 0:
+            raise malformed("a glTF node refers to a mesh that does not exist")
+        joints = None if "skin" not in node else _joints(document["skins"][node["skin"]], poses, accessors)
+        return PlacedMesh(node["mesh"], pose @ _instances(node, accessors), node.get("weights"), joints)
 
-def _placed(document: dict[str, Any], number: int, poses: dict[int, Float64Array], accessors: Accessors) -> PlacedMesh:
-    node = document["nodes"][number]
-    if type(node["mesh"]) is not int or node["mesh"] < 0:
-        raise malformed("a glTF node refers to a mesh that does not exist")
-    joints = None if "skin" not in node else _joints(document["skins"][node["skin"]], poses, accessors)
-    return PlacedMesh(node["mesh"], poses[number] @ _instances(node, accessors), node.get("weights"), joints)
+    shown = (number for number in drawn if "mesh" in nodes[number] and read[places[number]])
+    return (placed(nodes[number], drawn[number]) for number in shown), notes
 
 
 def _visited(

@@ -57,9 +57,9 @@ class Nodes:
         named = [number for number, count in enumerate(below) if count and self._names[number]]
         if asked is None:
             total = sum(self._shapes)
-            told = _shown({self._names[number] for number in named if below[number] < total})
-            several = len({self._names[number] for number in named if below[number] < total}) > 1
-            return [True] * len(below), (f"its nodes, to choose one by the import option node: {told}",) * several
+            parts = {self._names[number] for number in named if below[number] < total}
+            told = f"its nodes, to choose one by the import option node: {_shown(parts)}"
+            return [True] * len(below), (told,) * (len(parts) > 1)
         words = asked.strip("/").split("/")
         found = [number for number in named if self._names[number] == asked]
         found = found or [number for number in named if self._ends(number, words)]

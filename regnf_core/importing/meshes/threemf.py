@@ -82,10 +82,9 @@ class _Model(PlainXml):
             raise malformed(f"a 3MF {name[:20]} without its numbers") from error
 
     def end(self, tag: str) -> None:  # type: ignore[override]
-        """Nothing is kept."""
+        """Nothing is kept, and text has no meaning here."""
 
-    def data(self, data: str) -> None:
-        """Text has no meaning here."""
+    data = end
 
     def close(self) -> _Model:  # type: ignore[override]
         return self
@@ -136,10 +135,8 @@ class _Package:
         """Raises FieldFormatError."""
         if path not in self._models:
             member = self._members.get(path.lower())
-            if member is None and path == _MAIN:
-                raise unsupported(f"an office document or another package, not a 3MF model; {INSTEAD}")
             if member is None:
-                raise malformed("the 3MF package lacks a part that it names")
+                raise unsupported(f"an office document, or a 3MF package without {path[:60]}; {INSTEAD}")
             require_modest(member.size, member.packed_size, self._left)
             self._left -= member.size
             self._models[path] = parsed(member.content(self._data), _Model(path))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import posixpath
 import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,17 +42,15 @@ def read_usd(data: memoryview, siblings: Siblings | None = None, node: str | Non
     required("pxr", "a USD scene")
     from pxr import Tf, Usd
 
-    layers = dict(siblings or {})
-    name = ""
+    layers, name = dict(siblings or {}), ""
     if bytes(data[:2]) == b"PK":
         members = read_members(data, (STORED, DEFLATED), folders=True)
         layers = {one.name: data[one.offset : one.offset + one.packed_size] for one in members if one.method == STORED}
         name = members[0].name
-        data = layers[name] if name in layers else memoryview(b"")
+        data = layers.get(name, memoryview(b""))
     try:
         loaded = _Layers(layers)
-        stage = Usd.Stage.Open(loaded.load(name, data))
-        return _Scene(stage, node).geometry(loaded.missing)
+        return _Scene(Usd.Stage.Open(loaded.load(name, data)), node).geometry(loaded.missing)
     except Tf.ErrorException as error:
         raise malformed("the USD file is damaged") from error
 
@@ -77,7 +76,8 @@ class _Layers:
 
     def load(self, name: str, data: memoryview) -> Any:
         """The layer ``name``, with those that it refers to. Raises FieldFormatError (MESH_INVALID)."""
-        waiting = [(name, self._read(name, data))]
+        root = self._read(name, data)
+        waiting = [(name, root)]
         while waiting:
             name, layer = waiting.pop()
             for path in layer.GetCompositionAssetDependencies():
@@ -87,7 +87,7 @@ class _Layers:
                 known = self._loaded.get(wanted)
                 self.missing |= known is None
                 layer.UpdateCompositionAssetDependency(path, "" if known is None else known.identifier)
-        return self._loaded[next(iter(self._loaded))]
+        return root
 
     def _read(self, name: str, data: memoryview) -> Any:
         from pxr import Sdf
@@ -131,17 +131,14 @@ class _Scene:
             raise malformed("the USD file has an invalid metersPerUnit")
         unit = in_meters(_UNITS.get(round(scale, 9), f"a unit of {scale:g} meters"))
         resized = np.diag([scale, scale, scale, 1.0])
-        parts = (self._part(prim, resized @ matrices) for number, prim, matrices in self._shapes if read[number])
-        found = assembled(parts, notes=(*notes, unit if said("metersPerUnit") else "the file states no unit"))
-        lost = [*sorted(self._other), *["references to files that did not come with it"] * missing]
-        up = "z" if self._geom.GetStageUpAxis(stage) == "Z" else "y"
-        return Geometry(
-            found.vertices,
-            found.faces,
-            up_axis=up if said("upAxis") else None,  # type: ignore[arg-type]
-            not_applied=tuple(lost),
-            notes=found.notes,
+        parts = (
+            Part(*self._triangles(prim), resized @ matrices) for number, prim, matrices in self._shapes if read[number]
         )
+        up = str(self._geom.GetStageUpAxis(stage)).lower() if said("upAxis") else None
+        told = (*notes, unit if said("metersPerUnit") else "the file states no unit")
+        lost = ["references to files that did not come with it"] * missing
+        found = assembled(parts, up_axis=up, notes=told)
+        return replace(found, not_applied=(*sorted(self._other), *lost))
 
     def _find(self, root: Any, places: Float64Array, above: int) -> None:
         """Note the shapes below a prim that has these places (I, 4, 4)."""
@@ -183,10 +180,6 @@ class _Scene:
         for kind, path in enumerate(many.GetPrototypesRel().GetTargets()):
             if prototype := self._stage.GetPrimAtPath(path):
                 yield prototype, (places[:, None] @ local[kinds == kind]).reshape(-1, 4, 4), above
-
-    def _part(self, prim: Any, places: Float64Array) -> Part:
-        vertices, faces = self._triangles(prim)
-        return Part(vertices, faces, places)
 
     def _triangles(self, prim: Any) -> tuple[Float64Array, Int64Array]:
         """A shape in its own frame; nothing for one that is not read, which is noted."""

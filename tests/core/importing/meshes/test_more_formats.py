@@ -19,7 +19,7 @@ from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import read_mesh
 from regnf_core.importing.meshes.point_files import unpack_lzf
 from regnf_core.importing.upload_description import UploadDescription
-from tests.core.importing.archives import assert_refused
+from tests.core.importing.archives import assert_refused, zip_bytes
 from tests.core.importing.meshes.mesh_files import (
     BALL,
     PLY_TRIANGLE,
@@ -216,14 +216,11 @@ def test_ply_vertices_with_lists_are_read() -> None:
 @pytest.mark.parametrize(
     ("head", "named"),
     [
-        *((b"ASTM-E57", "E57"), (b"PXR-USDC\0", "USD"), (b"#usda 1.0\n", "USD")),
-        *((b"Kaydara FBX Binary  \0", "FBX"), (b"ISO-10303-21;\nHEADER;", "STEP")),
+        *((b"ASTM-E57", "E57"), (b"Kaydara FBX Binary  \0", "FBX"), (b"BLENDER-v300", "Blender")),
         *((b"# vtk DataFile Version 3.0\n", "VTK"), (b'<?xml version="1.0"?>\n<VTKFile type="PolyData">', "VTK")),
-        *((b'<?xml version="1.0"?>\n<robot name="r">', "URDF"), (b"BLENDER-v300", "Blender")),
         *((b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"), (b"# Octomap OcTree binary file\n", "OctoMap")),
-        *((b"NRRD0004\n", "NRRD"), (b"\xef\xbb\xbf\r\n<robot name='arm'>", "URDF")),
-        *((b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo"), (b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF")),
-        *((b"AC1032\0\0", "DWG"), (b"#X3D V3.0 utf8\n", "X3D")),
+        *((b"NRRD0004\n", "NRRD"), (b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo")),
+        *((b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF"), (b"AC1032\0\0", "DWG"), (b"#X3D V3.0 utf8\n", "X3D")),
         *((b"\xef\xbb\xbf<?xml version='1.0'?>\n<COLLADA version='1.4.1'>", "COLLADA"), (b"COFF BINARY\n", "OFF")),
         *((b"OFF8 12 0\n", "OFF"), (b"# a license\n\nSTCNOFF\n8 12 0\n", "OFF")),
     ],
@@ -234,6 +231,20 @@ def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
     assert reason == "FORMAT_NOT_SUPPORTED"
     assert named in detail
     assert detail.endswith("export it as .glb, .ply, .obj or .stl") or named == "numpy.savez"
+
+
+@pytest.mark.parametrize(
+    ("head", "format_"),
+    [
+        *((b"PXR-USDC\0", "usd"), (b"\xef\xbb\xbf#usda 1.0\n", "usd"), (b"ISO-10303-21;\nHEADER;", "step")),
+        *((b'<?xml version="1.0"?>\n<robot name="r">', "urdf"), (b"\xef\xbb\xbf\r\n<robot name='arm'>", "urdf")),
+        *((b"<!-- a <sdf> --><!-- b -->\n<robot>", "urdf"), (b"<?xml?><model><robot/></model>", None)),
+        *((zip_bytes([("3D/3dmodel.model", b"")]), "3mf"), (zip_bytes([("_rels/.rels", b"")]), "3mf")),
+        *((zip_bytes([("scene.usdc", b"")]), "usd"), (zip_bytes([("run/scene.glb", b"")]), "zip")),
+    ],
+)
+def test_scenes_and_models_of_cad_are_recognized(head: bytes, format_: str | None) -> None:
+    assert sniff_format(head + bytes(500)) == format_
 
 
 def test_a_text_that_names_another_program_is_not_that_programs_file() -> None:
