@@ -25,7 +25,7 @@ _OF_NODES: dict[str, Callable[[memoryview, Siblings, str | None], Geometry]] = {
     "glb": read_glb,
     "gltf": read_gltf,
     "step": read_step,
-    "urdf": read_urdf,
+    "urdf": lambda data, siblings, node: read_urdf(data, siblings, node, read_mesh),
     "usd": read_usd,
 }
 _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {

@@ -11,7 +11,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from regnf_core.importing.meshes import meshopt
+from regnf_core.importing.meshes.meshopt import decoded
 from regnf_core.importing.meshes.scene import required
 from regnf_core.importing.meshes.triangle_files import (
     MAX_TRIANGLES,
@@ -112,7 +112,7 @@ class Accessors:
             if count > _MAX_ITEMS:
                 raise malformed(f"a glTF buffer view of {count} items")
             how = str(packed["mode"]), str(packed.get("filter", "NONE"))
-            self._unpacked[number] = meshopt.decoded(self._part(packed), count, stride, *how)
+            self._unpacked[number] = decoded(self._part(packed), count, stride, *how)
         return self._unpacked[number]
 
     def _part(self, said: dict[str, Any]) -> memoryview:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members
+from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members, require_modest
 from regnf_core.importing.meshes.scene import INSTEAD, Nodes, Part, PlainXml, assembled, in_meters, parsed
 from regnf_core.importing.meshes.triangle_files import (
     MAX_TRIANGLES,
@@ -20,7 +20,6 @@ from regnf_core.importing.meshes.triangle_files import (
     require_room,
     unsupported,
 )
-from regnf_core.importing.run.tar_run import require_modest
 
 _CORE = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
 _PATH = "{http://schemas.microsoft.com/3dmanufacturing/production/2015/06}path"

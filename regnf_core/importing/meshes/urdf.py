@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.sniff import HEAD_BYTES, MESH_FORMATS, explain_refusal, sniff_format
 from regnf_core.importing.meshes.scene import Nodes, Part, PlainXml, assembled, parsed, solid
 from regnf_core.importing.meshes.triangle_files import (
     Float64Array,
@@ -21,15 +22,17 @@ from regnf_core.importing.meshes.triangle_files import (
     unsupported,
 )
 
+Read = Callable[[str, memoryview], Geometry]
+
 _SHAPES = ("visual", "collision")
 """Of a link, the first kind that it has is read."""
 _SIZES = {"box": (("size", 3),), "cylinder": (("radius", 1), ("length", 1)), "sphere": (("radius", 1),)}
 """Basic shapes, and the attributes that have their sizes, of so many numbers each."""
 
 
-def read_urdf(data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
+def read_urdf(data: memoryview, siblings: Siblings, node: str | None, read: Read) -> Geometry:
     """The triangles of all links. siblings: the mesh files by the names that the robot gives them · node: the link to
-    read, with those that are fixed to it; then joints may move, and are at zero.
+    read, with those that are joined to it; then joints may move, and are at zero · read: reads a mesh of a format.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE for a mesh that did not come with it,
     FORMAT_NOT_SUPPORTED for moving joints, xacro, or a mesh in a format that is not read, INVALID_DESCRIPTION.
@@ -44,12 +47,12 @@ def read_urdf(data: memoryview, siblings: Siblings | None = None, node: str | No
     placed = list(_tree(robot, links))
     for name, above, _ in placed:
         nodes.add(name, above, len(_shapes(links[name])))
-    read, notes = nodes.chosen(node)
+    chosen, notes = nodes.chosen(node)
     meshes: dict[str, Geometry] = {}
     parts = (
-        _part(shape, pose, siblings or {}, meshes)
+        _part(shape, pose, siblings, meshes, read)
         for number, (name, _, pose) in enumerate(placed)
-        if read[number]
+        if chosen[number]
         for shape in _shapes(links[name])
     )
     return assembled(parts, notes=(*notes, "the unit is meter, as URDF specifies"))
@@ -120,12 +123,12 @@ def _origin(element: Element) -> Float64Array:
     return pose
 
 
-def _part(shape: Element, pose: Float64Array, siblings: Siblings, meshes: dict[str, Geometry]) -> Part:
+def _part(shape: Element, pose: Float64Array, siblings: Siblings, meshes: dict[str, Geometry], read: Read) -> Part:
     given = next(iter(_child(shape, "geometry")), shape)
     place = (pose @ _origin(shape))[None]
     if given.tag == "mesh":
         name = given.get("filename", "")
-        mesh = meshes[name] = meshes.get(name) or _mesh(name, siblings)
+        mesh = meshes[name] = meshes.get(name) or _mesh(name, siblings, read)
         place = place @ np.diag([*_numbers(given, "scale", 3, "1 1 1"), 1.0])
         return Part(mesh.vertices, mesh.faces, place, mesh.colors)
     if given.tag not in _SIZES:
@@ -134,15 +137,12 @@ def _part(shape: Element, pose: Float64Array, siblings: Siblings, meshes: dict[s
     return Part(*solid(given.tag, *sizes.tolist()), place)
 
 
-def _mesh(name: str, siblings: Siblings) -> Geometry:
-    from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
-    from regnf_core.importing.meshes import MESH_READERS, read_mesh
-
+def _mesh(name: str, siblings: Siblings, read: Read) -> Geometry:
     if name not in siblings:
         raise elsewhere(f"the URDF robot's mesh {name[-200:]} is not there: give both in one archive")
-    data = siblings[name]
-    ending = name.rpartition(".")[2].lower()
-    format_ = sniff_format(bytes(data[:HEAD_BYTES])) or (ending if ending in MESH_READERS else None)
-    if format_ not in MESH_READERS or format_ == "urdf":
-        raise unsupported(f"the URDF robot's mesh {name[-200:]}: {explain_refusal(bytes(data[:HEAD_BYTES]))[1]}")
-    return read_mesh(format_, data)
+    data, ending = siblings[name], name.rpartition(".")[2].lower()
+    head = bytes(data[:HEAD_BYTES])
+    format_ = sniff_format(head) or (ending if ending in MESH_FORMATS else None)
+    if format_ not in MESH_FORMATS or format_ == "urdf":
+        raise unsupported(f"the URDF robot's mesh {name[-200:]}: {explain_refusal(head)[1]}")
+    return read(format_, data)

@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members
-from regnf_core.importing.run.tar_run import MAX_PARTS, TarRun, archive_error, kept, require_modest
+from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members, require_modest
+from regnf_core.importing.run.tar_run import MAX_PARTS, TarRun, archive_error, kept
 from regnf_core.library_entries import shown_path
 
 # Which file of a run is its checkpoint: the newest step by the trainer's own naming, never by the files' times.
