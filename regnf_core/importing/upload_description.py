@@ -177,6 +177,9 @@ class UploadDescription(_Said):
     """scene: a surface seen from inside, such as a room. object: a surface seen from outside."""
     sensor: _Corner | None = None
     """The position from which all points of a cloud were measured, in the file's coordinates."""
+    node: Annotated[str, Len(1, 512)] | None = None
+    """Of a scene of several nodes the one to import, with all below it: its name, or the names of a path to it with
+    ``/`` between them. A prim of USD, a product of STEP, an object of 3MF, or a link of URDF."""
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=MOST_OF_LABEL, pattern=LABEL_PATTERN)] | None = None

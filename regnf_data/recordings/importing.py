@@ -164,8 +164,8 @@ def unpack(upload: Path, kind: str, folder: Path, most: int) -> None:
 
 
 def _members(data: memoryview, kind: str, most: int) -> Iterator[tuple[str, bytes]]:
-    from regnf_core.importing.containers.zip_members import DEFLATED, STORED, read_members
-    from regnf_core.importing.run.tar_run import TarRun, require_modest
+    from regnf_core.importing.containers.zip_members import DEFLATED, STORED, read_members, require_modest
+    from regnf_core.importing.run.tar_run import TarRun
 
     if kind == "zip":
         members = read_members(data, (STORED, DEFLATED), True, _MOST_FILES)

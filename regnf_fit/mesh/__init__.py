@@ -35,13 +35,13 @@ class MeshTarget(NamedTuple):
     source: dict[str, Any]
 
 
-def mesh_target(mesh: Path, extent: float | None = None) -> MeshTarget:
+def mesh_target(mesh: Path, extent: float | None = None, node: str | None = None) -> MeshTarget:
     """The mesh in a file; with ``extent`` moved to the origin and scaled so that its longest edge has this length.
 
-    Faces are turned as an upload's are; the source's ``mesh_faces`` says what was done to them, if anything.
-    Raises what ``load_solid`` does.
+    node: of a scene, the node to read. Faces are turned as an upload's are; the source's ``mesh_faces`` says what was
+    done to them, if anything. Raises what ``load_solid`` does.
     """
-    target, done = load_solid(mesh)
+    target, done = load_solid(mesh, node=node)
     source: dict[str, Any] = {"mesh": mesh.name, **({"mesh_faces": list(done)} if done else {})}
     if extent is None:
         return MeshTarget(target, source)

@@ -11,7 +11,7 @@ from regnf_core.importing.containers.refused import is_package, refused
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
-MESH_FORMATS = ("e57", "glb", "gltf", "las", "npy", "obj", "pcd", "ply", "stl", "xyz")
+MESH_FORMATS = (*("3mf", "e57", "glb", "gltf", "las", "npy", "obj", "pcd", "ply", "step", "stl", "urdf", "usd", "xyz"),)
 
 _OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _MAGICS = ((b"glTF", "glb"), (b"LASF", "las"), (b"ASTM-E57", "e57"), (b"\x93NUMPY", "npy"))
@@ -29,6 +29,9 @@ _OBJ_FEW = 8
 _LONG_COMMENT = 2048
 """Bytes of comments, and nothing else, before the first statement: of the formats taken only OBJ has such."""
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
+_NAMED = ((b"PXR-USDC", "usd"), (b"#usda", "usd"), (b"ISO-10303-21", "step"), (b"<robot", "urdf"))
+_XML_OWN = re.compile(rb"<\?.*?\?>|<!--.*?-->", re.DOTALL)
+"""Of an XML document, what may come before its first element."""
 
 
 def sniff_mesh(head: bytes) -> str | None:
@@ -42,6 +45,9 @@ def sniff_mesh(head: bytes) -> str | None:
     if _is_binary_stl(head):
         return "stl"
     text = head.lstrip(_BLANK)
+    begin = _XML_OWN.sub(b"", text).lstrip() if text.startswith(b"<") else text
+    if named := next((format_ for magic, format_ in _NAMED if begin.startswith(magic)), None):
+        return named
     if re.match(rb"ply[ \t]*[\r\n]", text):
         return "splat-ply" if _SPLAT_PROPERTY.search(text) else "ply"
     if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS) and b'"geometricError"' not in text:
@@ -194,6 +200,8 @@ _TORCH_MEMBERS = frozenset(
 _ONNX = re.compile(rb"\x08[\x03-\x1f](?!\x12[\x80-\xff]*[\x01-\x7f]\n)[\x12\x1a\x22\x28\x32\x3a\x42]")
 """A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's. Core ML's
 has a message there, which begins with its first field, where ONNX has a name."""
+_PACKAGES = ((b"[Content_Types].xml", "3mf"), (b"_rels/", "3mf"), (b"3D/", "3mf"))
+"""The first member of zip files that are a model, or an office document: what they are read as."""
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
 """Formats in which a whole training run may be given."""
@@ -220,7 +228,7 @@ def sniff_format(head: bytes) -> str | None:
     if head.startswith(_ZIP_LOCAL_HEADER):
         if _first_name(head).endswith(b".npy"):
             return "npz"
-        return None if is_package(head) else "zip"
+        return _package(_first_name(head)) or (None if is_package(head) else "zip")
     if head[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC):
         return None if head.startswith(_OLD_TORCH_TAR) else "tar"
     for magic, packing in _PACKED:
@@ -249,6 +257,13 @@ def explain_refusal(head: bytes, name: str = "") -> tuple[str, str]:
         "not a supported format; supported are torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of "
         "a run",
     )
+
+
+def _package(first: bytes) -> str | None:
+    """The format of a zip with this first member that is no run, but a model of one file."""
+    if first.lower().endswith((b".usd", b".usda", b".usdc")):
+        return "usd"
+    return next((format_ for name, format_ in _PACKAGES if first.startswith(name)), None)
 
 
 def _first_name(head: bytes) -> bytes:

@@ -161,12 +161,24 @@ def _widened(value: int, wide: list[int]) -> int:
 
 
 MAX_ENTRIES = 16_384
+FREE_BYTES = 64 << 20
+"""What an archive may unpack to without anybody looking at how tightly it was packed."""
+MAX_RATIO = 200
+"""Beyond that, bytes unpacked for a byte packed. Checkpoints of trained fields stay below 10."""
 _PIECE = 1 << 20
 STORED, DEFLATED = 0, 8
 _ENCRYPTION_FLAGS = 0x0001 | 0x0040 | 0x2000
 _DESCRIPTOR_FLAG = 0x0008
 _UTF8_FLAG = 0x0800
 _PART = re.compile(r"[^\x00-\x1f\x7f/\\]+")
+
+
+def require_modest(unpacked: int, packed: int, most: int) -> None:
+    """Raise FieldFormatError (ARCHIVE_TOO_LARGE) for what unpacks to more than ``most`` bytes, or to many from few."""
+    if unpacked > most:
+        raise malformed(f"the archive unpacks to more than {most} bytes", "ARCHIVE_TOO_LARGE")
+    if unpacked > FREE_BYTES + MAX_RATIO * packed:
+        raise malformed(f"the archive unpacks to more than {MAX_RATIO} times its size", "ARCHIVE_TOO_LARGE")
 
 
 @dataclass(frozen=True)

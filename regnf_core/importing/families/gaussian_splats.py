@@ -19,6 +19,7 @@ from regnf_core.importing.families import voxel_block_grid
 from regnf_core.importing.families.converted import ConvertedField, observed_field
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family
 from regnf_core.importing.fusing import BlockGrid, fused_arrays
+from regnf_core.importing.meshes.scene import refuse_node
 from regnf_core.importing.meshes.triangle_files import Siblings, malformed
 from regnf_core.importing.observing.trajectory import Trajectory
 from regnf_core.importing.splats.drawing import prepared
@@ -52,18 +53,21 @@ _ACROSS, _LOOK_THROUGH = 2.0, 2
 """Voxels along an edge of the observation's; views that must look through one for it to be free."""
 
 
-def read_splats(format_: str, data: memoryview, siblings: Siblings) -> Splats:
-    """The Gaussians of a file of the format that ``sniff_format`` named, as they are stored.
+def read_splats(format_: str, data: memoryview, siblings: Siblings, node: str | None = None) -> Splats:
+    """The Gaussians of a file of the format that ``sniff_format`` named, as they are stored. node: of a glTF scene, the
+    node to read.
 
     Raises FieldFormatError: MESH_INVALID, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED.
     """
     if format_ == "sog":
+        refuse_node(node, format_)
         return read_sog(data, siblings)
     if format_ in ("glb", "gltf"):
-        found = read_gltf_splats(data, siblings)
+        found = read_gltf_splats(data, siblings, node)
         if found is None:
             raise malformed("the glTF file has no Gaussians")
         return found
+    refuse_node(node, format_)
     readers = {"splat-ply": read_ply_splats, "splat": read_splat, "ksplat": read_ksplat, "spz": read_spz}
     return readers[format_](data)
 
@@ -77,7 +81,7 @@ def convert_splats(
     refused for.
     """
     require_family(overrides, FAMILY)
-    refuse_other_entries(overrides, FAMILY, ("as", "cameras"))
+    refuse_other_entries(overrides, FAMILY, ("as", "cameras", "node"))
     splats, lost = sound(splats)
     scale = overrides.world_scale or 1.0
     within = None if overrides.as_ is None else overrides.as_ == "scene"

@@ -32,7 +32,7 @@ def convert_mesh(
     refused for.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are refused as not finite
-        geometry = read_mesh(format_, data, siblings, path)
+        geometry = read_mesh(format_, data, siblings, overrides.node, path)
     if len(geometry.faces) > 0:
         return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
     if format_ not in CLOUD_FORMATS or len(geometry.vertices) == 0:

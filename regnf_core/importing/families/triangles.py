@@ -194,7 +194,8 @@ def mesh_field(
 ) -> ConvertedField:
     """The exact distance to triangles. ``origin``: what they come from, for the report. Raises as ``convert_mesh``."""
     require_family(overrides, family)
-    refuse_other_entries(overrides, family)
+    refuse_other_entries(overrides, family, ("node",))
+    overrides = replace(overrides, up_axis=overrides.up_axis or geometry.up_axis)
     asked = "object" if overrides.sign == -1 else overrides.as_  # who turns the sign round means the turned faces
     solid = solid_of(geometry, asked, work_s)
     faces, places = solid.facing.faces, solid.places
@@ -209,6 +210,7 @@ def mesh_field(
         else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number decides what is inside",
         *solid.facing.why,
         *(f"ignored: {what}" for what in (*geometry.left_out, *solid.ignored)),
+        *geometry.notes,
     )
     converted = ConvertedField(
         family,

@@ -258,6 +258,9 @@ def main(arguments: list[str]) -> int:
     request = json.load(sys.stdin)
     limits = ImportLimits(**request["limits"])
     out_dir = Path(arguments[0])
+    os.environ["TMPDIR"] = arguments[0]  # where libraries that cannot do without put temporary files
+    told = os.dup(sys.stdout.fileno())
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what libraries print is no part of the report
     # Opened while all is still allowed: a folder on the way may be open to this process's privileges only.
     opened = [os.open(path, os.O_RDONLY) for path in arguments[1:]]
     head = os.pread(opened[0], MARKED_BYTES, 0)
@@ -268,8 +271,8 @@ def main(arguments: list[str]) -> int:
     beside, said = Companions(**named), request["description"]
     report = run(upload, out_dir, said, limits, request["picture"], beside, request["ask_by_picture"])
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
-    sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
-    sys.stdout.flush()
+    with open(told, "w", encoding="utf-8") as answer:
+        answer.write(json.dumps(report, allow_nan=False) + "\n")
     return 0
 
 

@@ -77,7 +77,9 @@ sys.exit(import_module(sys.argv[2]).main(sys.argv[3:]))
 _FIELDS = "regnf_core.importing.gate.convert"
 _REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
 _MAX_DETAIL = 1000
-_OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
+_OUT_OF_MEMORY_SIGNS = (
+    *(b"MemoryError", b"bad_alloc", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment"),
+)
 _MAX_DESCRIPTION = 16_384
 _MAX_NAME = 120
 _PICTURE_BYTES = 16 << 20
@@ -222,7 +224,7 @@ def request_of(
 
 def _environment() -> dict[str, str]:
     """All the child gets to see of the environment: no secret lives in these names. It may not have threads."""
-    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS", "PXR_WORK_THREAD_LIMIT")
     return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, "1")}
 
 

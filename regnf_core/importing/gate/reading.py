@@ -121,7 +121,7 @@ def _read_splats(
     beside = [file for file in opened.settings if PurePosixPath(file.name).name == TRAINED_CAMERAS]
     cameras = given or (read_trajectory(beside, said.cameras) if beside else None)
     origin = f"a {kind} file" if opened.name is None else opened.name[-200:]
-    splats = read_splats(kind, opened.data, opened.siblings)
+    splats = read_splats(kind, opened.data, opened.siblings, said.node)
     converted = convert_splats(splats, origin, said, cameras, limits.tensor_bytes)
     return ReadUpload(converted, said, None, None)
 

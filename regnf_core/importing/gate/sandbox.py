@@ -29,6 +29,7 @@ _NEEDED = """
 read               0  63  files
 pread64           17  67  files: the loader of libraries
 write              1  64  the field, the report
+writev            20  66  the same, as the C++ library asks for it: OpenCASCADE's triangles
 lseek              8  62  files
 close              3  57  files
 open               2   -  files: as Landlock allows

@@ -1,9 +1,11 @@
 """Strict readers of mesh files: numbers alone, from the bytes given. None opens another file or inflates anything but
-the points of a compressed PCD file, to exactly the size that its header says."""
+the points of a compressed PCD file and the parts of a 3MF package, to exactly the size that their headers say. STEP,
+USD and Draco are read by libraries, which an optional extra brings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from regnf_core.importing.meshes.e57 import read_e57
@@ -11,11 +13,23 @@ from regnf_core.importing.meshes.glb import read_glb, read_gltf
 from regnf_core.importing.meshes.las import read_las
 from regnf_core.importing.meshes.ply import read_ply
 from regnf_core.importing.meshes.point_files import read_npy, read_pcd, read_xyz
+from regnf_core.importing.meshes.scene import refuse_node
+from regnf_core.importing.meshes.step import read_step
+from regnf_core.importing.meshes.threemf import read_3mf
 from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, read_obj, read_stl
+from regnf_core.importing.meshes.urdf import read_urdf
+from regnf_core.importing.meshes.usd import read_usd
 
 CLOUD_FORMATS = ("ply", "pcd", "xyz", "las", "npy", "e57")
 """Formats that may hold points alone."""
-_IN_PARTS: dict[str, Callable[[memoryview, Siblings], Geometry]] = {"glb": read_glb, "gltf": read_gltf}
+_OF_NODES: dict[str, Callable[[memoryview, Siblings, str | None], Geometry]] = {
+    "3mf": read_3mf,
+    "glb": read_glb,
+    "gltf": read_gltf,
+    "step": read_step,
+    "urdf": lambda data, siblings, node: read_urdf(data, siblings, node, read_mesh),
+    "usd": read_usd,
+}
 _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
     "las": read_las,
     "npy": read_npy,
@@ -25,17 +39,29 @@ _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
     "stl": read_stl,
     "xyz": read_xyz,
 }
-_AT_FIXED_BYTES = frozenset({"glb", "las", "npy", "stl"})
+_UNITS = {
+    **dict.fromkeys(("glb", "gltf"), "the unit is meter, as glTF specifies"),
+    **dict.fromkeys(("obj", "ply", "stl"), "the file states no unit"),
+}
+"""What is told of the unit of formats that always have the same, or none."""
+_AT_FIXED_BYTES = frozenset({"3mf", "glb", "las", "npy", "stl", "usd"})
 _BLANK, _MOST_BLANKS = b"\xef\xbb\xbf \t\r\n", 4096
-MESH_READERS = (*_WHOLE, *_IN_PARTS, "e57")
+MESH_READERS = (*_WHOLE, *_OF_NODES, "e57")
 """The names that ``sniff_format`` gives files with a reader here."""
 
 
-def read_mesh(format_: str, data: memoryview, siblings: Siblings | None = None, path: Path | None = None) -> Geometry:
-    """What a file of this format holds. ``siblings``: the files that came with it in one archive, by relative name.
-    path: where the bytes are; E57 is read from there.
+def read_mesh(
+    format_: str,
+    data: memoryview,
+    siblings: Siblings | None = None,
+    node: str | None = None,
+    path: Path | None = None,
+) -> Geometry:
+    """What a file of this format holds. ``siblings``: the files that came with it in one archive, by relative name ·
+    node: of a scene, the node to read · path: where the bytes are; E57 is read from there.
 
-    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED.
+    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED; and
+    INVALID_DESCRIPTION for a node that is not there.
     """
     if format_ == "e57":
         if path is None:
@@ -44,6 +70,9 @@ def read_mesh(format_: str, data: memoryview, siblings: Siblings | None = None, 
     if format_ not in _AT_FIXED_BYTES:  # text may begin with a byte-order mark and blank lines
         head = bytes(data[:_MOST_BLANKS])
         data = data[len(head) - len(head.lstrip(_BLANK)) :]
-    if format_ in _IN_PARTS:
-        return _IN_PARTS[format_](data, siblings or {})
-    return _WHOLE[format_](data)
+    if format_ in _OF_NODES:
+        found = _OF_NODES[format_](data, siblings or {}, node)
+    else:
+        refuse_node(node, format_)
+        found = _WHOLE[format_](data)
+    return replace(found, notes=(*found.notes, *([_UNITS[format_]] if format_ in _UNITS else [])))

@@ -5,24 +5,22 @@ the shape and is not applied is said.
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.meshes.accessors import DRACO, MESHOPT, TRIANGLES, Accessors
+from regnf_core.importing.meshes.scene import MAX_NODES, Nodes, Part, assembled
 from regnf_core.importing.meshes.triangle_files import (
-    MAX_TRIANGLES,
     Float64Array,
     Geometry,
     Int64Array,
     Siblings,
-    elsewhere,
     fan,
     malformed,
     require_room,
@@ -32,123 +30,11 @@ from regnf_core.importing.meshes.triangle_files import (
 )
 from regnf_core.rotations import rotation_rows
 
-# The numbers: accessors into buffers, every extent checked first. A buffer is the file's own binary chunk, text within
-# the document, or a file that came with it. None is ever looked for.
-
 _CONTRADICTIONS = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError)
 """What faulty JSON ends in, where no check says more."""
-_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_MAX_ITEMS = 3 * MAX_TRIANGLES
-COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
-
-
-class Accessors:
-    """Reads accessors of ``document``. binary: the file's chunk, None in text form · siblings: files beside it."""
-
-    def __init__(self, document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> None:
-        self._accessors, self._views, self._buffers = (
-            document.get(key, []) for key in ("accessors", "bufferViews", "buffers")
-        )
-        self._binary = binary
-        self._siblings = siblings
-        self._read: dict[int, memoryview] = {}
-
-    def array(self, number: object, width: int) -> Float64Array:
-        """The items (N, width) of accessor ``number``.
-
-        Raises FieldFormatError: MESH_INVALID, FORMAT_NOT_SUPPORTED or MESH_EXTERNAL_REFERENCE.
-        """
-        accessor = self._accessors[_whole(number)]
-        component = _COMPONENTS.get(accessor["componentType"])
-        if component is None or _WIDTHS.get(accessor["type"]) != width:
-            raise malformed("a glTF accessor of an unexpected type")
-        count = _whole(accessor["count"])
-        if count > _MAX_ITEMS:
-            raise malformed(f"a glTF accessor of {count} items")
-        items = np.zeros((count, width))
-        if "bufferView" in accessor:
-            items = self._items(accessor, component, count, width)
-        if "sparse" in accessor:
-            said = accessor["sparse"]
-            changed, type_ = _whole(said["count"]), _COMPONENTS.get(said["indices"]["componentType"])
-            if type_ is None or type_[1] != "u" or changed > count:
-                raise malformed("a glTF sparse accessor has too many items")
-            at = self._items(said["indices"], type_, changed, 1).reshape(-1).astype(np.int64)
-            if len(at) and at.max() >= count:
-                raise malformed("a glTF sparse accessor refers to an item that does not exist")
-            items[at] = self._items(said["values"], component, changed, width)
-        if accessor.get("normalized", False) and component != "<f4":
-            items = np.maximum(items / float(np.iinfo(np.dtype(component)).max), -1.0)
-        return items
-
-    def is_stored(self, number: object) -> bool:
-        """Whether accessor ``number`` has numbers of its own."""
-        accessor = self._accessors[_whole(number)]
-        return "bufferView" in accessor or "sparse" in accessor
-
-    def _items(self, said: dict[str, Any], component: str, count: int, width: int) -> Float64Array:
-        """(count, width) numbers of a buffer view, from a byte offset on."""
-        view, item = self._views[_whole(said["bufferView"])], np.dtype(component).itemsize * width
-        data = self._view(view)
-        stride, start = _whole(view.get("byteStride", item)), _whole(said.get("byteOffset", 0))
-        if stride < item or start + stride * max(count - 1, 0) + item * min(count, 1) > len(data):
-            raise malformed("a glTF accessor extends beyond its buffer view")
-        items = np.ndarray((count, width), component, data, start, (stride, np.dtype(component).itemsize))
-        return items.astype(np.float64)
-
-    def _view(self, view: dict[str, Any]) -> memoryview:
-        if any(name in view.get("extensions", {}) for name in COMPRESSED):
-            raise unsupported("the glTF file's buffers are compressed: export it without mesh compression")
-        data = self._buffer(_whole(view["buffer"]))
-        start, size = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])
-        if start + size > len(data):
-            raise malformed("a glTF buffer view extends beyond its buffer")
-        return data[start : start + size]
-
-    def _buffer(self, number: int) -> memoryview:
-        """The bytes of a buffer, no more than it claims."""
-        if number not in self._read:
-            buffer = self._buffers[number]
-            claimed = _whole(buffer["byteLength"])
-            if "uri" in buffer:
-                data = self._elsewhere(buffer["uri"], claimed)
-            elif number == 0 and self._binary is not None:
-                data = self._binary
-            else:
-                raise malformed("a glTF buffer without data")
-            self._read[number] = data[: min(len(data), claimed)]
-        return self._read[number]
-
-    def _elsewhere(self, uri: object, claimed: int) -> memoryview:
-        """The bytes that a buffer's ``uri`` holds, or that came under this name."""
-        if not isinstance(uri, str):
-            raise malformed("a glTF buffer's uri is not text")
-        if uri.startswith("data:"):
-            head, comma, text = uri.partition(",")
-            if not comma or not head.endswith(";base64") or len(text) * 3 // 4 > claimed + 3:
-                raise malformed("a glTF buffer's data is not base64 of the length that it claims")
-            try:
-                return memoryview(base64.b64decode(text, validate=True))
-            except ValueError as error:
-                raise malformed("a glTF buffer's data is not base64") from error
-        name = unquote(uri).removeprefix("./")
-        if name not in self._siblings:
-            missing = "the glTF file keeps its geometry in another file or address: "
-            raise elsewhere(missing + "give both in one archive, or export it as one .glb")
-        return self._siblings[name]
-
-
-def _whole(value: object) -> int:
-    if type(value) is not int or not 0 <= value < 1 << 48:
-        raise malformed("a glTF count, offset or index that is not a number")
-    return value
-
+_TRIANGLES, _STRIP, _FAN = TRIANGLES, 5, 6
 
 # The colors of a glTF document's vertices: their own times the material's, linear light as sRGB. No textures.
-
-_GRAY = 0.8
-"""Of parts without any color, beside others that have one."""
 
 
 def _primitive_colors(
@@ -185,7 +71,6 @@ def _factor(document: dict[str, Any], primitive: dict[str, Any]) -> Float64Array
 INSTANCES = "EXT_mesh_gpu_instancing"
 VISIBILITY = "KHR_node_visibility"
 CENTER = "CESIUM_RTC"
-_MAX_NODES = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,39 +85,48 @@ class PlacedMesh:
     joints: Float64Array | None = None
 
 
-def placed_meshes(document: dict[str, Any], accessors: Accessors) -> Iterator[PlacedMesh]:
-    """Every visible node's mesh.
+def placed_meshes(
+    document: dict[str, Any], accessors: Accessors, asked: str | None
+) -> tuple[Iterable[PlacedMesh], tuple[str, ...]]:
+    """The meshes of the visible nodes, or of the one that is asked for, and what is told of them.
 
-    Raises FieldFormatError (MESH_INVALID) for a graph that is not a tree; KeyError, TypeError ... for faulty JSON.
+    Raises FieldFormatError (MESH_INVALID) for a graph that is not a tree, INVALID_DESCRIPTION for a name of no node;
+    KeyError, TypeError ... for faulty JSON.
     """
-    nodes = document.get("nodes", [])
+    nodes, scenes = document.get("nodes", []), document.get("scenes", [])
     if not nodes:  # meshes that no node places
-        yield from (PlacedMesh(number, np.eye(4)[None]) for number in range(len(document.get("meshes", []))))
-        return
-    if len(nodes) > _MAX_NODES:
+        nodes = [{"mesh": number, "name": mesh.get("name")} for number, mesh in enumerate(document.get("meshes", []))]
+        scenes = []
+    if len(nodes) > MAX_NODES:
         raise malformed(f"a glTF scene of {len(nodes)} nodes")
     center = _translation(document.get("extensions", {}).get(CENTER, {}).get("center", (0.0, 0.0, 0.0)))
-    scenes = document.get("scenes", [])
     roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else _without_parent(nodes)
     drawn = dict(_visited(nodes, roots, center))
     poses = dict(drawn)
     if any("skin" in nodes[number] for number in drawn):  # a joint may stand in no scene, or be invisible
         poses |= dict(_visited(nodes, _without_parent(nodes), center, hidden=True))
-    for number, pose in drawn.items():
-        node = nodes[number]
-        if "mesh" not in node:
-            continue
+    above = {child: number for number in drawn for child in nodes[number].get("children", [])}
+    named, places = Nodes(), dict[int, int]()
+    for number in drawn:
+        outer = places.get(above.get(number, -1), -1)
+        places[number] = named.add(nodes[number].get("name"), outer, "mesh" in nodes[number])
+    read, notes = named.chosen(asked)
+
+    def placed(node: dict[str, Any], pose: Float64Array) -> PlacedMesh:
         if type(node["mesh"]) is not int or node["mesh"] < 0:
             raise malformed("a glTF node refers to a mesh that does not exist")
         joints = None if "skin" not in node else _joints(document["skins"][node["skin"]], poses, accessors)
-        yield PlacedMesh(node["mesh"], pose @ _instances(node, accessors), node.get("weights"), joints)
+        return PlacedMesh(node["mesh"], pose @ _instances(node, accessors), node.get("weights"), joints)
+
+    shown = (number for number in drawn if "mesh" in nodes[number] and read[places[number]])
+    return (placed(nodes[number], drawn[number]) for number in shown), notes
 
 
 def _visited(
     nodes: list[dict[str, Any]], roots: list[int], above: Float64Array, hidden: bool = False
 ) -> Iterator[tuple[int, Float64Array]]:
     """The nodes below the roots, and from its frame to the scene's (4, 4). hidden: whether invisible ones too."""
-    waiting = [(number, above) for number in roots]
+    waiting = [(number, above) for number in reversed(roots)]
     seen: set[int] = set()
     while waiting:
         number, above = waiting.pop()
@@ -244,7 +138,7 @@ def _visited(
             continue
         matrix = above @ _pose(node)
         yield number, matrix
-        waiting.extend((child, matrix) for child in node.get("children", []))
+        waiting.extend((child, matrix) for child in reversed(node.get("children", [])))
 
 
 def _without_parent(nodes: list[dict[str, Any]]) -> list[int]:
@@ -316,9 +210,8 @@ def _rotations(quaternions: npt.NDArray[np.float64]) -> Float64Array:
 _HEADER, _CHUNK_HEADER = 12, 8
 _JSON, _BIN = b"JSON", b"BIN\0"
 _MAX_JSON = 64 << 20
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _IGNORED = {"animations": "animations", "images": "textures"}
-_APPLIED = frozenset({INSTANCES, VISIBILITY, CENTER, *COMPRESSED})
+_APPLIED = frozenset({INSTANCES, VISIBILITY, CENTER, DRACO, *MESHOPT})
 _NO_SHAPE = (
     *("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "MSFT_packing_", "ADOBE_materials_"),
     *("KHR_lights_", "EXT_lights_", "KHR_techniques_webgl", "EXT_materials_", "CESIUM_primitive_outline", "VRM"),
@@ -329,19 +222,19 @@ _NO_SHAPE = (
 """Beginnings of the names of extensions that leave triangles where they are. All others are said."""
 
 
-def read_glb(data: memoryview, siblings: Siblings | None = None) -> Geometry:
-    """The triangles of a .glb file's scene. ``siblings``: the files that came with it, by name.
+def read_glb(data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
+    """The triangles of a .glb file's scene. ``siblings``: the files that came with it, by name · node: the one to read.
 
-    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, FORMAT_NOT_SUPPORTED for compressed buffers, or
-    MESH_EXTERNAL_REFERENCE for buffers in files that did not come with it.
+    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, FORMAT_NOT_SUPPORTED for unknown extensions,
+    MESH_EXTERNAL_REFERENCE for buffers in files that did not come with it, or INVALID_DESCRIPTION for a wrong node.
     """
     document, binary = _chunks(data)
-    return _geometry(document, binary, siblings or {})
+    return _geometry(document, binary, siblings or {}, node)
 
 
-def read_gltf(data: memoryview, siblings: Siblings | None = None) -> Geometry:
+def read_gltf(data: memoryview, siblings: Siblings | None = None, node: str | None = None) -> Geometry:
     """The triangles of a .gltf file's scene, its buffers within it or beside it. Raises as :func:`read_glb`."""
-    return _geometry(_document(data), None, siblings or {})
+    return _geometry(_document(data), None, siblings or {}, node)
 
 
 def gltf_parts(data: memoryview) -> tuple[dict[str, Any], memoryview | None]:
@@ -352,9 +245,9 @@ def gltf_parts(data: memoryview) -> tuple[dict[str, Any], memoryview | None]:
     return _chunks(data) if bytes(data[:4]) == b"glTF" else (_document(data), None)
 
 
-def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> Geometry:
+def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings, node: str | None) -> Geometry:
     try:
-        return _scene(document, Accessors(document, binary, siblings))
+        return _scene(document, Accessors(document, binary, siblings), node)
     except _CONTRADICTIONS as error:
         raise malformed(f"the glTF document contradicts itself ({type(error).__name__})") from error
 
@@ -389,57 +282,41 @@ def _document(text: memoryview) -> dict[str, Any]:
     return document
 
 
-def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
+def _scene(document: dict[str, Any], accessors: Accessors, asked: str | None) -> Geometry:
     required, used = (
         [str(name)[:60] for name in document.get(key, []) if not str(name).startswith(_NO_SHAPE)]
         for key in ("extensionsRequired", "extensionsUsed")
     )
-    if unknown := [name for name in required if name not in _APPLIED or name in COMPRESSED]:
+    if unknown := [name for name in required if name not in _APPLIED]:
         raise unsupported(f"the glTF file needs the extension {unknown[0]}, which is not read: export it without")
-    vertices: list[Float64Array] = []
-    faces: list[Int64Array] = []
-    colors: list[Float64Array | None] = []
     flat: set[str] = set()
-    so_far = triangles = 0
-    for placed in placed_meshes(document, accessors):
-        mesh = document["meshes"][placed.mesh]
-        for primitive in mesh["primitives"]:
-            if (mode := primitive.get("mode", _TRIANGLES)) not in (_TRIANGLES, _STRIP, _FAN):
-                flat.add("points" if mode == 0 else "lines")
-                continue
-            _require_plain(primitive, accessors)
-            places = _morphed(primitive, placed.weights or mesh.get("weights"), accessors)
-            corners = _triangles(primitive, accessors, len(places))
-            if len(corners) and (corners.min() < 0 or corners.max() >= len(places)):
-                raise malformed("a glTF face refers to a vertex that does not exist")
-            painted = _primitive_colors(document, primitive, accessors, len(places))
-            count = len(placed.matrices) if placed.joints is None else 1
-            require_room(so_far + count * len(places), triangles + count * len(corners))
-            for matrix in placed.matrices[:count]:
-                if placed.joints is not None:
-                    places, matrix = _skinned(places, primitive, placed.joints, accessors), np.eye(4)
-                turned = np.linalg.det(matrix[:3, :3]) < 0  # a mirrored node turns its faces round
-                vertices.append(places @ matrix[:3, :3].T + matrix[:3, 3])
-                colors.append(painted)
-                faces.append((corners[:, ::-1] if turned else corners) + so_far)
-                so_far, triangles = so_far + len(places), triangles + len(corners)
-    empty = np.zeros((0, 3))
-    parts = zip(colors, vertices, strict=True)
-    shown = [np.full((len(part), 3), _GRAY) if color is None else color for color, part in parts]
-    return Geometry(
-        np.concatenate([empty, *vertices]),
-        np.concatenate([empty.astype(np.int64), *faces]),
-        colors=None if all(color is None for color in colors) else np.concatenate(shown),
+    placed, notes = placed_meshes(document, accessors, asked)
+    found = assembled(_parts(document, accessors, placed, flat), notes=notes)
+    return replace(
+        found,
         left_out=(*sorted(flat), *(word for key, word in _IGNORED.items() if document.get(key))),
         not_applied=tuple(f"extension {name}" for name in used if name not in _APPLIED),
     )
 
 
-def _require_plain(primitive: dict[str, Any], accessors: Accessors) -> None:
-    """Raise FieldFormatError (FORMAT_NOT_SUPPORTED) where the vertices are in compressed form alone."""
-    packed = [name for name in primitive.get("extensions", {}) if name in COMPRESSED]
-    if packed and not accessors.is_stored(primitive["attributes"]["POSITION"]):
-        raise unsupported(f"the glTF file's meshes are compressed by {packed[0]}: export it without compression")
+def _parts(
+    document: dict[str, Any], accessors: Accessors, placed: Iterable[PlacedMesh], flat: set[str]
+) -> Iterator[Part]:
+    """The triangles of each primitive of the meshes, at their places; what else there is goes to ``flat``."""
+    for one in placed:
+        mesh = document["meshes"][one.mesh]
+        for primitive in mesh["primitives"]:
+            if (mode := primitive.get("mode", _TRIANGLES)) not in (_TRIANGLES, _STRIP, _FAN):
+                flat.add("points" if mode == 0 else "lines")
+                continue
+            accessors.unpack(primitive)
+            places = _morphed(primitive, one.weights or mesh.get("weights"), accessors)
+            corners = _triangles(primitive, accessors, len(places))
+            painted = _primitive_colors(document, primitive, accessors, len(places))
+            if one.joints is None:
+                yield Part(places, corners, one.matrices, painted)
+            else:
+                yield Part(_skinned(places, primitive, one.joints, accessors), corners, colors=painted)
 
 
 def _morphed(primitive: dict[str, Any], weights: list[float] | None, accessors: Accessors) -> Float64Array:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.schema.description import Axis
 
 Float64Array = npt.NDArray[np.float64]
 Int64Array = npt.NDArray[np.int64]
@@ -40,6 +41,10 @@ class Geometry:
     """The same of what changes the shape: it is warned of."""
     sensor: Float64Array | None = None
     """(3,) from where all points were measured, where the file says so; or (V, 3) from where each was, NaN: unknown."""
+    up_axis: Axis | None = None
+    """The axis that points up, where the file says so."""
+    notes: tuple[str, ...] = ()
+    """What is told about the file's unit and its nodes, one short sentence each."""
 
 
 def not_numbers(message: str, text: bytes) -> FieldFormatError:
@@ -102,6 +107,16 @@ def fan(order: npt.NDArray[Any]) -> Int64Array:
     """(N - 2, 3) triangles of corners (N,) around the first of them."""
     corners = np.asarray(order, dtype=np.int64)
     return fans(corners[None]) if len(corners) >= 3 else np.zeros((0, 3), np.int64)
+
+
+def polygons(counts: npt.NDArray[Any], corners: npt.NDArray[Any]) -> Int64Array:
+    """(F, 3) triangles of polygons: ``counts`` (P,) corners each, one after the other in ``corners``."""
+    counts, corners = np.asarray(counts, np.int64), np.asarray(corners, np.int64)
+    if counts.sum() != len(corners) or (counts < 0).any():
+        raise malformed("polygons with more or fewer corners than their counts say")
+    begun = np.cumsum(counts) - counts
+    alike = [begun[counts == n][:, None] + np.arange(n) for n in np.unique(counts) if n >= 3]
+    return np.concatenate([np.zeros((0, 3), np.int64), *(fans(corners[rows]) for rows in alike)])
 
 
 # Wavefront OBJ: vertices and polygons. Everything else is ignored; no other file is opened.

@@ -10,8 +10,8 @@ from pathlib import Path, PurePosixPath
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members
-from regnf_core.importing.run.tar_run import MAX_PARTS, TarRun, archive_error, kept, require_modest
+from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members, require_modest
+from regnf_core.importing.run.tar_run import MAX_PARTS, TarRun, archive_error, kept
 from regnf_core.library_entries import shown_path
 
 # Which file of a run is its checkpoint: the newest step by the trainer's own naming, never by the files' times.
@@ -19,7 +19,11 @@ from regnf_core.library_entries import shown_path
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
     (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
-    (".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz", ".e57", ".splat", ".ksplat", ".spz"),
+    (".urdf",),
+    (
+        *(".step", ".stp", ".3mf", ".usd", ".usda", ".usdc", ".usdz"),
+        *(".glb", ".gltf", ".ply", ".obj", ".stl", ".pcd", ".xyz", ".las", ".laz", ".e57", ".splat", ".ksplat", ".spz"),
+    ),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
 _TENSORS_ELSEWHERE = "optimizerparameters schedulerparameters latentcodes reconstructions normalizationparameters"
@@ -81,7 +85,7 @@ def choose_checkpoint(names: Iterable[str]) -> str:
 
 
 def _first_tier(names: Iterable[str]) -> list[_Candidate]:
-    tiers: tuple[list[_Candidate], ...] = ([], [], [])
+    tiers: tuple[list[_Candidate], ...] = tuple([] for _ in _TIERS)
     for name in names:
         path = PurePosixPath(name)
         if _OTHER_FILES.fullmatch(path.name) or any(part.lower() in _OTHER_FOLDERS for part in path.parts[:-1]):
@@ -184,8 +188,9 @@ def _role(path: PurePosixPath) -> str:
 
 MAX_SETTINGS_BYTES = 64 << 20
 """All settings together: latent codes of a thousand shapes are the largest."""
-_OTHER_ENDS = {".gltf": ".bin", ".glb": ".bin", ".json": ".webp"}
-"""Of a file that refers to others, what these end in."""
+_USD = (".usd", ".usda", ".usdc")
+OTHER_FILES = {".gltf": (".bin",), ".glb": (".bin",), ".json": (".webp",), **dict.fromkeys(_USD, _USD)}
+"""By the end of a mesh's name, the ends of the names of files that it may refer to."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +228,7 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     name = _sog(archive.sizes) or choose_checkpoint(archive.sizes)
     settings = choose_settings(archive.sizes, name)
     _require_few(archive, settings)
-    siblings = _siblings(archive, name)
+    siblings = _siblings(archive, name) or _meshes(archive, name, folder)
     taken = archive.take({name, *settings, *siblings.values()}, folder)
     nested, members = _opened(taken[name], most)
     if nested is not None:
@@ -290,14 +295,23 @@ def _too_large(message: str) -> FieldFormatError:
 def _siblings(archive: ZipRun | TarRun, name: str) -> dict[str, str]:
     """Names in the archive by their names as a mesh in it would write them."""
     path = PurePosixPath(name)
-    if path.suffix.lower() not in _OTHER_ENDS:
-        return {}
+    ends = OTHER_FILES.get(path.suffix.lower(), ())
     near = [each for each in map(PurePosixPath, archive.sizes) if each.is_relative_to(path.parent) and each != path]
-    return {
-        str(each.relative_to(path.parent)): str(each)
-        for each in near
-        if each.suffix.lower() == _OTHER_ENDS[path.suffix.lower()]
+    return {str(each.relative_to(path.parent)): str(each) for each in near if each.suffix.lower() in ends}
+
+
+def _meshes(archive: ZipRun | TarRun, name: str, folder: Path) -> dict[str, str]:
+    """Names in the archive of the meshes of a robot, by the names that it gives them."""
+    if not name.lower().endswith(".urdf"):
+        return {}
+    from regnf_core.importing.meshes.urdf import endings, mesh_names
+
+    names = sorted(archive.sizes)
+    found = {
+        mesh: [each for end in endings(mesh) for each in names if f"/{each}".endswith(f"/{end}")]
+        for mesh in mesh_names(archive.take({name}, folder)[name])
     }
+    return {mesh: fitting[0] for mesh, fitting in found.items() if fitting}
 
 
 def _sog(names: Collection[str]) -> str | None:

@@ -14,28 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.zip_members import require_modest
 
 # Where an archive's members go as they are unpacked: small ones into memory, large ones into a file that is mapped.
 
 MAX_NAME_BYTES, MAX_PARTS = 512, 32
-FREE_BYTES = 64 << 20
-"""What an archive may unpack to without anybody looking at how tightly it was packed."""
-MAX_RATIO = 200
-"""Beyond that, bytes unpacked for a byte packed. Checkpoints of trained fields stay below 10."""
 _IN_MEMORY = 1 << 20
 
 
 def archive_error(message: str, reason: str = "ARCHIVE_MALFORMED") -> FieldFormatError:
     """The error for an archive of a run that is not taken."""
     return FieldFormatError(message, reason=reason)
-
-
-def require_modest(unpacked: int, packed: int, most: int) -> None:
-    """Raise FieldFormatError (ARCHIVE_TOO_LARGE) for what unpacks to more than ``most`` bytes, or to many from few."""
-    if unpacked > most:
-        raise archive_error(f"the archive unpacks to more than {most} bytes", "ARCHIVE_TOO_LARGE")
-    if unpacked > FREE_BYTES + MAX_RATIO * packed:
-        raise archive_error(f"the archive unpacks to more than {MAX_RATIO} times its size", "ARCHIVE_TOO_LARGE")
 
 
 def kept(pieces: Iterable[bytes | memoryview], size: int, folder: Path) -> memoryview:

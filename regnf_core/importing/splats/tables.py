@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.meshes.glb import Accessors, gltf_parts, placed_meshes
+from regnf_core.importing.meshes.accessors import Accessors
+from regnf_core.importing.meshes.glb import gltf_parts, placed_meshes
 from regnf_core.importing.meshes.ply import PlyTables
 from regnf_core.importing.meshes.triangle_files import Siblings, elsewhere, malformed, unsupported
 from regnf_core.importing.splats.gaussians import (
@@ -219,14 +220,14 @@ def _of_one_extent(levels: npt.NDArray[np.uint8], said: Mapping[str, Any]) -> Fl
 EXTENSION = "KHR_gaussian_splatting"
 
 
-def read_gltf_splats(data: memoryview, siblings: Siblings) -> Splats | None:
+def read_gltf_splats(data: memoryview, siblings: Siblings, node: str | None = None) -> Splats | None:
     """The splats of a glTF file, None where it has none. Raises FieldFormatError: as the reader of its meshes."""
     document, binary = gltf_parts(data)
     if EXTENSION not in json.dumps(document.get("extensionsUsed", [])):
         return None
     accessors, parts = Accessors(document, binary, siblings), []
     try:
-        for placed in placed_meshes(document, accessors):
+        for placed in placed_meshes(document, accessors, node)[0]:
             for primitive in document["meshes"][placed.mesh]["primitives"]:
                 said = primitive.get("extensions", {}).get(EXTENSION)
                 if said is None:

@@ -242,10 +242,8 @@ class Seen:
         """(X, Y, Z): how far the surface that is seen lies behind the places of a grid, by depth; infinity where there
         is none in their direction, NaN beside the image."""
         M = (self.camera.matrix @ self.camera.T_camera_world[:3]).astype(np.float32)
-        x, y, z = (axis.astype(np.float32) for axis in (x, y, z))
-        u, v, own = (
-            (row[0] * x)[:, None, None] + (row[1] * y)[:, None] + (row[2] * z + row[3]) for row in M
-        )  # homogeneous
+        x, y, z = (axis.astype(np.float32) for axis in (x, y, z))  # type: ignore[assignment]
+        u, v, own = ((row[0] * x)[:, None, None] + (row[1] * y)[:, None] + (row[2] * z + row[3]) for row in M)
         height, width = self.depth.shape
         inside = (own > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < width * own) & (v < height * own)
         with np.errstate(all="ignore"):

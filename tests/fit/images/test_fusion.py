@@ -12,9 +12,9 @@ import torch
 from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import has_color, observation_of
+from regnf_core.importing.fusing import BlockGrid
 from regnf_core.schema.description import FREE, SURFACE
 from regnf_core.schema.safe_format import read_description
-from regnf_core.importing.fusing import BlockGrid
 from regnf_data.fusing import fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.fusion import FusionOptions, FusionReport, fuse_images, measured_rays

@@ -145,7 +145,7 @@ def test_no_secret_is_handed_down_and_the_folder_is_its_own(tmp_path: Path, monk
     seen = tell(tmp_path, "print(json.dumps([dict(os.environ), open('/proc/self/environ').read(), os.getcwd()]))")
     assert seen.pop() == str(tmp_path.resolve())
     assert "hunter2" not in json.dumps(seen)
-    libraries = {f"{library}_NUM_THREADS" for library in ("OMP", "MKL", "OPENBLAS", "IGL")}
+    libraries = {f"{library}_NUM_THREADS" for library in ("OMP", "MKL", "OPENBLAS", "IGL")} | {"PXR_WORK_THREAD_LIMIT"}
     assert set(seen[0]) <= {"PATH", "LANG", "LC_CTYPE"} | libraries
 
 

@@ -67,6 +67,10 @@ def faulty_documents() -> dict[str, list[Any]]:
     ]
     views = [{"byteLength": 1 << 30}, {"byteStride": 0}, {"byteStride": 1 << 40}]
     packed = {"extensions": {"EXT_meshopt_compression": {}}}
+    codec = {"buffer": 0, "byteLength": 36, "byteStride": 12, "count": 3, "mode": "ATTRIBUTES"}
+    draco = {"attributes": {"POSITION": 0}, "indices": 0}
+    draco |= {"extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}}
+    absent = {"componentType": 5126, "count": 3, "type": "VEC3"}
     return {
         "MESH_INVALID": [
             *(b"{nonsense", b"[" * 100_000, [1], triangle(nodes=[]) | {"meshes": []}),
@@ -75,11 +79,15 @@ def faulty_documents() -> dict[str, list[Any]]:
             *(triangle(accessors=[POSITION | change]) for change in positions),
             *(triangle(bufferViews=[view | change]) for change in views),
             triangle(buffers=[{"byteLength": 36, "uri": "data:;base64,AAAA"}]),
+            triangle(bufferViews=[view | packed]),
+            triangle(bufferViews=[view | {"extensions": {"EXT_meshopt_compression": codec}}]),
+            triangle(bufferViews=[view | {"extensions": {"EXT_meshopt_compression": codec | {"count": 1 << 40}}}]),
+            triangle(accessors=[absent], meshes=[{"primitives": [draco]}]),
         ],
         "MESH_EXTERNAL_REFERENCE": [triangle(buffers=[{"byteLength": 36, "uri": "../../secret.bin"}])],
         "FORMAT_NOT_SUPPORTED": [
-            triangle(extensionsRequired=["KHR_draco_mesh_compression"]),
-            triangle(bufferViews=[view | packed]),
+            triangle(extensionsRequired=["EXT_of_nobody"]),
+            triangle(accessors=[absent], meshes=[{"primitives": [draco | {"mode": 5}]}]),
         ],
     }
 

@@ -19,7 +19,7 @@ from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import read_mesh
 from regnf_core.importing.meshes.point_files import unpack_lzf
 from regnf_core.importing.upload_description import UploadDescription
-from tests.core.importing.archives import assert_refused
+from tests.core.importing.archives import assert_refused, zip_bytes
 from tests.core.importing.meshes.mesh_files import (
     BALL,
     PLY_TRIANGLE,
@@ -211,6 +211,20 @@ def test_ply_vertices_with_lists_are_read() -> None:
     header = PLY_TRIANGLE.replace("property float z\n", "property float z\nproperty list uchar int views\n")
     data = header.replace("0 0 0\n1 0 0\n0 1 0\n", "0 0 0 2 7 8\n1 0 0 0\n0 1 0 1 9\n")
     np.testing.assert_array_equal(read_mesh("ply", memoryview(data.encode())).vertices[1], [1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("head", "format_"),
+    [
+        *((b"PXR-USDC\0", "usd"), (b"\xef\xbb\xbf#usda 1.0\n", "usd"), (b"ISO-10303-21;\nHEADER;", "step")),
+        *((b'<?xml version="1.0"?>\n<robot name="r">', "urdf"), (b"\xef\xbb\xbf\r\n<robot name='arm'>", "urdf")),
+        *((b"<!-- a <sdf> --><!-- b -->\n<robot>", "urdf"), (b"<?xml?><model><robot/></model>", None)),
+        *((zip_bytes([("3D/3dmodel.model", b"")]), "3mf"), (zip_bytes([("_rels/.rels", b"")]), "3mf")),
+        *((zip_bytes([("scene.usdc", b"")]), "usd"), (zip_bytes([("run/scene.glb", b"")]), "zip")),
+    ],
+)
+def test_scenes_and_models_of_cad_are_recognized(head: bytes, format_: str | None) -> None:
+    assert sniff_format(head + bytes(500)) == format_
 
 
 def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
