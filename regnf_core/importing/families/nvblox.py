@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
+from regnf_core.importing.assumptions import AXES, METERS, SIGN
 from regnf_core.importing.containers.euclidean import (
     PROJECTIVE,
     BoolArray,
@@ -65,7 +66,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
         why = (*why, PROJECTIVE)
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.astype(np.int32)}
     tensors["weights"] = stored_weights(weights)
-    return ConvertedField(FAMILY, why, description, tensors)
+    return ConvertedField(FAMILY, why, description, tensors, assumes=(METERS, AXES, SIGN))
 
 
 def _layer(tables: TableSource) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import GLTF
 from regnf_core.importing.meshes.triangle_files import (
     MAX_TRIANGLES,
     Float64Array,
@@ -424,6 +425,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
         colors=None if all(color is None for color in colors) else np.concatenate(shown),
         left_out=(*sorted(flat), *(word for key, word in _IGNORED.items() if document.get(key))),
         not_applied=tuple(f"extension {name}" for name in used if name not in _APPLIED),
+        assumes=GLTF,
     )
 
 

@@ -8,6 +8,7 @@ import struct
 
 import numpy as np
 
+from regnf_core.importing.assumptions import AXES, LAS
 from regnf_core.importing.meshes.triangle_files import Geometry, malformed, unsupported
 
 _TAKEN = 2_000_000
@@ -46,7 +47,7 @@ def read_las(data: memoryview) -> Geometry:
     if sum(map(len, points)) < count // step:
         raise malformed(f"the LAS file ends before the {count} points of its header")
     left_out = (f"{step - 1} of {step} points",) if step > 1 else ()
-    return Geometry(found, np.zeros((0, 3), np.int64), left_out=left_out)
+    return Geometry(found, np.zeros((0, 3), np.int64), left_out=left_out, assumes=(LAS, AXES))
 
 
 def _require_header(data: memoryview) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from regnf_core.importing.assumptions import PLACES
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, not_numbers, require_room
 
 # LZF, the compression of PCD files, by its published layout: literals, and copies of what was unpacked before.
@@ -207,7 +208,11 @@ def read_xyz(data: memoryview) -> Geometry:
     require_room(len(rows), 0)
     if _are_poses(rows):
         raise malformed("the lines are camera poses (KITTI or TUM), not points; give camera poses with --cameras")
-    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows))
+    start = _normals_at(rows)
+    normals = None if start is None else rows[:, start : start + 3]
+    told = "" if start is None else f", columns {start + 1} to {start + 3} are normals, as their length is 1"
+    assumes = (*PLACES, f"order: columns 1 to 3 are x, y, z{told}")
+    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), normals, assumes=assumes)
 
 
 def _are_poses(rows: Float64Array) -> bool:
@@ -225,10 +230,7 @@ def _of_length_one(rows: Float64Array) -> bool:
     return len(rows) > 0 and bool((np.abs(np.linalg.norm(rows, axis=1) - 1.0) < _UNIT).mean() >= _SHARE)
 
 
-def _normals(rows: Float64Array) -> Float64Array | None:
-    """The three neighboring columns behind the place whose rows have length one; None where there are none."""
-    for start in range(3, rows.shape[1] - 2):
-        found = rows[:, start : start + 3]
-        if _of_length_one(found):
-            return found
-    return None
+def _normals_at(rows: Float64Array) -> int | None:
+    """The first of three neighboring columns behind the place whose rows have length one; None: there are none."""
+    starts = range(3, rows.shape[1] - 2)
+    return next((start for start in starts if _of_length_one(rows[:, start : start + 3])), None)

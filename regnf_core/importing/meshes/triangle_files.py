@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import PLACES, Assumptions
 
 Float64Array = npt.NDArray[np.float64]
 Int64Array = npt.NDArray[np.int64]
@@ -40,6 +41,8 @@ class Geometry:
     """The same of what changes the shape: it is warned of."""
     sensor: Float64Array | None = None
     """(3,) from where all points were measured, where the file says so."""
+    assumes: Assumptions = PLACES
+    """What the file does not say and was taken for granted."""
 
 
 def not_numbers(message: str, text: bytes) -> FieldFormatError:
