@@ -59,18 +59,19 @@ def tripod(points: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """The tripod moved by x -> scale M x. M: (3, 3), of ones and zeros."""
+    """The tripod moved by x -> scale M x + shift. M: (3, 3), of ones and zeros."""
 
     M: Array
     scale: float = 1.0
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def distance(self, points: Array) -> Array:
         """(...,) at points (..., 3) of the twin's frame."""
-        return np.asarray(self.scale * tripod(points / self.scale @ self.M))
+        return np.asarray(self.scale * tripod((points - self.shift) / self.scale @ self.M))
 
     def at(self, points: Array) -> Array:
         """Where points (..., 3) of the tripod are."""
-        return np.asarray(self.scale * points @ self.M.T)
+        return np.asarray(self.scale * points @ self.M.T + self.shift)
 
     @property
     def mesh(self) -> trimesh.Trimesh:
@@ -144,19 +145,27 @@ def voxel_block_arrays(twin: Twin, size: float = 0.05) -> dict[str, Any]:
         return dict(np.load(f"{folder}/map.npz"))
 
 
-def nvblox(twin: Twin, size: float = 0.05) -> bytes:
-    """A map in SQLite after nvblox's published layout, x slowest."""
+def nvblox(
+    twin: Twin,
+    size: float = 0.05,
+    block: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray,
+    index: Callable[[tuple[int, ...]], tuple[int, ...]] = tuple,
+    edge: float | None = None,
+) -> bytes:
+    """A map in SQLite after nvblox's published layout, x slowest. block, index: what is stored in place of a block of
+    (8, 8, 8, 2) numbers and of its index · edge: of a block, as it is stored."""
     size *= twin.scale
     voxels = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1)
     rows = []
-    for index in _blocks(twin, size):
-        cut = np.clip(twin.distance(size * (8 * index + voxels + 0.5)), -4 * size, 4 * size)
-        rows.append((*map(int, index), np.stack([cut, np.ones_like(cut)], axis=-1).astype("<f4").tobytes()))
+    for at in _blocks(twin, size):
+        cut = np.clip(twin.distance(size * (8 * at + voxels + 0.5)), -4 * size, 4 * size)
+        stored = block(np.stack([cut, np.ones_like(cut)], axis=-1).astype("<f4"))
+        rows.append((*index(tuple(map(int, at))), stored.astype(stored.dtype).tobytes()))
     with tempfile.TemporaryDirectory() as folder:
         connection = sqlite3.connect(f"{folder}/map")
         connection.execute("CREATE TABLE tsdf_layer_metadata (param_name TEXT PRIMARY KEY, value_float REAL)")
         connection.execute("CREATE TABLE tsdf_layer_data (index_x INT, index_y INT, index_z INT, data BLOB)")
-        connection.execute("INSERT INTO tsdf_layer_metadata VALUES ('block_size', ?)", (8 * size,))
+        connection.execute("INSERT INTO tsdf_layer_metadata VALUES ('block_size', ?)", (edge or 8 * size,))
         connection.executemany("INSERT INTO tsdf_layer_data VALUES (?, ?, ?, ?)", rows)
         connection.commit()
         connection.close()
