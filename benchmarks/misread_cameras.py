@@ -47,15 +47,15 @@ def wrong_cameras(reader: str, twin: Twin, random: Random) -> Case:
     scaled[:, :3, 3] *= factor
     mirrored[:, 0, 3] *= -1.0
     turned = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ poses
-    line = rf"{_WARNED}|cameras: .*"
+    line, frame = rf"{_WARNED}|cameras: .*", rf"{_WARNED}|cameras: .*frame and unit"
     made: dict[str, tuple[Any, str]] = {
         "quaternions with w first": (tum(poses, roll=1), line + "quaternions"),
         "world to camera": (tum(np.linalg.inv(poses)), line + "camera to world"),
         "OpenGL's axes": (tum(gl), line + "opencv's axes"),
         "axes of a body": (tum(body), line + "opencv's axes"),
-        "poses in another unit": (tum(scaled), _WARNED),
-        "x mirrored": (tum(mirrored), _WARNED),
-        "another axis up": (tum(turned), _WARNED),
+        "poses in another unit": (tum(scaled), frame),
+        "x mirrored": (tum(mirrored), frame),
+        "another axis up": (tum(turned), frame),
         "decimal comma": (tum(poses).replace(b".", b","), _WARNED),
         "without the time": (b"\n".join(row.partition(b" ")[2] for row in tum(poses).splitlines()), _WARNED),
         "degrees for radians": (transforms(gl, math.degrees(0.9)), _WARNED),

@@ -27,7 +27,10 @@ METERS = "unit: meters, as the format defines; the file itself cannot say it"
 """Of formats with one unit: programs write other ones all the same."""
 LAS = "unit: that of the file's coordinate system, which is not read"
 
-GRID = "order: the axes of the array are x, y, z; a grid with z first gives a mirrored shape"
+GRID = (
+    "order: the axes of the array are x, y, z (with z first the shape is mirrored), and its values are at nodes, the "
+    "first at the origin or lowest corner, the last at the highest corner of bounds"
+)
 INPUTS = "order: the columns of the network's input are x, y, z"
 
 PLACES = (UNIT, AXES)

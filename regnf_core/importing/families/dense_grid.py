@@ -13,7 +13,13 @@ import numpy.typing as npt
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
 from regnf_core.importing.assumptions import GRID, UNSAID
-from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface, filled_nodes, stored_weights
+from regnf_core.importing.containers.euclidean import (
+    PROJECTIVE,
+    bound_by_surface,
+    doubts_of_map,
+    filled_nodes,
+    stored_weights,
+)
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family, shared_entries
@@ -27,6 +33,8 @@ _SPACINGS = ("spacing", "voxel_size")
 _Vector = npt.NDArray[np.float64]
 _NEAREST, _COMPARED = 0.2, 4_000
 """The slopes are compared at about so many nodes, of this share that is nearest to the surface."""
+_STEEP, _JUMPING = 1.5, 0.1
+"""Values of so large a share of the neighbors that differ by so many times their distance are no distances."""
 _OFF = 0.1
 """Slopes that are this near to 1, in the median, leave no doubt about the axes."""
 
@@ -78,7 +86,9 @@ def grid_field(
         "spacing": spacing.tolist(),
         "source": {"family": FAMILY},
     }
+    warnings = (*_other_axes(values, spacing, None if weights is None else weights > 0), *_jumps(values, spacing))
     if weights is not None:
+        warnings = doubts_of_map(values[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing)
         tensors["values"] = bounded = np.array(values, np.float32)
         if bound_by_surface(bounded[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing):
             why = (*why, PROJECTIVE)
@@ -88,7 +98,6 @@ def grid_field(
             *why,
             f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were observed; the others are free space",
         )
-    warnings = _other_axes(values, spacing, None if weights is None else weights > 0)
     return ConvertedField(FAMILY, why, description, tensors, warnings, sign_is_open=True, assumes=(*UNSAID, GRID))
 
 
@@ -117,6 +126,16 @@ def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.boo
         f"Transpose the array if that is wrong"
     )
     return (f"AXES_UNCERTAIN: {text}",)
+
+
+def _jumps(values: Float32Array, spacing: _Vector) -> tuple[str, ...]:
+    """A warning of neighbors whose values differ by more than a distance can between them."""
+    apart = (np.abs(np.diff(values, axis=axis)) > _STEEP * step for axis, step in enumerate(spacing))
+    share = max(float(one.mean()) for one in apart)
+    text = (
+        f"at {100 * share:.0f} % of the nodes along an axis values differ by more than {_STEEP:g} times their distance"
+    )
+    return (f"GRADIENT_NOT_UNIT: {text}: check the array's shape and order",) if share > _JUMPING else ()
 
 
 def _weights(arrays: ArraySource, shape: tuple[int, ...]) -> Float32Array | None:

@@ -83,6 +83,16 @@ class Accessors:
             items = np.maximum(items / float(np.iinfo(np.dtype(component)).max), -1.0)
         return items
 
+    def denies(self, number: object) -> bool:
+        """Whether the lowest and highest corner that an accessor states are not those of its numbers (N, 3)."""
+        accessor = self._accessors[_whole(number)]
+        told = "bufferView" in accessor and "sparse" not in accessor and "min" in accessor and "max" in accessor
+        if not told or not accessor["count"] or accessor.get("normalized"):
+            return False
+        items, stated = self.array(number, 3), np.array([accessor["min"], accessor["max"]], np.float64)
+        found = np.stack([items.min(axis=0), items.max(axis=0)])
+        return bool(np.abs(found - stated).max() > _DENIED_BY * np.abs(stated).max())
+
     def is_stored(self, number: object) -> bool:
         """Whether accessor ``number`` has numbers of its own."""
         accessor = self._accessors[_whole(number)]
@@ -318,6 +328,8 @@ _HEADER, _CHUNK_HEADER = 12, 8
 _JSON, _BIN = b"JSON", b"BIN\0"
 _MAX_JSON = 64 << 20
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_DENIED, _DENIED_BY = "the min and max of POSITION, which contradict its numbers", 1e-3
+"""Said where they differ by so large a share of the largest of them."""
 _IGNORED = {"animations": "animations", "images": "textures"}
 _APPLIED = frozenset({INSTANCES, VISIBILITY, CENTER, *COMPRESSED})
 _NO_SHAPE = (
@@ -394,6 +406,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
     colors: list[Float64Array | None] = []
     flat: set[str] = set()
     so_far = triangles = 0
+    denied = False
     for placed in placed_meshes(document, accessors):
         mesh = document["meshes"][placed.mesh]
         for primitive in mesh["primitives"]:
@@ -402,6 +415,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
                 continue
             _require_plain(primitive, accessors)
             places = _morphed(primitive, placed.weights or mesh.get("weights"), accessors)
+            denied = denied or accessors.denies(primitive["attributes"]["POSITION"])
             corners = _triangles(primitive, accessors, len(places))
             if len(corners) and (corners.min() < 0 or corners.max() >= len(places)):
                 raise malformed("a glTF face refers to a vertex that does not exist")
@@ -424,7 +438,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
         np.concatenate([empty.astype(np.int64), *faces]),
         colors=None if all(color is None for color in colors) else np.concatenate(shown),
         left_out=(*sorted(flat), *(word for key, word in _IGNORED.items() if document.get(key))),
-        not_applied=tuple(f"extension {name}" for name in used if name not in _APPLIED),
+        not_applied=(*(f"extension {name}" for name in used if name not in _APPLIED), *([_DENIED] if denied else [])),
         assumes=GLTF,
     )
 

@@ -183,6 +183,7 @@ def _from_columns(header: _Header, body: memoryview) -> dict[str, Float64Array]:
 # Points in lines of numbers: .xyz, .pts, .txt. Which columns are the normals is told by their length of one.
 
 _COMMENT = re.compile(rb"(?:#|//)[^\n]*")
+_DECIMAL_COMMA = re.compile(rb"\d,\d+[ \t;]+-?\d+,\d")
 _MOST_COLUMNS = 16
 _UNIT = 0.02
 """How far from one a normal's length may be; of so many ..."""
@@ -192,7 +193,10 @@ _SHARE = 0.9
 
 def read_xyz(data: memoryview) -> Geometry:
     """The points of a text file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
-    text = _COMMENT.sub(b"", bytes(data)).replace(b",", b" ").replace(b";", b" ").lstrip()
+    text = _COMMENT.sub(b"", bytes(data))
+    if b"." not in text and _DECIMAL_COMMA.search(text):
+        raise not_numbers("the numbers of the points have commas", text)
+    text = text.replace(b",", b" ").replace(b";", b" ").lstrip()
     first, _, rest = text.partition(b"\n")
     if len(first.split()) == 1:  # .pts begins with the number of points
         text = rest.lstrip()

@@ -61,8 +61,9 @@ class Trajectory:
     @property
     def assumes(self) -> Assumptions:
         """What the file does not say of its poses."""
-        frame = f"poses are camera to world, with {self.axes}'s axes; quaternions are x, y, z, w"
-        return () if self.axes is None else (f"cameras: {frame}",)
+        frame = "poses are in the frame and unit of the field, or of its dataset where that is known"
+        more = f"; camera to world, with {self.axes}'s axes; quaternions are x, y, z, w"
+        return (f"cameras: {frame}{'' if self.axes is None else more}",)
 
     def pinhole(self) -> PinholeCameras:
         """The cameras in the file's world."""

@@ -88,7 +88,7 @@ def test_a_spacing_that_fits_another_order_of_axes_is_warned_of(order: tuple[int
     for name, array in (("right", distance), ("wrong", distance.transpose(order))):
         np.savez(tmp_path / f"{name}.npz", sdf=array.astype(np.float32), **named)
     assert convert(tmp_path / "right.npz", tmp_path / "1")["warnings"] == []
-    (warning,) = convert(tmp_path / "wrong.npz", tmp_path / "2")["warnings"]
+    warning, *_ = convert(tmp_path / "wrong.npz", tmp_path / "2")["warnings"]
     assert warning.startswith(f"AXES_UNCERTAIN: the distances fit the spacing better if the array's axes are "
                               f"{', '.join('xyz'[axis] for axis in order)};")  # fmt: skip
 
