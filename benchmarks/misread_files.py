@@ -91,6 +91,7 @@ SOUND: dict[str, Callable[[Twin], bytes]] = twins.WRITERS | {
 }
 
 
+@cache
 def blocks_of(twin: Twin) -> dict[str, Any]:
     return twins.voxel_block_arrays(twin, STEP)
 

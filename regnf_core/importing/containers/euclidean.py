@@ -118,7 +118,7 @@ _EVEN, _ROUND = 1.12, 0.05
 _MANY, _FEWEST_PAIRS = 8, 64
 """Of so many blocks some touch; fewer pairs of voxels tell nothing."""
 _TINY = 1e-30
-_BROKEN, _BEND = 3.0, 0.2
+_BROKEN, _BEND = 2.2, 0.2
 """Values bend at the border of a block at most so many times as much as within it and a share of a step's change."""
 _FLAT, _STEEP = 0.7, 5.0
 """Slopes of fused maps at the surface: projective distances rise by 2 to 3 a unit in the median of rooms."""

@@ -130,6 +130,8 @@ def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.boo
 
 def _jumps(values: Float32Array, spacing: _Vector) -> tuple[str, ...]:
     """A warning of neighbors whose values differ by more than a distance can between them."""
+    if len(np.unique(values.reshape(-1)[:_COMPARED])) <= 2 and len(np.unique(values)) <= 2:
+        return ("GRADIENT_NOT_UNIT: the array has two values: it says what is inside, and not how far away it is",)
     apart = (np.abs(np.diff(values, axis=axis)) > _STEEP * step for axis, step in enumerate(spacing))
     share = max(float(one.mean()) for one in apart)
     text = (

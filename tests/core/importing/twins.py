@@ -45,16 +45,23 @@ def _faces() -> tuple[Array, Array]:
 
 
 _SQUARES, _NORMALS = _faces()
+_ARMS = CELL * np.array([[5.0, 1.0, 1.0], [1.0, 3.0, 1.0], [1.0, 1.0, 2.0]])
+"""The highest corners of the three; the lowest of all is the origin."""
 
 
 def tripod(points: Array) -> Array:
     """(...,) signed distances at points (..., 3), positive outside."""
-    low, high = _SQUARES.min(axis=1), _SQUARES.max(axis=1)
-    flat = points.reshape(-1, 1, 3)
-    apart = np.linalg.norm(np.maximum(np.maximum(low - flat, flat - high), 0.0), axis=2).min(axis=1)
-    cells = np.floor(points.reshape(-1, 3) / CELL).astype(int)
-    inside = np.array([tuple(cell) in _CELLS for cell in cells.tolist()])
-    return np.asarray(np.where(inside, -apart, apart).reshape(points.shape[:-1]))
+    flat = points.reshape(-1, 3)
+    found = np.min([_apart(flat, np.zeros(3), arm) for arm in _ARMS], axis=0)
+    inside = np.flatnonzero(found == 0.0)
+    within = [_apart(flat[inside], square.min(axis=0), square.max(axis=0)) for square in _SQUARES]
+    found[inside] = -np.min(within, axis=0)
+    return np.asarray(found.reshape(points.shape[:-1]))
+
+
+def _apart(points: Array, low: Array, high: Array) -> Array:
+    """(N,) distances of points (N, 3) from a box, 0 within."""
+    return np.asarray(np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1))
 
 
 @dataclass(frozen=True, eq=False)
