@@ -167,6 +167,8 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
     for why in report.why:
         if why.startswith("observed"):
             tell(why)
+    for line in report.assumed:
+        tell(f"assumed: {line}")
     warn(report.warnings)
 
 

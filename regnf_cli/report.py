@@ -119,8 +119,11 @@ def show_result(document: dict[str, Any]) -> None:
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
     for name in ("scene", "object"):
-        for warning in ((document.get("fields") or {}).get(name) or {}).get("warnings") or ():
+        notes = (document.get("fields") or {}).get(name) or {}
+        for warning in notes.get("warnings") or ():
             _line("warning", f"{name}: {warning}")
+        for line in notes.get("assumed") or () if verdict == "rejected" else ():
+            _line("assumed", f"{name}: {line}")
     show_pose(document)
     if symmetry := document.get("symmetry"):
         _line("symmetry", symmetry_in_words(symmetry))

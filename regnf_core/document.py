@@ -384,6 +384,11 @@ class FieldNotesDocument(Outgoing):
     warnings: list[str] = Field(
         default=[], description="Warnings of the import. Each begins with a stable word (docs/import-gate.md)."
     )
+    assumed: list[str] = Field(
+        default=[],
+        description="What the file does not state and the import assumed. Each begins with `unit`, `axes`, `sign`, "
+        "`order` or `cameras`.",
+    )
 
 
 class ArtifactEntry(Outgoing):

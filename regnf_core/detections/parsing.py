@@ -1,6 +1,7 @@
 """One parser for every form of a detection: of the command line, of Python and of the HTTP interface.
 
-    {"min": [..], "max": [..]} · [[min], [max]]              an axis-aligned box
+    {"min": [..], "max": [..]}                               an axis-aligned box
+    [[min], [max]]                                           the same, where no center and size is possible: a max <= 0
     {"center": [..], "size": [..]}                           the same by its center and full edge lengths
      + "rotation": 3x3 | {"x":, "y":, "z":, "w":}            box axes to scene axes
      + "rotation_quaternion_xyzw" | "rotation_quaternion_wxyz"
@@ -38,6 +39,7 @@ _ORDER = (
 )
 _TURN = "A rotation by the angle a about z is `rotation_quaternion_xyzw`: [0, 0, sin(a/2), cos(a/2)]."
 _HALF = "Write `size`: the full edge lengths, twice these."
+_EXTENT = "Write `size`: the full edge lengths. They are twice Unity's `extents`."
 _ALONG = "Write `size`: [x, y, z], the full edge lengths along the box's own axes."
 _CORNERS = "Write the lowest and the highest corner: `min`: [x, y, z] and `max`: [x, y, z]."
 INSTEAD = {
@@ -45,6 +47,7 @@ INSTEAD = {
     **dict.fromkeys(("yaw", "heading", "rotation_y", "rotation_z", "angle"), _TURN),
     "euler": "Write `rotation` as a 3x3 matrix: the order of Euler angles is not known.",
     **dict.fromkeys(("half_extents", "half_extent", "half_size"), _HALF),
+    **dict.fromkeys(("extents", "m_Extents", "m_Extent"), _EXTENT),
     "dimensions": "The order of dimensions differs between datasets. Write `size`: [x, y, z], the full edge lengths.",
     "wlh": "Write `size`: [x, y, z], the full edge lengths; for nuScenes' boxes that is [length, width, height].",
     **dict.fromkeys(("lwh", "hwl"), _ALONG),
@@ -57,7 +60,6 @@ INSTEAD = {
             (("lower",), "min"),
             (("upper",), "max"),
             (("position", "location"), "center"),
-            (("extents",), "size"),
             (("rotation_matrix",), "rotation"),
             (("class", "name", "category"), "label"),
             (("confidence", "probability"), "score"),
@@ -70,6 +72,7 @@ FORMS = (
     'Write {"min": [x, y, z], "max": [x, y, z]} or {"center": [x, y, z], "size": [x, y, z], "rotation": [[3], [3], '
     "[3]]}, in the scene's frame and units. docs/api.md lists every form."
 )
+_NAMED = 'Write {"min": [x, y, z], "max": [x, y, z]} for corners, {"center": [x, y, z], "size": [x, y, z]} otherwise.'
 _LEAVE_OUT = "Leave one of the two out."
 _MAX_LABEL = 200
 _LABEL = re.compile(LABEL_PATTERN)
@@ -92,7 +95,10 @@ def parse_detection(values: Any, index: int | None = None) -> Detection:
     """
     values = _chosen(_plain(values), index)
     if isinstance(values, Sequence) and len(values) == 2 and all(isinstance(part, list) for part in values):
-        return _by_corners(values[0], values[1], (0,), (1,), {})
+        box = _by_corners(values[0], values[1], (0,), (1,), {})
+        if all(value > 0 for value in values[1]):
+            raise fault((), "is two lists, which may be corners, or a center and a size", _NAMED)
+        return box
     if not isinstance(values, Mapping):
         raise fault((), f"is {shown(values)}, expected an object with a box", FORMS)
     found = _members(values)
@@ -106,6 +112,8 @@ def parse_detection(values: Any, index: int | None = None) -> Detection:
             other = next((f": `{found[name][0]}` is there" for name in required if name in found), "")
             raise fault((member,), f"is missing{other}", FORMS)
     (first, one), (second, two) = (found[member] for member in required)
+    if second == "extent" and "R" not in values:
+        raise fault((second,), "may be full edge lengths (Open3D, with `R`) or half of them (Unity, Unreal)", _EXTENT)
     if corners:
         return _by_corners(one, two, (first,), (second,), found)
     return Detection(point(one, (first,)), edges(two, (second,)), _rotation(found), **_labels(found))

@@ -53,7 +53,7 @@ class Gate:
         used = None if settings is None else {"trainer": "neus", "files": ["config.yml"], "used": {}}
         told: dict[str, Any] = {"family": "deepsdf", "kind": "sdf", "why": (), "parameters": 1, "plausibility": {}}
         told |= {"bounds": ((0, 0, 0), (1, 1, 1)), "surface_bounds": ((0, 0, 0), (1, 1, 1))}
-        told |= {"warnings": (WARNING,), "label": None, "settings": used}
+        told |= {"warnings": (WARNING,), "assumed": (), "label": None, "settings": used}
         told |= {"field_bytes": 1, "seconds": 0.1, "cpu_seconds": 0.1, "peak_memory_bytes": 1, "isolation": {}}
         return ImportReport(**told)
 
@@ -135,7 +135,7 @@ def test_a_result_repeats_what_the_imports_warned_of(gate: Gate, run: Run, run_f
     fields = json.loads((tmp_path / "out" / "result.json").read_text())["fields"]
     assert (fields["scene"]["warnings"], fields["scene"]["family"]) == ([WARNING], "deepsdf")
     assert fields["scene"]["settings"]["files"] == ["config.yml"]
-    assert fields["object"] == {"family": None, "settings": None, "warnings": []}
+    assert fields["object"] == {"family": None, "settings": None, "warnings": [], "assumed": []}
     assert gate.asked == [{"file": "room.ckpt", "description": None, "settings": b"method: neus\n"}]
     outcome = run(*registration(room, DATA / "armchair.safetensors", "--no-config"))
     assert "settings: " not in outcome.stderr

@@ -177,7 +177,9 @@ def submit(client: httpx.Client, **more: Any) -> str:
     data = {name: field_bytes(name) for name in ("scene", "object")}
     for one in data.values():
         put(client, one)
-    body = {name: sha256(one) for name, one in data.items()} | {"detection": [[0, 0, 0], [1, 1, 1]]} | more
+    body = (
+        {name: sha256(one) for name, one in data.items()} | {"detection": {"min": [0, 0, 0], "max": [1, 1, 1]}} | more
+    )
     answer = client.post("/register", json=body)
     assert answer.status_code == 202, answer.text
     return str(answer.json()["id"])

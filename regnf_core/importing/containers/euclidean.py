@@ -115,6 +115,13 @@ _INNER, _OUTER = 0.3, 0.9
 _BLOCKS, _FEWEST_RATIOS = 1_500, 200
 _EVEN, _ROUND = 1.12, 0.05
 """Ratios as even as this, about a surface with normals to all sides, are of distances that are not projective."""
+_MANY, _FEWEST_PAIRS = 8, 64
+"""Of so many blocks some touch; fewer pairs of voxels tell nothing."""
+_TINY = 1e-30
+_BROKEN, _BEND = 2.2, 0.2
+"""Values bend at the border of a block at most so many times as much as within it and a share of a step's change."""
+_FLAT, _STEEP = 0.7, 5.0
+"""Slopes of fused maps at the surface: projective distances rise by 2 to 3 a unit in the median of rooms."""
 _WHOLE = 0.05
 """Truncations are whole numbers of nodes, and are measured so well."""
 
@@ -166,10 +173,7 @@ def measure_from_surface(values: Float32Array, seen: BoolArray, blocks: IntArray
 def length_of_one(values: Float32Array, seen: BoolArray, blocks: IntArray) -> float | None:
     """How many nodes wide the length is that the value 1 stands for, where the values (B, R, R, R), cut off at 1, are
     distances to the surface; None where they are projective, or too few to tell."""
-    if len(blocks) > _BLOCKS:  # so many near one another
-        middle = blocks[np.random.default_rng(0).integers(len(blocks))]
-        near = np.sort(np.argsort(np.square(blocks - middle).sum(axis=1), kind="stable")[:_BLOCKS])
-        values, seen, blocks = values[near], seen[near], blocks[near]
+    values, seen, blocks = _some(values, seen, blocks)
     surface = crossings(values, seen, blocks)
     chosen = np.flatnonzero(seen & (np.abs(values) > _INNER) & (np.abs(values) < _OUTER))
     if min(len(surface), len(chosen)) < _FEWEST_RATIOS:
@@ -183,6 +187,55 @@ def length_of_one(values: Float32Array, seen: BoolArray, blocks: IntArray) -> fl
     if high > _EVEN * low or np.linalg.eigvalsh(normals.T @ normals / len(normals))[0] < _ROUND:
         return None
     return float(round(ratio)) if abs(ratio - round(ratio)) <= _WHOLE * ratio else ratio
+
+
+def doubts_of_map(
+    values: Float32Array, seen: BoolArray, blocks: IntArray, spacing: float | npt.NDArray[np.float64] | None
+) -> tuple[str, ...]:
+    """Warnings of values (B, X, Y, Z) that do not go on from block to block, or rise by another factor than distances.
+
+    blocks: see :func:`bound_by_surface` · spacing: the same, None for values of no known unit. Ask before it cuts them.
+    """
+    values, seen, blocks = _some(values, seen, blocks)
+    rows, squares, bends, touching = _Rows(blocks), np.zeros(values.shape), [0.0], False
+    step = np.broadcast_to(np.asarray(1.0 if spacing is None else spacing, np.float64), (3,))
+    whole, changes = seen.copy(), np.zeros(seen.shape, np.bool_)
+    for axis in range(3):
+        beside, there = rows.of(blocks + np.eye(3, dtype=np.int64)[axis])
+        beyond, both = _next(values, axis, beside), _next(seen, axis, beside)
+        last, before = _at(axis, -1), _at(axis, -2)
+        both[:, *last] &= there[:, None, None]
+        both &= seen
+        rise = beyond - values
+        if values.shape[axis + 1] > 2:  # how the values bend at the border, and just before it
+            known = both[:, *last] & both[:, *before] & seen[:, *_at(axis, -3)]
+            turns = (rise[:, *last] - rise[:, *before], rise[:, *before] - rise[:, *_at(axis, -3)])
+            at_border, inside = (float(np.abs(turn[known]).mean()) if known.any() else 0.0 for turn in turns)
+            usual = float(np.abs(rise[both]).mean())
+            bends.append(at_border / max(inside + _BEND * usual, _TINY) if known.sum() >= _FEWEST_PAIRS else 0.0)
+        touching |= bool(there.any())
+        both[:, *last] = False
+        whole, changes = whole & both, changes | (both & ((values < 0) != (beyond < 0)))
+        squares += np.square(rise / step[axis])
+    found: list[str] = []
+    if max(bends) > _BROKEN or (len(blocks) >= _MANY and not touching):
+        text = "the values do not go on from block to block: the order of voxels or of block indices may be another one"
+        found.append(f"AXES_UNCERTAIN: {text}")
+    rises = np.sqrt(squares[whole & changes])
+    slope = float(np.median(rises)) if len(rises) >= _FEWEST_PAIRS else 1.0
+    if spacing is not None and not _FLAT <= slope <= _STEEP:
+        text = f"the values rise by {slope:.2g} a unit at the surface: they or the voxel size may be of another unit"
+        found.append(f"GRADIENT_NOT_UNIT: {text}")
+    return tuple(found)
+
+
+def _some(values: Float32Array, seen: BoolArray, blocks: IntArray) -> tuple[Float32Array, BoolArray, IntArray]:
+    """At most so many blocks, near one another."""
+    if len(blocks) <= _BLOCKS:
+        return values, seen, blocks
+    middle = blocks[np.random.default_rng(0).integers(len(blocks))]
+    near = np.sort(np.argsort(np.square(blocks - middle).sum(axis=1), kind="stable")[:_BLOCKS])
+    return values[near], seen[near], blocks[near]
 
 
 def _places(chosen: IntArray, values: Float32Array, blocks: IntArray, step: Float64Array) -> Float64Array:

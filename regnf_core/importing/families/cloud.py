@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import NORMALS
 from regnf_core.importing.cost.mesh_work import FINEST, SPAN, affordable_depth
 from regnf_core.importing.families.cloud_normals import Oriented, fit_their_points, oriented
 from regnf_core.importing.families.cloud_rays import observed_by_rays
@@ -91,7 +92,9 @@ def convert_cloud(
     )
     if depth < FINEST:
         text += f"; it is {width} instead of {1 << FINEST}, because its points fill too many cells"
-    found = replace(found, why=why, warnings=(*found.warnings, *warnings, f"SURFACE_RECONSTRUCTED: {text}"))
+    assumes = geometry.assumes if warnings else (*geometry.assumes, NORMALS)  # warnings tell the side of other normals
+    warnings = (*found.warnings, *warnings, f"SURFACE_RECONSTRUCTED: {text}")
+    found = replace(found, why=why, warnings=warnings, assumes=assumes)
     return found if sensors is None else _observed(found, points, sensors, spacing * diagonal)
 
 

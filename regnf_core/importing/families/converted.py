@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from regnf_core.errors import MOST_CANDIDATES, FieldFormatError
 from regnf_core.importing.arrays import StoredArray
+from regnf_core.importing.assumptions import UNSAID, Assumptions
 from regnf_core.schema.description import FREE, OBSERVATION, UNSEEN, ObservationGrid
 
 
@@ -82,6 +83,8 @@ class ConvertedField:
     """Functions between which no behavior decides: a person is asked, once the readings are settled."""
     sign_is_open: bool = False
     """Whether trainers of this family save fields of either sign, and the upload does not say which this is."""
+    assumes: Assumptions = UNSAID
+    """What the file does not say and was taken for granted; see :mod:`regnf_core.importing.assumptions`."""
 
     @property
     def reading(self) -> Reading:

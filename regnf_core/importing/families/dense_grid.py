@@ -5,12 +5,21 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
-from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface, filled_nodes, stored_weights
+from regnf_core.importing.assumptions import GRID, UNSAID
+from regnf_core.importing.containers.euclidean import (
+    PROJECTIVE,
+    bound_by_surface,
+    doubts_of_map,
+    filled_nodes,
+    stored_weights,
+)
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family, shared_entries
@@ -22,6 +31,12 @@ _VALUES = ("sdf", "values")
 _WEIGHTS = ("weight", "weights")
 _SPACINGS = ("spacing", "voxel_size")
 _Vector = npt.NDArray[np.float64]
+_NEAREST, _COMPARED = 0.2, 4_000
+"""The slopes are compared at about so many nodes, of this share that is nearest to the surface."""
+_STEEP, _JUMPING = 1.5, 0.1
+"""Values of so large a share of the neighbors that differ by so many times their distance are no distances."""
+_OFF = 0.1
+"""Slopes that are this near to 1, in the median, leave no doubt about the axes."""
 
 
 def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField | None:
@@ -71,7 +86,9 @@ def grid_field(
         "spacing": spacing.tolist(),
         "source": {"family": FAMILY},
     }
+    warnings = (*_other_axes(values, spacing, None if weights is None else weights > 0), *_jumps(values, spacing))
     if weights is not None:
+        warnings = doubts_of_map(values[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing)
         tensors["values"] = bounded = np.array(values, np.float32)
         if bound_by_surface(bounded[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing):
             why = (*why, PROJECTIVE)
@@ -81,7 +98,46 @@ def grid_field(
             *why,
             f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were observed; the others are free space",
         )
-    return ConvertedField(FAMILY, why, description, tensors, sign_is_open=True)
+    return ConvertedField(FAMILY, why, description, tensors, warnings, sign_is_open=True, assumes=(*UNSAID, GRID))
+
+
+def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.bool_] | None) -> tuple[str, ...]:
+    """A warning where distances rise by one a unit only if the array's axes are others than x, y, z."""
+    inner = np.abs(values[1:-1, 1:-1, 1:-1])
+    if np.ptp(spacing) <= 1e-6 * spacing.max() or not inner.size:
+        return ()
+    near = inner <= np.quantile(inner, _NEAREST)
+    if seen is not None:
+        near &= seen[1:-1, 1:-1, 1:-1]
+    at = np.argwhere(near)[:: max(1, int(near.sum()) // _COMPARED)] + 1  # (N, 3)
+    if not len(at):
+        return ()
+    steps = np.eye(3, dtype=np.int64)
+    rises = [(values[tuple((at + one).T)] - values[tuple((at - one).T)]).astype(np.float64) / 2.0 for one in steps]
+    off: dict[str, float] = {}
+    for order in itertools.permutations(range(3)):  # the array's axis i lies along order[i]
+        slopes = np.sqrt(sum((rise / spacing[axis]) ** 2 for rise, axis in zip(rises, order, strict=True)))
+        off["".join("xyz"[axis] for axis in order)] = float(np.median(np.abs(slopes - 1.0)))
+    best = min(off, key=lambda name: off[name])
+    if off["xyz"] < _OFF or off[best] > off["xyz"] / 3.0:
+        return ()
+    text = (
+        f"the distances fit the spacing better if the array's axes are {', '.join(best)}; they were read as x, y, z. "
+        f"Transpose the array if that is wrong"
+    )
+    return (f"AXES_UNCERTAIN: {text}",)
+
+
+def _jumps(values: Float32Array, spacing: _Vector) -> tuple[str, ...]:
+    """A warning of neighbors whose values differ by more than a distance can between them."""
+    if len(np.unique(values.reshape(-1)[:_COMPARED])) <= 2 and len(np.unique(values)) <= 2:
+        return ("GRADIENT_NOT_UNIT: the array has two values: it says what is inside, and not how far away it is",)
+    apart = (np.abs(np.diff(values, axis=axis)) > _STEEP * step for axis, step in enumerate(spacing))
+    share = max(float(one.mean()) for one in apart)
+    text = (
+        f"at {100 * share:.0f} % of the nodes along an axis values differ by more than {_STEEP:g} times their distance"
+    )
+    return (f"GRADIENT_NOT_UNIT: {text}: check the array's shape and order",) if share > _JUMPING else ()
 
 
 def _weights(arrays: ArraySource, shape: tuple[int, ...]) -> Float32Array | None:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import DatasetError, FieldFormatError
+from regnf_core.importing.assumptions import GLTF, PLACES, RUB, UNIT, Assumptions
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families import voxel_block_grid
 from regnf_core.importing.families.converted import ConvertedField, observed_field
@@ -41,6 +42,8 @@ from regnf_core.schema.description import FREE, SURFACE, UNSEEN, ObservationGrid
 from regnf_core.schema.similarity import local_origin, shift_rows
 
 FAMILY = "gaussian_splats"
+ASSUMPTIONS = {"spz": (UNIT, RUB), "sog": (UNIT, RUB), "glb": GLTF, "gltf": GLTF}
+"""Of formats that define more than numbers."""
 _VOXELS = 256
 """Along the longest edge of the region."""
 _TRUNCATION = 4.0
@@ -73,9 +76,15 @@ def read_splats(format_: str, data: memoryview, siblings: Siblings, node: str | 
 
 
 def convert_splats(
-    splats: Splats, origin: str, overrides: UploadDescription, cameras: Trajectory | None, tensor_bytes: int
+    splats: Splats,
+    origin: str,
+    overrides: UploadDescription,
+    cameras: Trajectory | None,
+    tensor_bytes: int,
+    assumes: Assumptions = PLACES,
 ) -> ConvertedField:
-    """The field of Gaussians. origin: what they were read from · cameras: of their training.
+    """The field of Gaussians. origin: what they were read from · cameras: of their training ·
+    assumes: what their file does not say.
 
     Raises FieldFormatError: MESH_INVALID, NO_ZERO_LEVEL where no camera sees a surface, and what ``overrides`` is
     refused for.
@@ -122,7 +131,7 @@ def convert_splats(
         entries = {name: description[name] for name in ("bounds", "world_scale")}
         entries["bounds"] = [(np.array(corner) + scale * shift).tolist() for corner in entries["bounds"]]
         description |= entries_at(entries, near)
-    found = replace(fused, family=FAMILY, why=why, description=description, warnings=tuple(warnings))
+    found = replace(fused, family=FAMILY, why=why, description=description, warnings=tuple(warnings), assumes=assumes)
     return observed_field(found, *_observation(views, region, voxel, alone), f"in depths of {len(placed)} views")
 
 

@@ -9,11 +9,13 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
+from regnf_core.importing.assumptions import AXES, METERS, SIGN
 from regnf_core.importing.containers.euclidean import (
     PROJECTIVE,
     BoolArray,
     IntArray,
     bound_by_surface,
+    doubts_of_map,
     fill_unseen,
     near_blocks,
     seen_extent,
@@ -46,6 +48,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
     blocks, values, weights = _read(tables, layer, tensor_bytes)
     blocks, origin = near_blocks(blocks, _EDGE * voxel_size)
     seen: BoolArray = weights > 0
+    doubts = doubts_of_map(values, seen, blocks, voxel_size)
     projective = bound_by_surface(values, seen, blocks, voxel_size)
     fill_unseen(values, seen, voxel_size, overrides.sign or 1)
     middle = voxel_size / 2.0
@@ -65,7 +68,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
         why = (*why, PROJECTIVE)
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.astype(np.int32)}
     tensors["weights"] = stored_weights(weights)
-    return ConvertedField(FAMILY, why, description, tensors)
+    return ConvertedField(FAMILY, why, description, tensors, doubts, assumes=(METERS, AXES, SIGN))
 
 
 def _layer(tables: TableSource) -> str:

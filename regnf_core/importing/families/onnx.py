@@ -10,6 +10,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
+from regnf_core.importing.assumptions import INPUTS, UNSAID
 from regnf_core.importing.families.converted import Assumed, ConvertedField
 from regnf_core.importing.families.layers import (
     UNIT_CUBE,
@@ -62,7 +63,8 @@ def convert_onnx(data: memoryview, tensor_bytes: int, overrides: UploadDescripti
         if overrides.bounds
         else ("BOUNDS_ASSUMED: [-1, 1]^3; if the field's region is another, give the import option bounds",)
     )
-    converted = ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
+    assumes = (*UNSAID, INPUTS)
+    converted = ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True, assumes=assumes)
     if column is None or overrides.output_column is not None:
         return converted
     return replace(converted, assumed=Assumed({"output_column": column}))

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.field_notes import WARNINGS, kept_warnings
+from regnf_core.field_notes import ASSUMED, WARNINGS, kept_assumptions, kept_warnings
 from regnf_core.importing.arrays import StoredArray
+from regnf_core.importing.assumptions import PLACES
 from regnf_core.importing.containers.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import refuse_other_entries, require_family
@@ -43,7 +44,8 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, override
         tensors = split_color(tensors)[0]
     source = dict(description["source"])
     warnings = kept_warnings(source.pop(WARNINGS, None))  # the import writes them again
-    return ConvertedField(FAMILY, why, description | {"source": source}, tensors, warnings)
+    assumes = kept_assumptions(source.pop(ASSUMED, None))
+    return ConvertedField(FAMILY, why, description | {"source": source}, tensors, warnings, assumes=assumes or PLACES)
 
 
 def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dict[str, Any]:

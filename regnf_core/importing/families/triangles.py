@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import FACES
 from regnf_core.importing.cost.mesh_work import mesh_seconds, require_within
 from regnf_core.importing.families.color.head import with_values
 from regnf_core.importing.families.converted import ConvertedField
@@ -223,6 +224,7 @@ def mesh_field(
         },
         {"vertices": solid.vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
         solid.warnings,
+        assumes=(*(() if loose == 0.0 else (FACES,)), *geometry.assumes),
     )
     colors = None if overrides.color.keep is False else geometry.colors
     return with_values(converted, lambda: None if colors is None else colors[solid.kept].astype(np.float16))

@@ -15,6 +15,7 @@ from regnf_core.importing.containers.euclidean import (
     PROJECTIVE,
     IntArray,
     bound_by_surface,
+    doubts_of_map,
     fill_unseen,
     length_of_one,
     measure_from_surface,
@@ -140,15 +141,17 @@ def _distances(
             why = f"truncation of {voxels:g} voxels: by the distances to the surface"
     if truncation is not None:
         values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
+        doubts = doubts_of_map(values, seen, blocks.keys, size)
         projective = bound_by_surface(values, seen, blocks.keys, size)
-        return values, ((why, PROJECTIVE) if projective else (why,)), ()
+        return values, ((why, PROJECTIVE) if projective else (why,)), doubts
+    doubts = doubts_of_map(blocks.tsdf, seen, blocks.keys, None)
     measure_from_surface(blocks.tsdf, seen, blocks.keys, size, _USUAL * size)
     why = f"truncation of {_USUAL:g} voxels, Open3D's default: the values do not determine it"
     text = f"the truncation is not in the file: distances are measured from the surface, up to {_USUAL * size:.4g} "
     text += (
         f"({_USUAL:g} voxels, Open3D's default); if it was fused with another one, give the import option truncation"
     )
-    return blocks.tsdf, (why,), (f"TRUNCATION_ASSUMED: {text}",)
+    return blocks.tsdf, (why,), (*doubts, f"TRUNCATION_ASSUMED: {text}")
 
 
 def _attribute(arrays: ArraySource, name: str) -> str:

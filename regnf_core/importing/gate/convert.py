@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
-from regnf_core.field_notes import WARNINGS, kept_warnings
+from regnf_core.field_notes import ASSUMED, WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import (
     GAUSSIANS,
     HEAD_BYTES,
@@ -95,7 +95,8 @@ def convert_file(
     # Of warnings with the same word the last: a regnf field file brings those of its first import.
     latest = {warning.partition(":")[0]: warning for warning in (*warnings, *more)}
     warned = list(kept_warnings(list(latest.values())))
-    add_to_source(target, {WARNINGS: warned} if warned else {})
+    notes = {WARNINGS: warned, ASSUMED: reported[ASSUMED]}
+    add_to_source(target, {name: lines for name, lines in notes.items() if lines})
     told = {"plausibility": measured, "surface_bounds": surface, "warnings": warned, "settings": read.settings}
     return {**reported, **told}
 
@@ -108,6 +109,7 @@ def _stored(
     Returns values of the report, warnings, the sign where nobody has said it, whether the values will tell it, and the
     up axis. Raises FieldFormatError.
     """
+    from regnf_core.importing.assumptions import left_open
     from regnf_core.importing.families import safe_field
     from regnf_core.importing.gate.cost_estimate import affordable_share, require_affordable, with_affordable_color
     from regnf_core.importing.gate.observed import observed
@@ -136,6 +138,7 @@ def _stored(
         "bounds": said["bounds"],
         "parameters": sum(array.size for name, array in own.items() if name not in _SEEN),
         "label": said["label"],
+        ASSUMED: list(left_open(converted.assumes, read.description)),
     }
     # A mesh's faces say it, and a regnf field file was imported before.
     known = (

@@ -291,6 +291,7 @@ def _report(
             parameters=int(values["parameters"]),
             plausibility={str(key): _finite(value) for key, value in values["plausibility"].items()},
             warnings=(*map(str, values["warnings"]), *_isolation_warnings(isolation)),
+            assumed=tuple(map(str, values["assumed"])),
             label=None if values["label"] is None else str(values["label"]),
             settings=_settings(values.get("settings")),
             field_bytes=size,

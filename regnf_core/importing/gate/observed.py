@@ -62,8 +62,8 @@ def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, 
         if required:
             raise
         return with_unused_cameras(converted, str(error))
-    if doubt is not None:
-        converted = replace(converted, warnings=(*converted.warnings, doubt))
+    told = converted.warnings if doubt is None else (*converted.warnings, doubt)
+    converted = replace(converted, warnings=told, assumes=(*converted.assumes, *read.cameras.assumes))
     return observed_field(converted, grid, words, f"by lines of sight from {len(read.cameras)} cameras")
 
 

@@ -107,6 +107,8 @@ _SAME = 1e-3
 _SURFACE_SHARE = 1e-3
 """A point counts as on the surface when its |distance| is below this share of the bounds' diagonal."""
 _GRADIENT_RANGE = (0.5, 2.0)
+_EVEN, _SCALED = 1.15, 0.15
+"""Slopes that differ this little are those of distances in one unit; this far from 1, it is not the bounds' unit."""
 _PLAUSIBLE = (0.1, 10.0)
 """Beyond these slopes distances are of no use. Trained fields are known from 0.2 (a loss that clamps them) to 2."""
 _MIN_SLOPE = 1e-6  # a field of any unit may be uploaded: only a gradient of zero is left out; the steps are bounded
@@ -253,8 +255,9 @@ def _require_finite(values: Tensor) -> None:
 
 def _warnings(measured: dict[str, float]) -> list[str]:
     warnings = []
-    median = measured["gradient_median"]
-    if not _GRADIENT_RANGE[0] <= median <= _GRADIENT_RANGE[1]:
+    low, median, high = (measured[f"gradient_{which}"] for which in ("p10", "median", "p90"))
+    even = high < _EVEN * low and abs(median - 1.0) > _SCALED
+    if even or not _GRADIENT_RANGE[0] <= median <= _GRADIENT_RANGE[1]:
         text = (
             f"the gradient's norm at the surface is {median:.2f}, not about 1: the family or the hash grid may be wrong"
         )

@@ -114,7 +114,8 @@ def _read_splats(
     kind: str, opened: OpenedUpload, said: UploadDescription, given: Trajectory | None, limits: ImportLimits
 ) -> ReadUpload:
     """By the cameras that came with them, or those that the trainer of 3DGS keeps beside them, in the same frame."""
-    from regnf_core.importing.families.gaussian_splats import convert_splats, read_splats
+    from regnf_core.importing.assumptions import PLACES
+    from regnf_core.importing.families.gaussian_splats import ASSUMPTIONS, convert_splats, read_splats
     from regnf_core.importing.observing.reading import read_trajectory
     from regnf_core.importing.run.opened import TRAINED_CAMERAS
 
@@ -122,7 +123,7 @@ def _read_splats(
     cameras = given or (read_trajectory(beside, said.cameras) if beside else None)
     origin = f"a {kind} file" if opened.name is None else opened.name[-200:]
     splats = read_splats(kind, opened.data, opened.siblings, said.node)
-    converted = convert_splats(splats, origin, said, cameras, limits.tensor_bytes)
+    converted = convert_splats(splats, origin, said, cameras, limits.tensor_bytes, ASSUMPTIONS.get(kind, PLACES))
     return ReadUpload(converted, said, None, None)
 
 

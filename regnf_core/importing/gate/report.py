@@ -101,6 +101,8 @@ class ImportReport:
     """What was measured of the evaluated field; see ``plausibility``."""
     warnings: tuple[str, ...]
     """Each begins with a stable UPPER_SNAKE word and a colon."""
+    assumed: tuple[str, ...]
+    """What the file does not state; see :mod:`regnf_core.importing.assumptions`."""
     label: str | None
     settings: dict[str, Any] | None
     """The trainer's settings that counted: ``trainer``, ``files`` (their names) and ``used`` (entries of a description,

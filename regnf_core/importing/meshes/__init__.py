@@ -5,7 +5,6 @@ USD and Draco are read by libraries, which an optional extra brings."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from regnf_core.importing.meshes.e57 import read_e57
@@ -39,11 +38,6 @@ _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
     "stl": read_stl,
     "xyz": read_xyz,
 }
-_UNITS = {
-    **dict.fromkeys(("glb", "gltf"), "the unit is meter, as glTF specifies"),
-    **dict.fromkeys(("obj", "ply", "stl"), "the file states no unit"),
-}
-"""What is told of the unit of formats that always have the same, or none."""
 _AT_FIXED_BYTES = frozenset({"3mf", "glb", "las", "npy", "stl", "usd"})
 _BLANK, _MOST_BLANKS = b"\xef\xbb\xbf \t\r\n", 4096
 MESH_READERS = (*_WHOLE, *_OF_NODES, "e57")
@@ -71,8 +65,6 @@ def read_mesh(
         head = bytes(data[:_MOST_BLANKS])
         data = data[len(head) - len(head.lstrip(_BLANK)) :]
     if format_ in _OF_NODES:
-        found = _OF_NODES[format_](data, siblings or {}, node)
-    else:
-        refuse_node(node, format_)
-        found = _WHOLE[format_](data)
-    return replace(found, notes=(*found.notes, *([_UNITS[format_]] if format_ in _UNITS else [])))
+        return _OF_NODES[format_](data, siblings or {}, node)
+    refuse_node(node, format_)
+    return _WHOLE[format_](data)

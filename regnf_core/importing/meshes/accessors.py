@@ -25,6 +25,8 @@ from regnf_core.importing.meshes.triangle_files import (
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _MAX_ITEMS = 3 * MAX_TRIANGLES
+_DENIED_BY = 1e-3
+"""A stated range that differs by so large a share of its largest number is not that of the numbers."""
 DRACO = "KHR_draco_mesh_compression"
 MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 TRIANGLES = 4
@@ -91,6 +93,16 @@ class Accessors:
             self._decoded[_whole(primitive["indices"])] = np.asarray(mesh.faces, np.float64).reshape(-1, 1)
         except (library.FileTypeException, AttributeError, RuntimeError, ValueError) as error:
             raise malformed("the glTF file's mesh is no sound Draco data") from error
+
+    def denies(self, number: object) -> bool:
+        """Whether the lowest and highest corner that an accessor states are not those of its numbers (N, 3)."""
+        accessor = self._accessors[_whole(number)]
+        told = "bufferView" in accessor and "sparse" not in accessor and "min" in accessor and "max" in accessor
+        if not told or not accessor["count"] or accessor.get("normalized"):
+            return False
+        items, stated = self.array(number, 3), np.array([accessor["min"], accessor["max"]], np.float64)
+        found = np.stack([items.min(axis=0), items.max(axis=0)])
+        return bool(np.abs(found - stated).max() > _DENIED_BY * np.abs(stated).max())
 
     def _items(self, said: dict[str, Any], component: str, count: int, width: int) -> Float64Array:
         """(count, width) numbers of a buffer view, from a byte offset on."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from regnf_core.importing.assumptions import METERS, SCENE
 from regnf_core.importing.meshes.thinning import Thinning
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, unsupported
 
@@ -73,7 +74,13 @@ def _read(libe57: Any, file: Any, scans: list[Any]) -> Geometry:
         raise malformed(f"the E57 file ends before the {thinning.count} points of its scans")
     sensor = np.concatenate(sensors)
     known = sensor if np.isfinite(sensor).any() else None
-    return Geometry(np.concatenate(points), np.zeros((0, 3), np.int64), left_out=thinning.left_out, sensor=known)
+    return Geometry(
+        np.concatenate(points),
+        np.zeros((0, 3), np.int64),
+        left_out=thinning.left_out,
+        sensor=known,
+        assumes=(METERS, SCENE),
+    )
 
 
 def _places(is_spherical: bool, columns: Float64Array) -> Float64Array:

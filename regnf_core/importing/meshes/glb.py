@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import GLTF
 from regnf_core.importing.meshes.accessors import DRACO, MESHOPT, TRIANGLES, Accessors
 from regnf_core.importing.meshes.scene import MAX_NODES, Nodes, Part, assembled
 from regnf_core.importing.meshes.triangle_files import (
@@ -210,6 +211,7 @@ def _rotations(quaternions: npt.NDArray[np.float64]) -> Float64Array:
 _HEADER, _CHUNK_HEADER = 12, 8
 _JSON, _BIN = b"JSON", b"BIN\0"
 _MAX_JSON = 64 << 20
+_DENIED = "the min and max of POSITION, which contradict its numbers"
 _IGNORED = {"animations": "animations", "images": "textures"}
 _APPLIED = frozenset({INSTANCES, VISIBILITY, CENTER, DRACO, *MESHOPT})
 _NO_SHAPE = (
@@ -291,16 +293,18 @@ def _scene(document: dict[str, Any], accessors: Accessors, asked: str | None) ->
         raise unsupported(f"the glTF file needs the extension {unknown[0]}, which is not read: export it without")
     flat: set[str] = set()
     placed, notes = placed_meshes(document, accessors, asked)
-    found = assembled(_parts(document, accessors, placed, flat), notes=notes)
+    doubts: set[str] = set()
+    found = assembled(_parts(document, accessors, placed, flat, doubts), notes=notes)
     return replace(
         found,
         left_out=(*sorted(flat), *(word for key, word in _IGNORED.items() if document.get(key))),
-        not_applied=tuple(f"extension {name}" for name in used if name not in _APPLIED),
+        not_applied=(*(f"extension {name}" for name in used if name not in _APPLIED), *sorted(doubts)),
+        assumes=GLTF,
     )
 
 
 def _parts(
-    document: dict[str, Any], accessors: Accessors, placed: Iterable[PlacedMesh], flat: set[str]
+    document: dict[str, Any], accessors: Accessors, placed: Iterable[PlacedMesh], flat: set[str], doubts: set[str]
 ) -> Iterator[Part]:
     """The triangles of each primitive of the meshes, at their places; what else there is goes to ``flat``."""
     for one in placed:
@@ -310,6 +314,8 @@ def _parts(
                 flat.add("points" if mode == 0 else "lines")
                 continue
             accessors.unpack(primitive)
+            if accessors.denies(primitive["attributes"]["POSITION"]):
+                doubts.add(_DENIED)
             places = _morphed(primitive, one.weights or mesh.get("weights"), accessors)
             corners = _triangles(primitive, accessors, len(places))
             painted = _primitive_colors(document, primitive, accessors, len(places))

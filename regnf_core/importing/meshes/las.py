@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 
+from regnf_core.importing.assumptions import AXES, LAS
 from regnf_core.importing.meshes.thinning import Thinning
 from regnf_core.importing.meshes.triangle_files import Geometry, malformed, unsupported
 
@@ -45,7 +46,7 @@ def read_las(data: memoryview) -> Geometry:
     found = np.concatenate(points) if points else np.zeros((0, 3))
     if read < count:
         raise malformed(f"the LAS file ends before the {count} points of its header")
-    return Geometry(found, np.zeros((0, 3), np.int64), left_out=thinning.left_out)
+    return Geometry(found, np.zeros((0, 3), np.int64), left_out=thinning.left_out, assumes=(LAS, AXES))
 
 
 def _require_header(data: memoryview) -> None:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import PLACES
 from regnf_core.importing.containers.npz import array_header
 from regnf_core.importing.meshes.thinning import Thinning, lines_of, rows_of_text
-from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, unsupported
+from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, not_numbers, unsupported
 
 # LZF, the compression of PCD files, by its published layout: literals, and copies of what was unpacked before.
 
@@ -181,6 +182,7 @@ def _columns_of(header: _Header, body: memoryview) -> dict[str, Any]:
 # Points in lines of numbers: .xyz, .pts, .txt. Which columns are the normals is told by their length of one.
 
 _COMMENT = re.compile(rb"(?:#|//)[^\n]*")
+_DECIMAL_COMMA = re.compile(rb"\d,\d+[ \t;]+-?\d+,\d")
 _MOST_COLUMNS = 16
 _SEPARATORS = bytes.maketrans(b",;", b"  ")
 _FIRST_LINES = 1 << 16
@@ -193,8 +195,11 @@ _SHARE = 0.9
 
 def read_xyz(data: memoryview) -> Geometry:
     """The points of a text file. Raises FieldFormatError: MESH_INVALID."""
+    head = bytes(data[:_FIRST_LINES])
+    if b"." not in head and _DECIMAL_COMMA.search(head):
+        raise not_numbers("the numbers of the points have commas", head)
     columns = start = at = 0
-    for line in bytes(data[:_FIRST_LINES]).splitlines(keepends=True):
+    for line in head.splitlines(keepends=True):
         at += len(line)
         columns = len(_plain(line).split())
         if columns == 1 and not start:  # .pts begins with the number of points
@@ -208,7 +213,11 @@ def read_xyz(data: memoryview) -> Geometry:
     rows, _ = rows_of_text(body, columns, thinning, "point", _plain)
     if _are_poses(rows):
         raise malformed("the lines are camera poses (KITTI or TUM), not points; give camera poses with --cameras")
-    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), _normals(rows), left_out=thinning.left_out)
+    first = _normals_at(rows)
+    told = "" if first is None else f", columns {first + 1} to {first + 3} are normals, as their length is 1"
+    assumes = (*PLACES, f"order: columns 1 to 3 are x, y, z{told}")
+    normals = None if first is None else rows[:, first : first + 3]
+    return Geometry(rows[:, :3], np.zeros((0, 3), np.int64), normals, left_out=thinning.left_out, assumes=assumes)
 
 
 def _plain(text: bytes) -> bytes:
@@ -233,13 +242,10 @@ def _of_length_one(rows: Float64Array) -> bool:
     return len(rows) > 0 and bool((np.abs(np.linalg.norm(rows, axis=1) - 1.0) < _UNIT).mean() >= _SHARE)
 
 
-def _normals(rows: Float64Array) -> Float64Array | None:
-    """The three neighboring columns behind the place whose rows have length one; None where there are none."""
-    for start in range(3, rows.shape[1] - 2):
-        found = rows[:, start : start + 3]
-        if _of_length_one(found):
-            return found
-    return None
+def _normals_at(rows: Float64Array) -> int | None:
+    """The first of three neighboring columns behind the place whose rows have length one; None: there are none."""
+    starts = range(3, rows.shape[1] - 2)
+    return next((start for start in starts if _of_length_one(rows[:, start : start + 3])), None)
 
 
 # A bare .npy array: (N, 3) points, or (N, 6) with their normals.
@@ -257,4 +263,6 @@ def read_npy(data: memoryview) -> Geometry:
     thinning = Thinning(shape[0])
     rows = np.frombuffer(data[start:], dtype).reshape(shape, order="F" if fortran_order else "C")
     found = rows[thinning.kept(0, shape[0])].astype(np.float64)
-    return Geometry(found[:, :3], np.zeros((0, 3), np.int64), _normals(found), left_out=thinning.left_out)
+    normals = found[:, 3:] if shape[1] == 6 and _of_length_one(found[:, 3:]) else None
+    assumes = (*PLACES, "order: columns 1 to 3 are x, y, z" + (", columns 4 to 6 are normals" if shape[1] == 6 else ""))
+    return Geometry(found[:, :3], np.zeros((0, 3), np.int64), normals, left_out=thinning.left_out, assumes=assumes)

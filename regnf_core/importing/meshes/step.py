@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from regnf_core.importing.assumptions import SCENE
 from regnf_core.importing.meshes.glb import read_glb
 from regnf_core.importing.meshes.scene import in_meters, required
 from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, malformed
@@ -33,7 +34,7 @@ def read_step(data: memoryview, _: Siblings | None = None, node: str | None = No
         raise malformed("the STEP file has no surface")
     found = _triangles(data, node, {"tol_linear": _DEVIATION * _MM * diagonal, "tol_angular": _TURN})
     finer = f"its curved faces are triangles within {100.0 * _DEVIATION:g} % of its diagonal"
-    return replace(found, notes=(*found.notes, _unit(bytes(data)), finer))
+    return replace(found, assumes=(SCENE,), notes=(*found.notes, _unit(bytes(data)), finer))
 
 
 def _triangles(data: memoryview, node: str | None, tolerances: dict[str, float]) -> Geometry:

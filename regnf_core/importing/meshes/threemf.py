@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from regnf_core.importing.assumptions import SCENE
 from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members, require_modest
 from regnf_core.importing.meshes.scene import INSTEAD, Nodes, Part, PlainXml, assembled, in_meters, parsed
 from regnf_core.importing.meshes.triangle_files import (
@@ -110,7 +111,7 @@ def read_3mf(data: memoryview, _: Siblings | None = None, node: str | None = Non
     scale = np.diag([*3 * [_UNITS[main.unit]], 1.0])
     parts = (_part(thing, scale @ place) for number, thing, place in placed if read[number])
     other = tuple(sorted(package.other))
-    return assembled(parts, notes=(*notes, in_meters(main.unit)), not_applied=other)
+    return assembled(parts, assumes=(SCENE,), notes=(*notes, in_meters(main.unit)), not_applied=other)
 
 
 def _part(thing: _Object, place: Float64Array) -> Part:

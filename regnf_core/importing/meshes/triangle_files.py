@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import PLACES, Assumptions
 from regnf_core.schema.description import Axis
 
 Float64Array = npt.NDArray[np.float64]
@@ -45,6 +46,8 @@ class Geometry:
     """The axis that points up, where the file says so."""
     notes: tuple[str, ...] = ()
     """What is told about the file's unit and its nodes, one short sentence each."""
+    assumes: Assumptions = PLACES
+    """What the file does not say and was taken for granted."""
 
 
 def not_numbers(message: str, text: bytes) -> FieldFormatError:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import METERS, SCENE
 from regnf_core.importing.containers.sniff import HEAD_BYTES, MESH_FORMATS, explain_refusal, sniff_format
 from regnf_core.importing.meshes.scene import Nodes, Part, PlainXml, assembled, parsed, solid
 from regnf_core.importing.meshes.triangle_files import (
@@ -55,7 +56,7 @@ def read_urdf(data: memoryview, siblings: Siblings, node: str | None, read: Read
         if chosen[number]
         for shape in _shapes(links[name])
     )
-    return assembled(parts, notes=(*notes, "the unit is meter, as URDF specifies"))
+    return assembled(parts, assumes=(METERS, SCENE), notes=notes)
 
 
 def mesh_names(data: memoryview) -> list[str]:

@@ -137,7 +137,7 @@ class _Scene:
         up = str(self._geom.GetStageUpAxis(stage)).lower() if said("upAxis") else None
         told = (*notes, unit if said("metersPerUnit") else "the file states no unit")
         lost = ["references to files that did not come with it"] * missing
-        found = assembled(parts, up_axis=up, notes=told)
+        found = assembled(parts, up_axis=up, notes=told, assumes=())
         return replace(found, not_applied=(*sorted(self._other), *lost))
 
     def _find(self, root: Any, places: Float64Array, above: int) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.assumptions import Assumptions
 
 if TYPE_CHECKING:
     from regnf_core.geometry.pinhole import PinholeCameras
@@ -56,6 +57,13 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def assumes(self) -> Assumptions:
+        """What the file does not say of its poses."""
+        frame = "poses are in the frame and unit of the field, or of its dataset where that is known"
+        more = f"; camera to world, with {self.axes}'s axes; quaternions are x, y, z, w"
+        return (f"cameras: {frame}{'' if self.axes is None else more}",)
 
     def pinhole(self) -> PinholeCameras:
         """The cameras in the file's world."""

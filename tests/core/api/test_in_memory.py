@@ -21,6 +21,7 @@ BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 V, F = np.asarray(BALL.vertices), np.asarray(BALL.faces)
 NAMES = "from_mesh, from_points, from_grid or from_function"
 CUBE = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
+BOX = {"min": CUBE[0], "max": CUBE[1]}
 POINTS = torch.from_numpy(np.random.default_rng(0).uniform(-0.7, 0.7, (200, 3))).float()
 GRID = np.linalg.norm(np.stack(np.meshgrid(*[np.linspace(-1, 1, 17)] * 3, indexing="ij"), -1), axis=-1) - 0.5
 
@@ -137,7 +138,7 @@ def test_a_function_is_a_field(function: Callable[[Tensor], Any], sign: int) -> 
             (lambda thing=thing: regnf.open_field(thing), "NO_FIELD", NAMES)
             for thing in (V, {"a": 1}, b"x", None, 3, torch.nn.Linear(3, 1), trimesh.Trimesh, [V, F])
         ),
-        (lambda: regnf.register(BALL, {"a": 1}, CUBE), "NO_FIELD", "the object is of the type dict"),
+        (lambda: regnf.register(BALL, {"a": 1}, BOX), "NO_FIELD", "the object is of the type dict"),
     ],
 )
 def test_what_is_no_field_is_refused_in_words(make: Callable[[], object], reason: str, says: str) -> None:
@@ -232,6 +233,6 @@ def test_what_is_refused_is_refused_before_a_large_file_is_imported(
         str(tmp_path / "cloud.ply"), open3d.geometry.PointCloud(open3d.utility.Vector3dVector(V[:20]))
     )
     with pytest.raises(regnf.RegnfError) as caught:
-        ask(tmp_path / "room.ply", tmp_path / "cloud.ply", CUBE)
+        ask(tmp_path / "room.ply", tmp_path / "cloud.ply", BOX)
     assert caught.value.reason in ("POINT_CLOUD_TOO_SMALL", "NO_FIELD")
     assert "room.ply" not in imported

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import random
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,12 +30,9 @@ TURNED = OrientedBox(torch.tensor([1.0, 2, 3]), torch.tensor([4.0, 5, 6]), torch
     "values",
     [
         {"min": [0, 0, 0], "max": [1, 2, 3]},
-        [[0, 0, 0], [1, 2, 3]],
-        ((0, 0, 0), (1, 2, 3)),
-        np.array([[0, 0, 0], [1, 2, 3]]),
         {"min_bound": [0, 0, 0], "max_bound": [1, 2, 3], "class_name": "AxisAlignedBoundingBox"},
         {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 2, "z": 3}},
-        {"center": np.array([0.5, 1.0, 1.5]), "extent": torch.tensor([1, 2, 3])},
+        {"center": np.array([0.5, 1.0, 1.5]), "extent": torch.tensor([1, 2, 3]), "R": np.eye(3)},
         {"center": {"x": 0.5, "y": 1, "z": 1.5}, "size": {"x": 1, "y": 2, "z": 3}},
         {"center": [0.5, 1.0, 1.5], "size": [1, 2, 3], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"center": [0.5, 1.0, 1.5], "size": [1, 2, 3], "label": None, "score": None},
@@ -100,7 +98,8 @@ def test_every_rotation_matrix_is_read_as_it_is(seed: int) -> None:
         (UNIT | {"color": 1}, ("color",), "detection.color", ""),
         (UNIT | {"extent": [0, 0, 0]}, ("extent",), "is given twice, also as `size`", "Leave one"),
         ({"centre": [0, 0, 0], "size": [1, 1, 1]}, ("centre",), "", "Did you mean `center`?"),
-        ({"center": [0, 0, 0], "extents": [1, 1, 1]}, ("extents",), "", "Did you mean `size`?"),
+        ({"center": [0, 0, 0], "extents": [1, 1, 1]}, ("extents",), "", "twice Unity's"),
+        ({"center": [0, 0, 0], "extent": [1, 1, 1]}, ("extent",), "half of them", "full edge lengths"),
         (UNIT | {"rotation_matrix": QUARTER}, ("rotation_matrix",), "", "Did you mean `rotation`?"),
         (UNIT | {"min": [0, 0, 0], "max": [1, 1, 1]}, ("center",), "corners too", "Leave one"),
         (UNIT | {"R": QUARTER, "rotation_quaternion_xyzw": [0, 0, 0, 1]}, ("rotation_quaternion_xyzw",), "`R`", ""),
@@ -153,8 +152,12 @@ def test_one_of_several_is_chosen_by_its_index() -> None:
         parse_detection(UNIT, 0)
 
 
-def test_an_array_is_no_list_of_detections() -> None:
-    assert parse_detection(torch.tensor([[0.0, 0, 0], [1, 2, 3]])) == AXIS_ALIGNED
+@pytest.mark.parametrize("form", [list, tuple, np.array, torch.tensor])
+def test_two_lists_are_corners_only_where_they_can_be_nothing_else(form: Any) -> None:
+    assert parse_detection(form([[-1.0, -2, -3], [0, 0, 0]])) == replace(AXIS_ALIGNED, center=(-0.5, -1.0, -1.5))
+    with pytest.raises(InvalidDetectionError, match="corners, or a center and a size") as caught:
+        parse_detection(form([[0.0, 0, 0], [1, 2, 3]]))
+    assert all(name in str(caught.value.hint) for name in ('"min"', '"max"', '"center"', '"size"'))
 
 
 # Boxes as plain numbers, by hand-computed cases and a slow reference.

@@ -118,7 +118,12 @@ class CornerBox(_OfOpen3D):
 
 _Corners = Annotated[
     list[_Point],
-    Field(min_length=2, max_length=2, description="Lowest and highest corner of an axis-aligned box."),
+    Field(
+        min_length=2,
+        max_length=2,
+        description="Lowest and highest corner of an axis-aligned box. "
+        "Refused if all numbers of the second are positive: they may be a size.",
+    ),
 ]
 
 

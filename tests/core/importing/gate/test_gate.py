@@ -196,7 +196,7 @@ def test_an_output_beyond_the_limit_is_refused(upload: Path, tmp_path: Path) -> 
 
 BOX = [[0, 0, 0], [1, 1, 1]]
 GOOD = {"family": "f", "kind": "k", "why": [], "bounds": BOX, "surface_bounds": BOX, "parameters": 1}
-GOOD |= {"plausibility": {}, "warnings": [], "label": None, "isolation": {}, "peak_memory_bytes": 1}
+GOOD |= {"plausibility": {}, "warnings": [], "assumed": [], "label": None, "isolation": {}, "peak_memory_bytes": 1}
 
 
 def claim(**values: Any) -> str:

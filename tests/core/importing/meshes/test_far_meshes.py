@@ -130,9 +130,9 @@ def test_a_pose_far_away_is_that_at_the_origin(tmp_path: Path) -> None:
     T[:3, 3] = (0.3, 0.2, 0.05)
     placed = thing.copy().apply_transform(T)
     room = trimesh.util.concatenate([placed, trimesh.creation.box((3.0, 3.0, 0.1), _moved(0.0, 0.0, -0.06))])
-    box = np.array([placed.bounds[0] - 0.05, placed.bounds[1] + 0.05])
+    low, high = placed.bounds[0] - 0.05, placed.bounds[1] + 0.05
     fields = [regnf.from_mesh(one.vertices + by, one.faces) for one, by in ((room, UTM), (thing, ECEF))]
-    found = regnf.register(*fields, box + np.array(UTM))
+    found = regnf.register(*fields, {"min": low + np.array(UTM), "max": high + np.array(UTM)})
     assert found.verdict == "registered"
     pose = _moved(*(-np.array(ECEF))) @ found.T_object_scene.matrix().numpy() @ _moved(*UTM)
     assert np.abs(found.scene_samples.points.numpy() - np.array(UTM)).max() < 3.0
