@@ -137,7 +137,7 @@ def convert(
 
 
 def _moved(field: Path, output: Path, transform: Path | None, inverse: bool) -> None:
-    from regnf_core.importing.splats.moving import pose_in, write_moved
+    from regnf_core.moved_splats import pose_in, write_moved
 
     if transform is None or output.suffix.lower() != ".ply":
         raise InvalidOptionsError("--inverse needs --transform, which needs .ply as the output")

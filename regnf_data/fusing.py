@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from regnf_core.errors import DatasetError
 from regnf_core.importing.fusing import BlockGrid, Progress, fused_arrays
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
@@ -33,6 +34,8 @@ def fuse_blocks(
     arrays = fused_arrays(
         list(depths), list(intrinsics), list(T_world_camera), grid, None if colors is None else list(colors), progress
     )
+    if arrays is None:
+        raise DatasetError("no depth image shows a surface within the depth limit", reason="DATASET_NOTHING_IN_BOUNDS")
     source = path.with_suffix(".npz")
     try:
         np.savez(source, **arrays)  # type: ignore[arg-type]

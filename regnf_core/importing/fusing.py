@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.errors import DatasetError
-
 _EDGE = 8
 """Voxels along an edge of a block."""
 _BLOCKS = 20_000
@@ -40,12 +38,12 @@ def fused_arrays(
     grid: BlockGrid,
     colors: Sequence[NDArray[np.uint8]] | None = None,
     progress: Progress | None = None,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, NDArray[Any]] | None:
     """The arrays of a saved VoxelBlockGrid by their names, blocks in the order of their keys.
 
     depths: (H, W) each, along the camera's axis, world units, 0 where nothing was read · intrinsics: (3, 3) each, a
     pixel's center at (column + 0.5, row + 0.5) · T_world_camera: (4, 4) each, OpenCV's axes · colors: (H, W, 3) each.
-    Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image shows surface within reach.
+    None where no image shows a surface within reach.
     """
     o3d = open3d()
     core, image_of = o3d.core, o3d.t.geometry.Image
@@ -76,9 +74,7 @@ def fused_arrays(
         else:
             color = image_of(core.Tensor((colors[number] / np.float32(255.0)).astype(np.float32)))
             blocks.integrate(near, image, color, K, K, camera, *reach)
-    if fused == 0:
-        raise DatasetError("no depth image shows a surface within the depth limit", reason="DATASET_NOTHING_IN_BOUNDS")
-    return _stored(blocks, channels, grid)
+    return _stored(blocks, channels, grid) if fused else None
 
 
 def _stored(blocks: Any, channels: dict[str, int], grid: BlockGrid) -> dict[str, NDArray[Any]]:

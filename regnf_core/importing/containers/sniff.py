@@ -30,6 +30,8 @@ _LONG_COMMENT = 2048
 """Bytes of comments, and nothing else, before the first statement: of the formats taken only OBJ has such."""
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
 _NAMED = ((b"PXR-USDC", "usd"), (b"#usda", "usd"), (b"ISO-10303-21", "step"), (b"<robot", "urdf"))
+_IFC = re.compile(rb"FILE_SCHEMA *\( *\( *'IFC")
+"""A building model in the same file structure: it has no shapes that are read."""
 _XML_OWN = re.compile(rb"<\?.*?\?>|<!--.*?-->", re.DOTALL)
 """Of an XML document, what may come before its first element."""
 
@@ -47,7 +49,7 @@ def sniff_mesh(head: bytes) -> str | None:
     text = head.lstrip(_BLANK)
     begin = _XML_OWN.sub(b"", text).lstrip() if text.startswith(b"<") else text
     if named := next((format_ for magic, format_ in _NAMED if begin.startswith(magic)), None):
-        return named
+        return None if named == "step" and _IFC.search(head) else named
     if re.match(rb"ply[ \t]*[\r\n]", text):
         return "splat-ply" if _SPLAT_PROPERTY.search(text) else "ply"
     if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS) and b'"geometricError"' not in text:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.errors import DatasetError, FieldFormatError
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.assumptions import GLTF, PLACES, RUB, UNIT, Assumptions
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families import voxel_block_grid
@@ -170,13 +170,10 @@ def _fused(views: list[Seen], voxel: float, said: UploadDescription, tensor_byte
     depths = [np.ascontiguousarray(view.depth, np.float32) for view in views]
     farthest = max((float(depth.max(initial=0.0)) for depth in depths), default=0.0)
     grid = BlockGrid(voxel, _TRUNCATION, 1.01 * farthest)
-    try:
-        arrays = fused_arrays(
-            depths, [view.camera.matrix for view in views], poses, grid, [view.color for view in views]
-        )
-    except DatasetError as error:
+    arrays = fused_arrays(depths, [view.camera.matrix for view in views], poses, grid, [view.color for view in views])
+    if arrays is None:
         message = "no view sees a surface: the Gaussians stop less than half of the light everywhere"
-        raise FieldFormatError(message, reason="NO_ZERO_LEVEL") from error
+        raise FieldFormatError(message, reason="NO_ZERO_LEVEL")
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
     found = voxel_block_grid.convert(ArraySource(file.getbuffer(), tensor_bytes), said)

@@ -17,7 +17,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format, splat_format
 from regnf_core.importing.families.gaussian_splats import read_splats
 from regnf_core.importing.splats.gaussians import Doubles, Splats, basis, sound, turned_harmonics, write_ply
-from regnf_core.importing.splats.moving import pose_in, read_splat_file, write_moved
+from regnf_core.moved_splats import pose_in, read_splat_file, write_moved
 
 DATA = Path(__file__).parent / "data"
 TURNED_X, TURNED_Z = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
