@@ -149,7 +149,7 @@ OF_THE_CIRCUMSTANCES |= {"IMPORT_OUT_OF_MEMORY", "IMPORT_OUTPUT_TOO_LARGE"}
 WARNED_OF = {"COLOR_ASSUMED", "COLOR_LEFT_OUT"}
 FUNCTIONS = {"FUNCTION_UNUSABLE"}
 """Of functions in Python, which no gate sees."""
-NO_REASONS = {"COLOR_0", "CESIUM_RTC", "FIELD_NAME", "REGNF_NATIVE"}
+NO_REASONS = {"COLOR_0", "CESIUM_RTC", "FIELD_NAME", "PXR_WORK_THREAD_LIMIT", "REGNF_NATIVE"}
 NO_REASONS |= {f"{library}_NUM_THREADS" for library in ("IGL", "MKL", "OMP", "OPENBLAS")}
 """Words of the same form that name files, attributes and variables of the environment."""
 
