@@ -46,9 +46,7 @@ def _require(sound: bool) -> None:
 
 def _require_version(data: bytes, header: int) -> None:
     if data[0] & 0xF0 == header & 0xF0 and data[0] != header:
-        raise unsupported(
-            "the glTF file has meshopt compression of another version: export it with EXT_meshopt_compression"
-        )
+        raise unsupported("a glTF file with meshopt compression of another version; use EXT_meshopt_compression")
     _require(data[0] == header)
 
 
@@ -155,8 +153,7 @@ def _triangles(data: bytes, count: int) -> list[int]:
     _require(count % 3 == 0 and len(data) > count // 3 + 16)
     codes, auxiliary, at = data[1 : 1 + count // 3], data[-16:], 1 + count // 3
     edges, recent = deque([(0, 0)] * 16, maxlen=16), deque([0] * 16, maxlen=16)  # the last ones come last
-    order: list[int] = []
-    next_ = last = 0
+    order, next_, last = list[int](), 0, 0
 
     def free() -> int:
         nonlocal last, at
@@ -196,8 +193,7 @@ def _triangles(data: bytes, count: int) -> list[int]:
             a, b, c = corners
             recent.extend(corners[place] for place, kind in enumerate(kinds) if kind == 0 or (given and kind == 15))
             edges.append((b, a))
-        edges.append((c, b))
-        edges.append((a, c))
+        edges.extend(((c, b), (a, c)))
         order += (a, b, c)
     _require(len(data) - at == 16)
     return order
