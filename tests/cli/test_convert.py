@@ -37,6 +37,19 @@ def test_a_mesh_becomes_a_safe_field_and_a_grid(run: Run, tmp_path: Path) -> Non
     assert {path.name for path in tmp_path.glob("ball*")} == {"ball.glb", safe.name, grid.name}
 
 
+@pytest.mark.usefixtures("cache")
+def test_a_node_of_a_scene_is_chosen(run: Run, tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for name, radius in (("small", 0.5), ("large", 2.0)):
+        scene.add_geometry(trimesh.creation.icosphere(subdivisions=2, radius=radius), node_name=name)
+    scene.export(tmp_path / "balls.glb")
+    run("convert", tmp_path / "balls.glb", tmp_path / "ball.safetensors", "--node", "small", code=0)
+    found = open_field(tmp_path / "ball.safetensors").signed_distance(torch.zeros(1, 3))
+    assert found.item() == pytest.approx(-0.5, abs=0.02)
+    refused = run("inspect", tmp_path / "balls.glb", "--node", "medium", code=2)
+    assert "no node with a shape is named 'medium'; the file has large, small" in refused.stderr
+
+
 def test_a_field_becomes_a_mesh(run: Run, tmp_path: Path) -> None:
     outcome = run("convert", DATA / "armchair.safetensors", tmp_path / "chair.ply", "--resolution", 24, code=0)
     assert "triangles" in outcome.stdout

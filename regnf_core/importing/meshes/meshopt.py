@@ -39,20 +39,21 @@ def decoded(data: memoryview, count: int, stride: int, mode: str, filter_: str) 
     return memoryview(items.tobytes())
 
 
+def _require(sound: bool) -> None:
+    if not sound:
+        raise malformed(_FAULTY)
+
+
 def _require_version(data: bytes, header: int) -> None:
     if data[0] & 0xF0 == header & 0xF0 and data[0] != header:
-        raise unsupported(
-            "the glTF file has meshopt compression of another version: export it with EXT_meshopt_compression"
-        )
-    if data[0] != header:
-        raise malformed(_FAULTY)
+        raise unsupported("a glTF file with meshopt compression of another version; use EXT_meshopt_compression")
+    _require(data[0] == header)
 
 
 def _attributes(data: bytes, count: int, stride: int) -> Bytes:
     """(count, stride) bytes: for each block and each byte of an item, differences in groups of 16."""
     _require_version(data, _ATTRIBUTES)
-    if not 0 < stride <= 256 or stride % 4 or len(data) < 1 + max(stride, _TAIL):
-        raise malformed(_FAULTY)
+    _require(0 < stride <= 256 and stride % 4 == 0 and len(data) > max(stride, _TAIL))
     raw = np.frombuffer(data, np.uint8)
     items, last, at = np.empty((count, stride), np.uint8), raw[len(raw) - stride :].copy(), 1
     block = min(_BLOCK_BYTES // stride & ~(_GROUP - 1), _BLOCK_ITEMS)
@@ -66,8 +67,7 @@ def _attributes(data: bytes, count: int, stride: int) -> Bytes:
         signed[0] += last
         items[start : start + size] = np.cumsum(signed[:size], axis=0, dtype=np.uint8)
         last = items[start + size - 1]
-    if len(data) - at != max(stride, _TAIL):
-        raise malformed(_FAULTY)
+    _require(len(data) - at == max(stride, _TAIL))
     return items
 
 
@@ -143,20 +143,17 @@ def _sequence(data: bytes, count: int) -> list[int]:
         line, number = number & 1, number >> 1
         last[line] = (last[line] + ((number >> 1) ^ -(number & 1))) & 0xFFFFFFFF
         order.append(last[line])
-    if len(data) - at != 4:
-        raise malformed(_FAULTY)
+    _require(len(data) - at == 4)
     return order
 
 
 def _triangles(data: bytes, count: int) -> list[int]:
     """Corners: a code for each triangle names an edge and a vertex of those that were last used, or new ones."""
     _require_version(data, _TRIANGLES)
-    if count % 3 or len(data) < 1 + count // 3 + 16:
-        raise malformed(_FAULTY)
+    _require(count % 3 == 0 and len(data) > count // 3 + 16)
     codes, auxiliary, at = data[1 : 1 + count // 3], data[-16:], 1 + count // 3
     edges, recent = deque([(0, 0)] * 16, maxlen=16), deque([0] * 16, maxlen=16)  # the last ones come last
-    order: list[int] = []
-    next_ = last = 0
+    order, next_, last = list[int](), 0, 0
 
     def free() -> int:
         nonlocal last, at
@@ -196,9 +193,7 @@ def _triangles(data: bytes, count: int) -> list[int]:
             a, b, c = corners
             recent.extend(corners[place] for place, kind in enumerate(kinds) if kind == 0 or (given and kind == 15))
             edges.append((b, a))
-        edges.append((c, b))
-        edges.append((a, c))
+        edges.extend(((c, b), (a, c)))
         order += (a, b, c)
-    if len(data) - at != 16:
-        raise malformed(_FAULTY)
+    _require(len(data) - at == 16)
     return order

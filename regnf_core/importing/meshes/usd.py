@@ -80,7 +80,7 @@ class _Layers:
         waiting = [(name, root)]
         while waiting:
             name, layer = waiting.pop()
-            for path in layer.GetCompositionAssetDependencies():
+            for path in filter(None, layer.GetCompositionAssetDependencies()):  # "" is the layer itself
                 wanted = posixpath.normpath(posixpath.join(posixpath.dirname(name), path))
                 if wanted not in self._loaded and wanted in self._given and wanted.lower().endswith(_ENDS):
                     waiting.append((wanted, self._read(wanted, self._given[wanted])))

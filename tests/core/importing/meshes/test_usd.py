@@ -150,6 +150,7 @@ def test_instances_of_both_kinds_are_read(tmp_path: Path) -> None:
 
     found = read_mesh_file(stage_of(build, tmp_path / "copies.usdc"))
     assert volume(found) == pytest.approx(4 * 48 + 2 * 8 * 4 / 3 * np.pi, rel=0.01)
+    assert found.not_applied == ()
     assert box_of(found) == [[-1, -2, -3], [72, 2, 303]]
     balls = read_mesh_file(tmp_path / "copies.usdc", "Many")
     assert box_of(balls) == [[48, -2, -2], [72, 2, 2]]
