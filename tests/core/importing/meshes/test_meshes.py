@@ -90,7 +90,7 @@ def test_obj_counts_from_either_end_and_passes_over_the_rest() -> None:
         "v 0 0 1\nf 1/1 3/1/1 2//1\nf -4 -3 \\\n -1\nf 2 3 4\nf 1 4 3\n"
     )
     found = converted(text.encode())
-    assert found.why[1:] == ("watertight", "ignored: materials in another file", "the file states no unit")
+    assert found.why[1:] == ("watertight", "ignored: materials in another file")
     inside, outside = field_of(found).signed_distance(torch.tensor([[0.1, 0.1, 0.1], [-0.5, 0.2, 0.2]])).tolist()
     assert (inside, outside) == pytest.approx((-0.1, 0.5), abs=1e-6)
 

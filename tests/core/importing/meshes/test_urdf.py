@@ -58,7 +58,7 @@ def box(found: Geometry) -> list[list[float]]:
 def test_links_are_placed_by_their_joints_and_origins(node: str | None, extent: list[list[float]]) -> None:
     found = read(node=node)
     np.testing.assert_allclose(box(found), extent, atol=1e-3)
-    assert found.notes[-1] == "the unit is meter, as URDF specifies"
+    assert found.assumes[0].startswith("unit: meters")
 
 
 def test_a_mesh_that_its_scale_mirrors_still_looks_outward() -> None:
