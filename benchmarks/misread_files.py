@@ -234,7 +234,7 @@ def wrong_mesh(reader: str, twin: Twin, random: Random) -> Case:
         faces = np.where(some[:, None], faces[:, ::-1], faces)
     about = r"MESH_INSIDE_OUT|SCENE_ASSUMED|of its surface was flipped" if "flipped" in kind else GARBLED
     about = AXES if "swapped" in kind else rf"{LOST}|not watertight" if kind == "one face fewer" else about
-    data = _MESHES[reader](places, faces, kind)
+    data = MESHES[reader](places, faces, kind)
     return Case(reader, kind if "flipped" not in kind else f"faces {kind}", data, about, twin)
 
 
@@ -308,7 +308,7 @@ def _glb(places: Array, faces: NDArray[np.int64], kind: str) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts
 
 
-_MESHES: dict[str, Callable[[Array, NDArray[np.int64], str], bytes]] = {
+MESHES: dict[str, Callable[[Array, NDArray[np.int64], str], bytes]] = {
     "ply": _ply,
     "ply text": lambda places, faces, kind: _ply(places, faces, kind, text=True),
     "obj": _obj,
@@ -376,7 +376,7 @@ MAKERS: dict[str, Callable[[str, Twin, Random], Case]] = {
     "grid": wrong_grid,
     "voxel blocks": wrong_blocks,
     "nvblox": wrong_nvblox,
-    **dict.fromkeys(_MESHES, wrong_mesh),
+    **dict.fromkeys(MESHES, wrong_mesh),
     "xyz cloud": wrong_cloud,
     "onnx": wrong_network,
 }

@@ -126,7 +126,6 @@ def test_every_form_of_a_box_is_one_job(world: World) -> None:
         {"center": CENTER, "size": SIZE},
         {"center": CENTER, "extent": SIZE, "R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]},
         {"min_bound": LOW, "max_bound": HIGH},
-        [LOW, HIGH],
         {"center": dict(zip("xyz", CENTER, strict=True)), "size": dict(zip("xyz", SIZE, strict=True))},
         {"center": CENTER, "size": SIZE, "rotation_quaternion_wxyz": [-2, 0, 0, 0]},
     ]

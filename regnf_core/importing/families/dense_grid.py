@@ -33,6 +33,8 @@ _SPACINGS = ("spacing", "voxel_size")
 _Vector = npt.NDArray[np.float64]
 _NEAREST, _COMPARED = 0.2, 4_000
 """The slopes are compared at about so many nodes, of this share that is nearest to the surface."""
+_UNEVEN = 0.05
+"""Slopes that differ by less are those of distances; so far from 1, these are not in the unit of the spacing."""
 _STEEP, _JUMPING = 1.5, 0.1
 """Values of so large a share of the neighbors that differ by so many times their distance are no distances."""
 _OFF = 0.1
@@ -86,17 +88,21 @@ def grid_field(
         "spacing": spacing.tolist(),
         "source": {"family": FAMILY},
     }
-    warnings = (*_other_axes(values, spacing, None if weights is None else weights > 0), *_jumps(values, spacing))
-    if weights is not None:
-        warnings = doubts_of_map(values[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing)
+    seen = None if weights is None else weights > 0
+    warnings = _other_axes(values, spacing, seen)
+    if seen is None:
+        warnings = (*warnings, *_jumps(values, spacing))
+    else:
+        one = np.zeros((1, 3), np.int64)
+        warnings = (*warnings, *doubts_of_map(values[None], seen[None], one, spacing))
         tensors["values"] = bounded = np.array(values, np.float32)
-        if bound_by_surface(bounded[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing):
+        if bound_by_surface(bounded[None], seen[None], one, spacing):
             why = (*why, PROJECTIVE)
-    if weights is not None and not weights.all():
-        tensors["values"] = filled_nodes(bounded, weights > 0, spacing, overrides.sign or 1)
+    if seen is not None and not seen.all():
+        tensors["values"] = filled_nodes(bounded, seen, spacing, overrides.sign or 1)
         why = (
             *why,
-            f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were observed; the others are free space",
+            f"{100.0 * float(seen.mean()):.3g} % of the nodes were observed; the others are free space",
         )
     return ConvertedField(FAMILY, why, description, tensors, warnings, sign_is_open=True, assumes=(*UNSAID, GRID))
 
@@ -112,11 +118,9 @@ def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.boo
     at = np.argwhere(near)[:: max(1, int(near.sum()) // _COMPARED)] + 1  # (N, 3)
     if not len(at):
         return ()
-    steps = np.eye(3, dtype=np.int64)
-    rises = [(values[tuple((at + one).T)] - values[tuple((at - one).T)]).astype(np.float64) / 2.0 for one in steps]
     off: dict[str, float] = {}
     for order in itertools.permutations(range(3)):  # the array's axis i lies along order[i]
-        slopes = np.sqrt(sum((rise / spacing[axis]) ** 2 for rise, axis in zip(rises, order, strict=True)))
+        slopes = _slopes(values, spacing, at, order)
         off["".join("xyz"[axis] for axis in order)] = float(np.median(np.abs(slopes - 1.0)))
     best = min(off, key=lambda name: off[name])
     if off["xyz"] < _OFF or off[best] > off["xyz"] / 3.0:
@@ -129,15 +133,30 @@ def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.boo
 
 
 def _jumps(values: Float32Array, spacing: _Vector) -> tuple[str, ...]:
-    """A warning of neighbors whose values differ by more than a distance can between them."""
+    """A warning of values that neighbors cannot have, if they are distances in the unit of the spacing."""
+    word = "GRADIENT_NOT_UNIT: the values "
     if len(np.unique(values.reshape(-1)[:_COMPARED])) <= 2 and len(np.unique(values)) <= 2:
-        return ("GRADIENT_NOT_UNIT: the array has two values: it says what is inside, and not how far away it is",)
+        return (f"{word}are two alone: they say what is inside, and not how far away it is",)
     apart = (np.abs(np.diff(values, axis=axis)) > _STEEP * step for axis, step in enumerate(spacing))
     share = max(float(one.mean()) for one in apart)
-    text = (
-        f"at {100 * share:.0f} % of the nodes along an axis values differ by more than {_STEEP:g} times their distance"
-    )
-    return (f"GRADIENT_NOT_UNIT: {text}: check the array's shape and order",) if share > _JUMPING else ()
+    if share > _JUMPING:
+        text = f"of {100 * share:.0f} % of the neighbors differ by more than {_STEEP:g} times their distance"
+        return (f"{word}{text}: check the array's shape and order",)
+    if min(values.shape) <= 2:
+        return ()
+    at = np.random.default_rng(0).integers(1, np.array(values.shape) - 1, (_COMPARED, 3))
+    middle, high = np.quantile(_slopes(values, spacing, at, (0, 1, 2)), [0.5, 0.9])
+    even = high < (1.0 + _UNEVEN) * middle and abs(high - 1.0) > _UNEVEN
+    text = f"rise by {high:.3g} a unit almost everywhere: they or the spacing are of another unit"
+    return (f"{word}{text}",) if even else ()
+
+
+def _slopes(values: Float32Array, spacing: _Vector, at: npt.NDArray[np.int64], order: tuple[int, ...]) -> _Vector:
+    """(N,) slopes at inner nodes (N, 3), if the array's axis i lies along order[i]."""
+    steps = np.eye(3, dtype=np.int64)
+    rises = [(values[tuple((at + one).T)] - values[tuple((at - one).T)]).astype(np.float64) / 2.0 for one in steps]
+    squares = [(rise / spacing[axis]) ** 2 for rise, axis in zip(rises, order, strict=True)]
+    return np.asarray(np.sqrt(sum(squares)), np.float64)
 
 
 def _weights(arrays: ArraySource, shape: tuple[int, ...]) -> Float32Array | None:
