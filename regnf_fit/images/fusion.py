@@ -18,8 +18,8 @@ from torch import Tensor
 
 from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.build import open_field
-from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_core.importing.fusing import BlockGrid, Progress
+from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.fusing import fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
