@@ -35,7 +35,9 @@ from regnf_core.surface.isosurface import extract_surface
 
 Doubles = npt.NDArray[np.float64]
 ROOM_SPLATS, OBJECT_SPLATS = 400_000, 80_000
-_NOISE, _TILT = 0.002, 0.15
+_COVER = 0.5
+"""Standard deviation of a splat over the distance to its fourth neighbor: each place is covered by two, about."""
+_NOISE, _TILT = 0.001, 0.15
 """Standard deviations of a center along the normal, diagonals, and of the orientation, radians."""
 _FLOATERS = 0.05
 _PLACES, _AROUND = 60, 60
@@ -71,7 +73,7 @@ def as_splats(points: Doubles, normals: Doubles, kind: str, seed: int) -> Splats
     count, low, high = len(points), points.min(axis=0), points.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
     spacing = cKDTree(points).query(points, k=5)[0][:, -1]
-    wide = spacing[:, None] * np.exp(0.4 * random.normal(size=(count, 2)))
+    wide = _COVER * spacing[:, None] * np.exp(0.4 * random.normal(size=(count, 2)))
     thin = wide.min(axis=1) * random.uniform(0.05, 0.4, count)
     axis = np.cross([0.0, 0.0, 1.0], normals)
     sine, cosine = np.linalg.norm(axis, axis=1), normals[:, 2]
