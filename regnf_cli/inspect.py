@@ -145,7 +145,8 @@ def _show(values: dict[str, Any], indent: int = 0) -> None:
             out.print(f"{'  ' * indent}{name}:")
             _show(value, indent + 1)
         else:
-            say(f"{'  ' * indent}{name:<24} {_readable(value)}")
+            for line in value if name == "assumed" and value else [value]:
+                say(f"{'  ' * indent}{name:<24} {_readable(line)}")
 
 
 def _readable(value: Any) -> str:

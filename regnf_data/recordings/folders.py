@@ -36,6 +36,8 @@ _INVALID = "DATASET_METADATA_INVALID"
 _MILLIMETER = 0.001
 _MOST_TEXT = 256 << 20
 DEPTHS = (".png", ".tif", ".tiff", ".pgm", *ARRAYS)
+_FEWEST_PIXELS = 16
+"""Along a side of an image."""
 _COLORS = (".jpg", ".jpeg", ".png", ".ppm", ".bmp", ".webp")
 _CAMERAS = (".json", ".txt", ".yaml", ".yml", ".csv", ".npy")
 _POSE_LISTS = (".txt", ".csv", ".npy")
@@ -328,7 +330,8 @@ def is_frame(path: Path) -> bool:
 def _frame_files(path: Path) -> tuple[Path, Path | None] | None:
     """The depth image and the color image; None where there is no one depth image."""
     if path.is_file():
-        return (path, None) if path.suffix.lower() in DEPTHS else None
+        known = path.suffix.lower() in DEPTHS and (path.suffix.lower() not in ARRAYS or _is_image(path))
+        return (path, None) if known else None
     images = [p for p in sorted(path.glob("[!.]*")) if p.suffix.lower() in (*DEPTHS, *_COLORS) and p.is_file()]
     named = [p for p in images if "depth" in p.name.lower() and p.suffix.lower() in DEPTHS]
     depths = named or [p for p in images if p.suffix.lower() in ARRAYS or _has_16_bits(p)]
@@ -338,6 +341,15 @@ def _frame_files(path: Path) -> tuple[Path, Path | None] | None:
     named = [p for p in colors if re.search("colou?r|rgb|image", p.name.lower())]
     chosen = named if named else colors
     return depths[0], chosen[0] if len(chosen) == 1 else None
+
+
+def _is_image(path: Path) -> bool:
+    """Whether a file's array is one of pixels: a grid of distances and a list of points are none."""
+    try:
+        shape = array_file(path).shape
+    except DatasetError:
+        return False
+    return len(shape) == 2 and min(shape) >= _FEWEST_PIXELS
 
 
 def _has_16_bits(path: Path) -> bool:

@@ -115,10 +115,10 @@ _INNER, _OUTER = 0.3, 0.9
 _BLOCKS, _FEWEST_RATIOS = 1_500, 200
 _EVEN, _ROUND = 1.12, 0.05
 """Ratios as even as this, about a surface with normals to all sides, are of distances that are not projective."""
-_MANY, _FEWEST_PAIRS = 8, 64
-"""Of so many blocks some touch; fewer pairs of voxels tell nothing."""
+_MANY, _FEWEST_PAIRS, _FEWEST_RISES = 8, 64, 32
+"""Of so many blocks some touch; fewer pairs of voxels at borders, or voxels at the surface, tell nothing."""
 _TINY = 1e-30
-_BROKEN, _BEND = 2.2, 0.2
+_BROKEN, _BEND = 3.0, 0.2
 """Values bend at the border of a block at most so many times as much as within it and a share of a step's change."""
 _FLAT, _STEEP = 0.7, 5.0
 """Slopes of fused maps at the surface: projective distances rise by 2 to 3 a unit in the median of rooms."""
@@ -222,7 +222,7 @@ def doubts_of_map(
         text = "the values do not go on from block to block: the order of voxels or of block indices may be another one"
         found.append(f"AXES_UNCERTAIN: {text}")
     rises = np.sqrt(squares[whole & changes])
-    slope = float(np.median(rises)) if len(rises) >= _FEWEST_PAIRS else 1.0
+    slope = float(np.median(rises)) if len(rises) >= _FEWEST_RISES else 1.0
     if spacing is not None and not _FLAT <= slope <= _STEEP:
         text = f"the values rise by {slope:.2g} a unit at the surface: they or the voxel size may be of another unit"
         found.append(f"GRADIENT_NOT_UNIT: {text}")

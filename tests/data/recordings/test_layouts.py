@@ -15,7 +15,7 @@ from regnf_core.errors import DatasetError
 from regnf_core.fields.build import open_field
 from regnf_data.exr import read_exr
 from regnf_data.recordings.camera import Camera, camera_of_values
-from regnf_data.recordings.opening import open_recording
+from regnf_data.recordings.opening import is_recording, open_recording
 from regnf_data.recordings.recording import Frame, Recording, as_posed_images
 from regnf_fit.images.fusion import FusionOptions, fuse_images
 from tests.data.recordings import writers
@@ -189,3 +189,14 @@ def test_every_layout_gives_the_same_map(tmp_path: Path) -> None:
         apart = (open_field(tmp_path / f"{name}.safetensors").signed_distance(points) - wanted).abs()[near]
         assert float(apart.quantile(0.99)) < report.voxel, name
         assert float(apart.median()) < 0.1 * report.voxel, name
+
+
+def test_arrays_that_are_no_image_are_no_recording(tmp_path: Path) -> None:
+    """A grid of distances, a map of blocks and a list of points are fields' files."""
+    grid, keys = np.zeros((20, 20, 20), np.float32), np.zeros((90, 3), np.int32)
+    np.savez(tmp_path / "grid.npz", sdf=grid, origin=np.zeros(3), spacing=0.1)
+    np.savez(tmp_path / "map.npz", key=keys, value_000=np.zeros((90, 8, 8, 8, 1)))
+    np.save(tmp_path / "points.npy", np.ones((500, 3)))
+    assert not any(is_recording(tmp_path / name) for name in ("grid.npz", "map.npz", "points.npy"))
+    np.save(tmp_path / "image.npy", np.ones((48, 64), np.float32))
+    assert is_recording(tmp_path / "image.npy")
