@@ -189,6 +189,7 @@ def length_of_one(values: Float32Array, seen: BoolArray, blocks: IntArray) -> fl
     return float(round(ratio)) if abs(ratio - round(ratio)) <= _WHOLE * ratio else ratio
 
 
+@np.errstate(all="ignore")  # numbers near the largest ones overflow, and are refused later
 def doubts_of_map(
     values: Float32Array, seen: BoolArray, blocks: IntArray, spacing: float | npt.NDArray[np.float64] | None
 ) -> tuple[str, ...]:

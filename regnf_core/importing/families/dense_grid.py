@@ -107,6 +107,7 @@ def grid_field(
     return ConvertedField(FAMILY, why, description, tensors, warnings, sign_is_open=True, assumes=(*UNSAID, GRID))
 
 
+@np.errstate(all="ignore")
 def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.bool_] | None) -> tuple[str, ...]:
     """A warning where distances rise by one a unit only if the array's axes are others than x, y, z."""
     inner = np.abs(values[1:-1, 1:-1, 1:-1])
@@ -132,6 +133,7 @@ def _other_axes(values: Float32Array, spacing: _Vector, seen: npt.NDArray[np.boo
     return (f"AXES_UNCERTAIN: {text}",)
 
 
+@np.errstate(all="ignore")
 def _jumps(values: Float32Array, spacing: _Vector) -> tuple[str, ...]:
     """A warning of values that neighbors cannot have, if they are distances in the unit of the spacing."""
     word = "GRADIENT_NOT_UNIT: the values "
