@@ -220,8 +220,8 @@ def test_what_the_imports_said_reaches_the_result_and_the_job(context: Context) 
     record = run(context, engine, "j1", object=CHAIR)
     assert record.inputs["warnings"] == {"scene": ["TRUNCATION_ASSUMED", "x" * 64]}
     (notes,) = engine.notes
-    assert notes["scene"].to_dict() == {**report, "settings": None}
-    assert notes[CHAIR].to_dict() == {"family": None, "settings": used, "warnings": []}
+    assert notes["scene"].to_dict() == {**report, "settings": None, "assumed": []}
+    assert notes[CHAIR].to_dict() == {"family": None, "settings": used, "warnings": [], "assumed": []}
     assert run(context, engine, "j2", candidates=[CHAIR, TABLE]).inputs["warnings"] == record.inputs["warnings"]
 
 

@@ -139,7 +139,7 @@ none     a picture                        .bmp .psd .jp2    BM.{4}\0{4}|8BPS|\0{
 none     an SVG picture                   .svg              <svg
 video    a video                          .mp4 .avi .mkv    .{4}(ftyp|moov)|RIFF.{4}AVI\x20|\x1aE\xdf\xa3|\0\0\x01\xba
 none     a sound                          .wav .mp3         RIFF.{4}WAVE|ID3|OggS|fLaC
-lfs      a Git LFS pointer, not the file  -                 version https://git-lfs
+lfs      a Git LFS pointer, not the file itself  -                 version https://git-lfs
 failed   an HTML page, not a field        .html             <!doctype html|<html
 none     a PDF document                   .pdf .ps          %PDF|%!PS|\{\\rtf
 archive  a 7z archive                     .7z               7z\xbc\xaf

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.assumptions import NORMALS
 from regnf_core.importing.cost.mesh_work import FINEST, SPAN, affordable_depth
-from regnf_core.importing.families.cloud_normals import Oriented, fit_their_points, oriented
 from regnf_core.importing.families.cloud_rays import observed_by_rays
 from regnf_core.importing.families.converted import ConvertedField, observed_field
 from regnf_core.importing.families.triangles import mesh_field, require_extent
+from regnf_core.importing.meshes.cloud_normals import Oriented, fit_their_points, oriented
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
 

@@ -16,13 +16,12 @@ import numpy.typing as npt
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.assumptions import GLTF, PLACES, RUB, UNIT, Assumptions
 from regnf_core.importing.containers.npz import ArraySource
-from regnf_core.importing.families import voxel_block_grid
 from regnf_core.importing.families.converted import ConvertedField, observed_field
 from regnf_core.importing.families.layers import entries_at, refuse_other_entries, require_family
+from regnf_core.importing.families.voxel_block_grid import convert as convert_blocks
 from regnf_core.importing.fusing import BlockGrid, fused_arrays
 from regnf_core.importing.meshes.scene import refuse_node
 from regnf_core.importing.meshes.triangle_files import Siblings, malformed
-from regnf_core.importing.observing.trajectory import Trajectory
 from regnf_core.importing.splats.drawing import prepared
 from regnf_core.importing.splats.gaussians import Doubles, Splats, sound
 from regnf_core.importing.splats.packed import read_ksplat, read_splat, read_spz
@@ -30,6 +29,7 @@ from regnf_core.importing.splats.tables import read_gltf_splats, read_ply_splats
 from regnf_core.importing.splats.views import (
     Region,
     Seen,
+    Trained,
     agreed,
     cameras_for,
     drawn,
@@ -79,7 +79,7 @@ def convert_splats(
     splats: Splats,
     origin: str,
     overrides: UploadDescription,
-    cameras: Trajectory | None,
+    cameras: Trained | None,
     tensor_bytes: int,
     assumes: Assumptions = PLACES,
 ) -> ConvertedField:
@@ -140,7 +140,7 @@ def _workers() -> int:
     return max(1, min(cores, int(os.environ.get("OMP_NUM_THREADS") or cores)))
 
 
-def _into_file(overrides: UploadDescription, cameras: Trajectory, shift: Doubles) -> Doubles:
+def _into_file(overrides: UploadDescription, cameras: Trained, shift: Doubles) -> Doubles:
     """(4, 4), from the shifted Gaussians to the frame of the cameras: the dataset's where its transform is known."""
     known = np.eye(4) if overrides.dataset_transform is None else np.array(overrides.dataset_transform)
     back = np.array(shift_rows(shift.tolist()))
@@ -148,7 +148,7 @@ def _into_file(overrides: UploadDescription, cameras: Trajectory, shift: Doubles
     return np.asarray(T)
 
 
-def _from_where(region: Region, cameras: Trajectory | None, count: int) -> str:
+def _from_where(region: Region, cameras: Trained | None, count: int) -> str:
     if cameras is not None:
         return f"seen from {count} of the {len(cameras)} cameras that came with it"
     if region.within:
@@ -176,7 +176,7 @@ def _fused(views: list[Seen], voxel: float, said: UploadDescription, tensor_byte
         raise FieldFormatError(message, reason="NO_ZERO_LEVEL")
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
-    found = voxel_block_grid.convert(ArraySource(file.getbuffer(), tensor_bytes), said)
+    found = convert_blocks(ArraySource(file.getbuffer(), tensor_bytes), said)
     if found is None:
         raise RuntimeError("the fused map is not read as one")
     return found

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.assumptions import METERS, SCENE
@@ -119,6 +118,8 @@ def _origin(element: Element) -> Float64Array:
     pose, origin = np.eye(4), element.find("origin")
     if origin is not None:
         turn = _numbers(origin, "rpy", 3, "0 0 0")
+        from scipy.spatial.transform import Rotation  # what reads other meshes does without it
+
         pose[:3, :3] = Rotation.from_euler("xyz", turn).as_matrix()  # about the fixed axes
         pose[:3, 3] = _numbers(origin, "xyz", 3, "0 0 0")
     return pose

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from regnf_core.importing.families.cloud_normals import directions, oriented
-from regnf_core.importing.observing.trajectory import Trajectory
+from regnf_core.importing.meshes.cloud_normals import directions, oriented
 from regnf_core.importing.splats.drawing import MOST_PIXELS, Camera, Prepared, depth_image
 from regnf_core.importing.splats.gaussians import Doubles, Floats, Splats
 
@@ -44,6 +44,22 @@ _AGREE = 0.02
 _AGREE_VOXELS = 3.0
 """... or this many voxels."""
 _LEAST_AGREEING = 2
+
+
+class Trained(Protocol):
+    """The cameras of a training, as of :class:`regnf_core.importing.observing.trajectory.Trajectory`."""
+
+    @property
+    def poses(self) -> Doubles: ...
+    @property
+    def focal(self) -> Doubles: ...
+    @property
+    def middle(self) -> Doubles: ...
+    @property
+    def aspect(self) -> Doubles: ...
+    @property
+    def T_dataset_file(self) -> Doubles | None: ...
+    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +110,7 @@ def cameras_for(splats: Splats, region: Region) -> list[Camera]:
     return _within(splats, region) if region.within else _around(region)
 
 
-def given_cameras(trajectory: Trajectory, T_file_splats: Doubles) -> list[Camera]:
+def given_cameras(trajectory: Trained, T_file_splats: Doubles) -> list[Camera]:
     """Of the cameras from whose images the splats were trained, some, spread over the trajectory.
 
     T_file_splats: (4, 4), a similarity from the frame of the splats to that of the cameras' poses.

@@ -15,10 +15,10 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families import cloud as clouds
-from regnf_core.importing.families.cloud_normals import oriented
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.meshes.cloud_normals import oriented
 from regnf_core.importing.meshes.point_files import read_pcd
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import saved
