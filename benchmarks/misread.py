@@ -22,6 +22,10 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -52,6 +56,7 @@ _OFF = 0.05
 """A field is the one that was meant where its values are off by less than this at most marks, in lengths of the twin's
 own unit; the widest cells are 0.1."""
 _CUT = 0.2
+_PART = 200
 
 
 def marks(case: Case) -> tuple[Array, Array]:
@@ -123,6 +128,22 @@ def run(number: int, seed: int, keep: Path | None) -> Ending:
     return case.reader, case.error, outcome, told
 
 
+def run_part(first: int, seed: int, keep: Path | None) -> list[Ending]:
+    return [run(number, seed, keep) for number in range(first, first + _PART)]
+
+
+def all_parts(count: int, jobs: int, part: Callable[[int], list[Ending]]) -> Iterator[list[Ending]]:
+    """All cases, in parts as they end. A part whose process was killed from outside is begun again."""
+    left = set(range(0, count, _PART))
+    while left:
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+            waiting = {pool.submit(part, first): first for first in left}
+            for done in as_completed(waiting):
+                with suppress(BrokenProcessPool):
+                    yield done.result()
+                    left.discard(waiting[done])
+
+
 OUTCOMES = ("refused", "said", "harmless", "silent")
 
 
@@ -152,14 +173,11 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="where silent files are written")
     asked = parser.parse_args()
     begun = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(asked.jobs) as pool:
-        one = partial(run, seed=asked.seed, keep=asked.keep)
-        endings = []
-        for ending in pool.imap(one, range(asked.count), chunksize=20):
-            endings.append(ending)
-            if len(endings) % 1000 == 0:
-                silent = sum(each[2] == "silent" for each in endings)
-                print(f"{len(endings)} files, {silent} silent, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+    endings: list[Ending] = []
+    for part in all_parts(asked.count, asked.jobs, partial(run_part, seed=asked.seed, keep=asked.keep)):
+        endings += part
+        silent = sum(each[2] == "silent" for each in endings)
+        print(f"{len(endings)} files, {silent} silent, {time.monotonic() - begun:.0f} s", file=sys.stderr)
     text = table(endings)
     print(text)
     silent = sum(ending[2] == "silent" for ending in endings)
