@@ -96,23 +96,7 @@ def search_library(
     run = Run(progress)
     with run.phase("sampling"):
         view = view_scene(scene, detection, options.robust)
-    with run.phase("initializing"):
-        nearest = rank_by_signature(view, [one.model for one in library])
-        there = view.on(working_device(scene))
-        coarse = [_searched_coarsely(there, library[n], n, options, seed) for n, _ in nearest[: LIBRARY.shortlist]]
-        coarse.sort(key=lambda found: found[0])
-        worth = [found for found in coarse if found[0] <= coarse[0][0] + LIBRARY.margin][: LIBRARY.max_refined]
-    refined = []
-    with run.phase("optimizing"):
-        for taken, (_, number, poses) in enumerate(worth):
-            one, counted = library[number], CountingField(scene)
-            obj, generator = CountingField(one.field()), torch.Generator().manual_seed(seed)
-            problem = make_problem(view, one.model, counted, obj, options.robust, options.up_axis)
-            found = refine_poses(problem, poses, generator, partial(run.optimized, taken / len(worth)))
-            evaluation = evaluate_candidates(problem, found, options)
-            refined.append((evaluation, number, problem, counted.evaluations + obj.evaluations))
-        refined.sort(key=lambda found: found[0].rank)
-        told_apart = _decided(refined)
+    nearest, coarse, refined, told_apart = refined_objects(scene, view, library, options, seed, run)
     evaluation, number, problem, evaluations = refined[0]
     first = library[number]
     with run.phase("verifying"):
@@ -139,10 +123,42 @@ def search_library(
     return LibrarySearch(ranking, run.finish(result))
 
 
-_Refined = tuple[Evaluation, int, RegistrationProblem, int]
+Refined = tuple[Evaluation, int, RegistrationProblem, int]
+"""What one object came to: its best candidate, its number, its problem, and the evaluations of both fields."""
+Coarse = tuple[float, int, Sim3]
 
 
-def _decided(refined: list[_Refined]) -> list[Comparison]:
+def refined_objects(
+    scene: SdfField,
+    view: SceneView,
+    library: Sequence[LibraryObject],
+    options: RegistrationOptions,
+    seed: int,
+    run: Run,
+) -> tuple[list[tuple[int, float]], list[Coarse], list[Refined], list[Comparison]]:
+    """The objects nearest to the view by signature, those searched coarsely, those refined on their fields, each list
+    the best first, and what tells the first refined one from each of the others."""
+    with run.phase("initializing"):
+        nearest = rank_by_signature(view, [one.model for one in library])
+        there = view.on(working_device(scene))
+        coarse = [_searched_coarsely(there, library[n], n, options, seed) for n, _ in nearest[: LIBRARY.shortlist]]
+        coarse.sort(key=lambda found: found[0])
+        worth = [found for found in coarse if found[0] <= coarse[0][0] + LIBRARY.margin][: LIBRARY.max_refined]
+    refined = []
+    with run.phase("optimizing"):
+        for taken, (_, number, poses) in enumerate(worth):
+            one, counted = library[number], CountingField(scene)
+            obj, generator = CountingField(one.field()), torch.Generator().manual_seed(seed)
+            problem = make_problem(view, one.model, counted, obj, options.robust, options.up_axis)
+            found = refine_poses(problem, poses, generator, partial(run.optimized, taken / len(worth)))
+            evaluation = evaluate_candidates(problem, found, options)
+            refined.append((evaluation, number, problem, counted.evaluations + obj.evaluations))
+        refined.sort(key=lambda found: found[0].rank)
+        told_apart = _decided(refined)
+    return nearest, coarse, refined, told_apart
+
+
+def _decided(refined: list[Refined]) -> list[Comparison]:
     """Move the candidate that the surface speaks for by which it differs from the most probable one to the first place,
     but no rejected one before an accepted one. Returns what tells each of the others from the first."""
     placed = {found[1]: found[0].placed(found[2]) for found in refined}
@@ -166,7 +182,7 @@ def rank_by_signature(view: SceneView, models: Sequence[ObjectModel]) -> list[tu
 
 def _searched_coarsely(
     view: SceneView, one: LibraryObject, number: int, options: RegistrationOptions, seed: int
-) -> tuple[float, int, Sim3]:
+) -> Coarse:
     """The best pose's score (0..1, smaller is better), the number, and poses (H,), best first."""
     model, generator = one.model.on(view.foreground.points.device), torch.Generator().manual_seed(seed)
     bound = pose_bound(view, model, options.robust, options.up_axis)

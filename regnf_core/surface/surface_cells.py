@@ -86,6 +86,10 @@ class Cells(Bundle):
         """The cells that may hold surface."""
         return self[self.values.abs() <= _REACH * self.edge]
 
+    def halved(self, value: Callable[[Tensor], Tensor]) -> Cells:
+        """The eight halves of each."""
+        return _split(value, self)
+
     def few_or_thin(self, enough: int) -> bool:
         """Whether there are no more than ``enough`` cells, or the two faces of a thin object share them."""
         low, high = self.extent()
