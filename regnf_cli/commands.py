@@ -14,9 +14,9 @@ from regnf_cli.report import EXIT_BAD_INPUT, err, fail
 from regnf_core import __version__
 
 COMMANDS = {
-    "demo": "demo", "register": "register", "search": "register", "batch": "batch", "serve": "serve", "worker": "serve",
-    "inspect": "inspect", "convert": "convert", "fit": "fit", "fuse": "fit", "render": "render", "edit": "render",
-    "doctor": "doctor", "manual": "manual",
+    "demo": "demo", "register": "register", "search": "register", "populate": "populate", "compare": "populate",
+    "batch": "batch", "serve": "serve", "worker": "serve", "inspect": "inspect", "convert": "convert", "fit": "fit",
+    "fuse": "fit", "render": "render", "edit": "render", "doctor": "doctor", "manual": "manual",
 }  # fmt: skip
 """In the order of the help, each with its module. Its function has its name."""
 GROUPS = ("library",)

@@ -227,14 +227,14 @@ def search(
     )
     objects: list[FieldSource] = []
     if server is None or library:
-        for one in _objects_of(library, tag):
+        for one in objects_of(library, tag):
             chosen = cli.choice_of(object_config, no_config)
             objects += [cli.source_of(one, object_description, chosen, "object") if isinstance(one, Path) else one]
     client = cli.client_of(server, token, worker_timeout)
     answer(place, objects, request, Files(output), client, tag, cancel_on_interrupt, as_json, top)
 
 
-def _objects_of(named: list[Path] | None, tag: str | None) -> Iterator[FieldSource | Path]:
+def objects_of(named: list[Path] | None, tag: str | None) -> Iterator[FieldSource | Path]:
     """The entries and the files that are meant; without any path, the user's own library.
 
     Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE).

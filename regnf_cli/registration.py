@@ -146,7 +146,7 @@ def register_here(
         where = partial(place_of, seen, detection, options, name)
         if isinstance(objects, list):
             place = where()
-            library, unusable = _modeled(objects, options.robust, partial(report, "library"))
+            library, unusable = modeled(objects, options.robust, partial(report, "library"))
             found = search_library(place.field, place.box, library, place.options, seed, report, clouds=wanted)
             result, said["object_name"] = found.result, found.ranking[0].name
             said["candidates"] = ranking_document(found.ranking, unusable)
@@ -217,7 +217,7 @@ def _field_of(source: FieldSource) -> SdfField:
     return load_field(source).field
 
 
-def _modeled(
+def modeled(
     objects: list[FieldSource], options: RobustOptions, progress: Callable[[float], None]
 ) -> tuple[list[LibraryObject], dict[str, str]]:
     """The objects with their models, and of those that are none the reasons, by name. Raises NoSurfaceError: all."""

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from regnf_core.in_memory import FieldWarning, from_function, from_grid, from_mesh, from_points
     from regnf_core.loading import open_field
     from regnf_core.options import RegistrationOptions
+    from regnf_core.population.calls import Changes, compare, populate
+    from regnf_core.population.populate import Population
     from regnf_core.rendering.camera import Camera
     from regnf_core.rendering.request import RenderOptions
 
@@ -43,15 +45,17 @@ _NAMES = {
     "in_memory": ("FieldWarning", "from_function", "from_grid", "from_mesh", "from_points"),
     "loading": ("open_field",),
     "options": ("RegistrationOptions",),
+    "population.calls": ("Changes", "compare", "populate"),
+    "population.populate": ("Population",),
     "rendering.camera": ("Camera",),
     "rendering.request": ("RenderOptions",),
 }
 _HOMES = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names}
 __all__ = [
-    "BatchOutcome", "Camera", "FieldWarning", "Insertion", "OrientedBox", "Registered", "RegistrationOptions",
-    "RegistrationResult", "RegnfError", "Removal", "RenderOptions", "Replacement", "SdfField", "Search", "Sim3",
-    "Substitution", "__version__", "compose", "from_function", "from_grid", "from_mesh", "from_points", "open_field",
-    "register", "register_batch", "render", "search",
+    "BatchOutcome", "Camera", "Changes", "FieldWarning", "Insertion", "OrientedBox", "Population", "Registered",
+    "RegistrationOptions", "RegistrationResult", "RegnfError", "Removal", "RenderOptions", "Replacement", "SdfField",
+    "Search", "Sim3", "Substitution", "__version__", "compare", "compose", "from_function", "from_grid", "from_mesh",
+    "from_points", "open_field", "populate", "register", "register_batch", "render", "search",
 ]  # fmt: skip
 
 

@@ -371,25 +371,36 @@ def search(
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
     chosen.require_robust("searches a library", reason="PRESET_UNSUITABLE")
-    named = _named(objects)
-    paths = [one for one in named.values() if isinstance(one, str | os.PathLike)]
-    sources = [find_source(Path(one), role="object") for one in paths]
-    if isinstance(scene, str | os.PathLike):
-        sources.append(find_source(Path(scene), role="scene"))
-    import_smallest_first(sources)
+    library, unusable = modeled_library(objects, chosen.robust, [scene])
     place = opened(scene, "scene")
-    library, unusable = [], {}
-    for name, one in named.items():
-        try:
-            library.append(_modeled(name, one, chosen.robust))
-        except NoSurfaceError as error:
-            unusable[name] = error.reason
-    if not library:
-        raise NoSurfaceError("no object has a surface", reason="NO_SURFACE_IN_OBJECT")
     found = search_library(place.field, box, library, chosen, seed, progress, clouds)
     first = found.ranking[0].name
     notes = None if place.notes is None else {"scene": place.notes}
     return Search(found.ranking, Registered.of(found.result, first, notes, box), unusable)
+
+
+def modeled_library(
+    objects: Objects, options: RobustOptions, scenes: Sequence[FieldLike]
+) -> tuple[list[LibraryObject], dict[str, str]]:
+    """The objects with their models, and of objects without a surface the reasons, by name. Files are imported, also
+    those of the scenes, the smallest first.
+
+    Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE, NO_FIELD), NoSurfaceError: no object has a surface.
+    """
+    named = _named(objects)
+    paths = [one for one in named.values() if isinstance(one, str | os.PathLike)]
+    sources = [find_source(Path(one), role="object") for one in paths]
+    sources += [find_source(Path(one), role="scene") for one in scenes if isinstance(one, str | os.PathLike)]
+    import_smallest_first(sources)
+    library, unusable = [], {}
+    for name, one in named.items():
+        try:
+            library.append(_modeled(name, one, options))
+        except NoSurfaceError as error:
+            unusable[name] = error.reason
+    if not library:
+        raise NoSurfaceError("no object has a surface", reason="NO_SURFACE_IN_OBJECT")
+    return library, unusable
 
 
 def _named(objects: Objects) -> dict[str, FieldLike | LibraryObject]:

@@ -73,6 +73,12 @@ def cases_of(home: Path, by: ObservedBy = "images") -> Iterator[WorldCase]:
         yield replace(case, facts=case.facts | told)
 
 
+def room_field(home: Path, by: ObservedBy = "images") -> tuple[SdfField, dict[str, Any]]:
+    """The map of a world in the room's own frame, in meters, and what ``world.json`` says."""
+    world = json.loads((home / WORLD).read_text())
+    return _observed(home, _scene(home, world), by), world
+
+
 def _case(
     home: Path, number: int, said: tuple[dict[str, Any], dict[str, Any]], scene: SdfField, seen: Observation
 ) -> WorldCase:

@@ -62,7 +62,7 @@ def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:
     """
     points = points.double()
     placed = T.apply_inverse(points)
-    alike = _alike(symmetry).apply_inverse(points)
+    alike = alike_poses(symmetry).apply_inverse(points)
     rows = []
     for number in range(len(T)):
         pose = T[number]
@@ -72,7 +72,7 @@ def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:
     return torch.stack(rows)
 
 
-def _alike(symmetry: SelfSymmetry) -> Sim3:
+def alike_poses(symmetry: SelfSymmetry) -> Sim3:
     """(K,) the object's symmetries, the identity among them, with turns about its axis in small steps."""
     identity = Sim3.identity()[None]
     exact = Sim3.cat([identity, symmetry.T[symmetry.deviation <= MODEL.max_deviating_share]])

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,7 +41,7 @@ Mask = NDArray[np.bool_]
 # The surface of a whole scene.
 
 _BASE, _LEVELS = 16, 4
-"""Cells along the scene's longest edge, and how often those near the surface are halved before the boundary is found."""
+"""Cells along the scene's longest edge; how often those near the surface are halved before the boundary is found."""
 _MOST_HALVINGS, _MOST_SAMPLES = 2, 180_000
 """What is not boundary is halved further, so often at most, while there are no more samples than this."""
 
@@ -62,12 +62,13 @@ class BoundaryPlane:
 @dataclass(frozen=True, eq=False)
 class SceneSurface:
     """Samples of a scene's surface without its boundary. points, normals: (N, 3), scene frame · spacing: between
-    samples, scene units · boundary: the planes, the largest first."""
+    samples, scene units · boundary: the planes, the largest first · cut: what is lower above them was left out."""
 
     points: Floats
     normals: Floats
     spacing: float
     boundary: list[BoundaryPlane] = field(default_factory=list)
+    cut: float = 0.0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -101,20 +102,20 @@ def scene_surface(scene: SdfField) -> SceneSurface:
     points, normals = samples(cells)
     require_surface(len(points), of_object=False)
     planes = boundary_planes(points.numpy(), normals.numpy(), cells.edge)
-    free = _off_boundary(points.numpy(), planes, cells.edge)
-    halvings = 0
+    halvings, cut = 0, _THICK * cells.edge
+    free = _off_boundary(points.numpy(), planes, cut)
     while halvings < _MOST_HALVINGS and 4 * free.sum() <= _MOST_SAMPLES:
-        near = _off_boundary(cells.centers.numpy(), planes, cells.edge)
+        near = _off_boundary(cells.centers.numpy(), planes, cut)
         cells = cells[torch.from_numpy(near)].halved(field.value).near()
         points, normals = samples(cells)
-        free = _off_boundary(points.numpy(), planes, cells.edge)
+        free = _off_boundary(points.numpy(), planes, cut)
         halvings += 1
     own = frame.out_of(points).numpy()[free]
     moved = [
         BoundaryPlane(one.normal, one.offset * frame.length + float(one.normal @ frame.center.numpy()))
         for one in planes
     ]
-    return SceneSurface(own, normals.numpy()[free], cells.edge * frame.length, moved)
+    return SceneSurface(own, normals.numpy()[free], cells.edge * frame.length, moved, cut * frame.length)
 
 
 # Planes.
@@ -154,14 +155,14 @@ def boundary_planes(points: Floats, normals: Floats, spacing: float) -> list[Bou
     rng, thick = np.random.default_rng(0), _THICK * spacing
     asked = rng.permutation(len(points))[:_ASKED]
     points, normals = points[asked], normals[asked]
-    whole, found, rest = np.ptp(points, axis=0), list[BoundaryPlane](), np.arange(len(points))
+    found, rest = list[BoundaryPlane](), np.arange(len(points))
     while len(rest) and len(found) < _MOST_PLANES:
         tried = _Planes.through(points[rest], normals[rest], thick, rng)
         counts, heights = tried.on.sum(0), points @ tried.normals.T - tried.offsets
         # What faces the other way is the far side of the same floor or wall.
         behind = ((heights < -2 * thick) & (normals @ tried.normals.T > -_FACING)).sum(0)
         counts[behind > _MOST_BEHIND * counts] = 0
-        counts[[not _spans(points[rest[mask]], whole) for mask in tried.on.T]] = 0
+        counts[[not _spans(points[rest[mask]], points) for mask in tried.on.T]] = 0
         best = int(counts.argmax())
         if counts[best] < _LEAST_SHARE * len(points):
             break
@@ -170,18 +171,21 @@ def boundary_planes(points: Floats, normals: Floats, spacing: float) -> list[Bou
     return found
 
 
-def _off_boundary(points: Floats, planes: Sequence[BoundaryPlane], spacing: float) -> Mask:
+def _off_boundary(points: Floats, planes: Sequence[BoundaryPlane], cut: float) -> Mask:
     free = np.ones(len(points), bool)
     for one in planes:
-        free &= one.height(points) > _THICK * spacing
+        free &= one.height(points) > cut
     return free
 
 
 def _spans(points: Floats, whole: Floats) -> bool:
+    """Whether the points of a plane go on through much of the ``whole`` scene, along both of their axes."""
     if len(points) < _LEAST_ON_PLANE:
         return False
-    low, high = np.quantile(points, [0.02, 0.98], axis=0)
-    return bool(np.sort((high - low) / whole)[1] >= _SPAN)
+    middle = points.mean(0)
+    axes = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 1:]
+    own, all_ = (np.diff(np.quantile(one @ axes, [0.02, 0.98], axis=0), axis=0)[0] for one in (points, whole))
+    return bool((own >= _SPAN * all_).all())
 
 
 def _fitted(points: Floats, normal: Floats) -> tuple[Floats, float]:
@@ -401,15 +405,37 @@ def proposals(surface: SceneSurface, free: Mask, most: int, known: Sequence[Inte
         near, own = whole.within(mask), numbers[mask]
         found += [(cost, own[samples]) for cost, samples in unions(near, _atoms(near, surface.spacing))]
     found.sort(key=lambda one: (-one[0], -len(one[1])))
-    up, kept = surface.boundary[0].normal if surface.boundary else np.array([0.0, 0.0, 1.0]), list[Proposal]()
-    taken = list(known)
+    kept, taken = list[Proposal](), list(known)
     for cost, samples in found:
         if len(kept) == most:
             break
         if not any(_same(samples, other) for other in taken):
             taken.append(samples)
-            kept.append(Proposal(box_around(surface.points[samples], up, surface.spacing), samples, cost))
+            kept.append(Proposal(_box(surface, samples), samples, cost))
     return kept
+
+
+def pieces(surface: SceneSurface, free: Mask) -> Iterator[Proposal]:
+    """The connected pieces of the samples that ``free`` (N,) names, the largest first."""
+    numbers = np.flatnonzero(free)
+    if not len(numbers):
+        return
+    near = Neighborhood.of(surface.points[numbers], surface.normals[numbers], surface.spacing)
+    label = _components(near.pairs, len(numbers))
+    sizes = np.bincount(label)
+    for piece in np.argsort(-sizes, kind="stable")[: int((sizes >= _LEAST_SAMPLES).sum())]:
+        samples = numbers[label == piece]
+        yield Proposal(_box(surface, samples), samples, math.inf)
+
+
+def _box(surface: SceneSurface, samples: Integers) -> OrientedBox:
+    """The smallest box around samples that has an axis across one of the scene's boundary planes."""
+    across: list[Floats] = []
+    for normal in (*(one.normal for one in surface.boundary), np.array([0.0, 0.0, 1.0])):
+        if all(abs(float(normal @ other)) < _FACING for other in across):
+            across.append(normal)
+    boxes = [box_around(surface.points[samples], normal, surface.spacing) for normal in across]
+    return min(boxes, key=lambda box: float(box.size.prod()))
 
 
 def _same(one: Integers, other: Integers) -> bool:

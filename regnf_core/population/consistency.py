@@ -1,4 +1,5 @@
-"""Which placements can stand together: no surface explained twice, no matter shared, nothing behind floor or walls.
+"""Which placements can stand together: no surface explained twice, no matter shared, nothing behind floor or walls, one
+size of each object.
 
 Each placement has the probability p of its pose by itself. Sets of placements without conflict are compared by the
 product of the odds p / (1 - p) of their members: a placement's probability among the others is the share of the sets
@@ -17,13 +18,15 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from regnf_core.library import LibraryObject
-from regnf_core.populate.placements import Placement
-from regnf_core.populate.proposals import Floats, Mask, SceneSurface
+from regnf_core.population.placements import Placement, placed_samples
+from regnf_core.population.proposals import Floats, Mask, SceneSurface
 
 _SHARED_SURFACE = 0.25
 """Of the samples that the smaller of two placements explains: with more in common they explain the same surface."""
 _DEEP, _DEEP_SHARE = 1.0, 0.02
 """Spacings that one placed surface may lie within another one or behind the boundary, but for so many samples."""
+_SAME_SCALE = 1.1
+"""Ratio of the scales of two placements of one object, at most: it has one size."""
 _MOST_TOGETHER = 14
 """Placements that exclude each other, of which all sets are looked at; of more, the most probable."""
 
@@ -45,7 +48,7 @@ def _same_surface(one: Placement, other: Placement) -> bool:
 
 def within_boundary(placement: Placement, library: Sequence[LibraryObject], surface: SceneSurface) -> bool:
     """Whether the placed object stands in front of floor and walls."""
-    points = _placed(placement, library).numpy()
+    points = placed_samples(library[placement.number].model, placement.T_object_scene).numpy()
     return all((plane.height(points) < -_DEEP * surface.spacing).mean() <= _DEEP_SHARE for plane in surface.boundary)
 
 
@@ -53,22 +56,25 @@ def conflicts(placements: Sequence[Placement], library: Sequence[LibraryObject],
     """(K, K): which pairs cannot stand together."""
     count = len(placements)
     found = np.zeros((count, count), bool)
-    points = [_placed(one, library) for one in placements]
+    points = [placed_samples(library[one.number].model, one.T_object_scene) for one in placements]
     ends = [(one.amin(0), one.amax(0)) for one in points]
     for a in range(count):
         for b in range(a):
             apart = bool((ends[a][0] > ends[b][1]).any() or (ends[b][0] > ends[a][1]).any())
-            found[a, b] = found[b, a] = not apart and (
-                _same_surface(placements[a], placements[b])
-                or _enters(points[a], placements[b], library, spacing)
-                or _enters(points[b], placements[a], library, spacing)
+            found[a, b] = found[b, a] = _of_two_sizes(placements[a], placements[b]) or (
+                not apart
+                and (
+                    _same_surface(placements[a], placements[b])
+                    or _enters(points[a], placements[b], library, spacing)
+                    or _enters(points[b], placements[a], library, spacing)
+                )
             )
     return found
 
 
-def _placed(placement: Placement, library: Sequence[LibraryObject]) -> torch.Tensor:
-    model = library[placement.number].model
-    return placement.T_object_scene.apply_inverse(model.frame.out_of(model.samples.on_surface()))
+def _of_two_sizes(one: Placement, other: Placement) -> bool:
+    ratio = float(one.T_object_scene.scale / other.T_object_scene.scale)
+    return one.number == other.number and max(ratio, 1.0 / ratio) > _SAME_SCALE
 
 
 def _enters(points: torch.Tensor, other: Placement, library: Sequence[LibraryObject], spacing: float) -> bool:

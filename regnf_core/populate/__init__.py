@@ -1,1 +1,0 @@
-"""A whole scene populated with a library's objects: proposals, placements, and what can stand together."""
