@@ -24,7 +24,7 @@ from regnf_core.importing.families.layers import (
     strip_prefix,
 )
 from regnf_core.importing.families.radiance_field import Radiance
-from regnf_core.importing.radiance.density import Level, RadianceField, fused_layers, plain_levels, tiny_levels
+from regnf_core.importing.radiance.density import Level, Pairs, RadianceField, fused_layers, plain_levels, tiny_levels
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
@@ -104,7 +104,7 @@ def read_radiance(checkpoint: dict[Any, Any], source: TensorSource, overrides: U
         if not (low < high).all():
             raise FieldFormatError("the aabb is empty", reason="BOUNDS_INVALID")
     kind = "tiny-cuda-nn's layout" if names.tiny else "plain PyTorch's layout"
-    why = f"tensors {names.table.rpartition('.')[0]}*, {kind}: {told}, {len(layers.weights)} layers"
+    why = f"tensors {names.table.rpartition('.')[0]}*, {kind}: {told}, {len(layers)} layers"
     text = "without config.yml the trainer's defaults are taken: " + ", ".join(assumed)
     field = RadianceField(levels, layers, low, high, contracted, factor, _NEAR)
     return Radiance(FAMILY, field, (low, high), why, (f"SETTINGS_ASSUMED: {text}",) if assumed else ())
@@ -122,7 +122,7 @@ def _named(checkpoint: dict[Any, Any]) -> tuple[dict[str, Any], _Names | None]:
 
 def _density(
     state: dict[str, Any], names: _Names, source: TensorSource, overrides: UploadDescription, assumed: list[str]
-) -> tuple[tuple[Level, ...], Layers, str]:
+) -> tuple[tuple[Level, ...], Pairs, str]:
     """The grid, the network, and a few words. What nobody says goes to ``assumed``."""
     table = source.array(names.table, state[names.table])
     require_shape(names.table, table, (None,) if names.tiny else (None, None))
@@ -132,7 +132,8 @@ def _density(
     if not names.tiny:
         if table.shape != (grid.levels << grid.log2, grid.features):
             raise contradiction("hash", f"{grid.levels} levels of 2^{grid.log2} entries", f"{table.shape}")
-        layers = _plain_network(state, names.network, source, width)
+        plain = _plain_network(state, names.network, source, width)
+        layers = tuple(zip(plain.weights, plain.biases, strict=True))
         return plain_levels(grid.base, grid.top, table, grid.levels), layers, told
     if width % _BLOCK:
         message = f"a hash grid of {width} columns, which tiny-cuda-nn fills up, is not supported: export a mesh"

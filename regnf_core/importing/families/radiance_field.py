@@ -52,14 +52,18 @@ class Radiance:
 
 
 def surface_of(
-    radiance: Radiance, cameras: Trained | None, overrides: UploadDescription, tensor_bytes: int
+    radiance: Radiance, cameras: Trained | None, overrides: UploadDescription, tensor_bytes: int, most_s: float
 ) -> ConvertedField:
-    """The field of what the cameras see.
+    """The field of what the cameras see. most_s: seconds that the density may take.
 
-    Raises FieldFormatError: CAMERAS_NOT_RECOGNIZED where there are none, CAMERAS_OF_ANOTHER_FRAME, NO_ZERO_LEVEL.
+    Raises FieldFormatError: CAMERAS_NOT_RECOGNIZED where there are none, CAMERAS_OF_ANOTHER_FRAME, NO_ZERO_LEVEL,
+    IMPORT_TOO_COSTLY.
     """
     if cameras is None:
         raise FieldFormatError(f"{radiance.family}: {WITHOUT_CAMERAS}", reason="CAMERAS_NOT_RECOGNIZED")
+    if (seconds := VOXELS**3 * radiance.field.seconds) > most_s:
+        message = f"the density may take an estimated {seconds:.0f} s in {VOXELS}^3 places; {most_s:g} s are allowed"
+        raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
     field, T_file_field = radiance.field, into_file(overrides, cameras, np.zeros(3))
     region = _region(radiance, cameras, T_file_field, overrides)
     placed = given_cameras(cameras, T_file_field, _MOST_CAMERAS, _PIXELS)

@@ -173,7 +173,7 @@ class _Trained:
         """Of such a field: the frame is the dataset's, whose cameras they are, if it is known and no other is said."""
 
     def surface(
-        self, radiance: Radiance, said: UploadDescription, tensor_bytes: int, own: Trajectory | None = None
+        self, radiance: Radiance, said: UploadDescription, limits: ImportLimits, own: Trajectory | None = None
     ) -> ConvertedField:
         """The field of what the cameras see. own: in the file, in its frame. Raises FieldFormatError."""
         from regnf_core.importing.families.radiance_field import surface_of
@@ -184,8 +184,8 @@ class _Trained:
         known = cameras is not None and said.dataset_transform is not None and said.frame is None
         self.description = replace(said, frame="dataset") if known else said
         if cameras is None and own is not None:
-            return surface_of(radiance, own, replace(said, dataset_transform=None), tensor_bytes)
-        return surface_of(radiance, cameras, said, tensor_bytes)
+            cameras, said = own, replace(said, dataset_transform=None)
+        return surface_of(radiance, cameras, said, limits.tensor_bytes, limits.refused_beyond_s)
 
 
 def _convert(
@@ -199,7 +199,7 @@ def _convert(
     head = bytes(data[:HEAD_BYTES])
     kind = sniff_format(head)
     if kind in ("torch-zip", "torch-legacy"):
-        return _convert_torch(kind, opened, tensor_bytes, describe, trained)
+        return _convert_torch(kind, opened, limits, describe, trained)
     if kind == "instant-ngp":
         return _convert_snapshot(opened.data, limits, describe, trained)
     if kind == "npz":
@@ -231,18 +231,18 @@ def _convert(
 
 
 def _convert_snapshot(data: memoryview, limits: ImportLimits, describe: Describe, trained: _Trained) -> ConvertedField:
-    from regnf_core.importing.families.instant_ngp import cameras_of, read_radiance, snapshot_of, to_dataset
-    from regnf_core.importing.radiance.msgpack import read_msgpack, unpacked
     from regnf_core.importing.settings.facts import Facts
+    from regnf_core.importing.snapshots.instant_ngp import cameras_of, read_radiance, snapshot_of, to_dataset
+    from regnf_core.importing.snapshots.msgpack import read_msgpack, unpacked
 
     snapshot, said = snapshot_of(read_msgpack(unpacked(data, limits.file_bytes))), describe(Facts())
     radiance = read_radiance(snapshot, limits.tensor_bytes, said)
     said = replace(said, dataset_transform=said.dataset_transform or to_dataset(snapshot))
-    return trained.surface(radiance, said, limits.tensor_bytes, cameras_of(snapshot))
+    return trained.surface(radiance, said, limits, cameras_of(snapshot))
 
 
 def _convert_torch(
-    kind: str, opened: OpenedUpload, tensor_bytes: int, describe: Describe, trained: _Trained
+    kind: str, opened: OpenedUpload, limits: ImportLimits, describe: Describe, trained: _Trained
 ) -> ConvertedField:
     from regnf_core.importing.containers.legacy_container import read_archive, read_legacy
     from regnf_core.importing.families import convert_checkpoint, nerfacto
@@ -253,14 +253,14 @@ def _convert_torch(
     source: TensorSource
     if kind == "torch-zip":
         archive = read_archive(opened.data, members=opened.members)
-        values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes)
+        values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, limits.tensor_bytes)
     else:
         values, legacy = read_legacy(opened.data)
-        source = TensorSource(legacy, tensor_bytes)
+        source = TensorSource(legacy, limits.tensor_bytes)
     said = describe(facts_of(values, source))
     radiance = nerfacto.read_radiance(values, source, said)
     if radiance is not None:
-        return trained.surface(radiance, said, source.left)
+        return trained.surface(radiance, said, limits)
     return convert_checkpoint(values, source, said)
 
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families.layers import Layers
 from regnf_core.importing.radiance.density import RadianceField, fused_layers, plain_levels, tiny_levels
 from regnf_core.importing.radiance.depths import depth_images, sampled
 from regnf_core.importing.splats.drawing import Camera
@@ -24,7 +23,7 @@ def field_of(fitted: Fitted, low: float = 0.0, high: float = 1.0, contracted: bo
     corners = np.full(3, low), np.full(3, high)
     if not grid.tiny:
         levels = plain_levels(grid.base, grid.top, fitted.table, grid.levels)
-        layers = Layers((network.first, network.last[:1]), (network.first_bias, network.last_bias[:1]))
+        layers = ((network.first, network.first_bias), (network.last[:1], network.last_bias[:1]))
         return RadianceField(levels, layers, *corners, contracted, 0.5, 0.0)
     config = HashGridConfig.from_top_resolution(
         grid.top,
@@ -81,8 +80,9 @@ def test_fused_layers_need_their_very_number() -> None:
     first, hidden, last = (RANDOM.normal(size=shape).astype(np.float32) for shape in ((64, 32), (64, 64), (16, 64)))
     flat = np.concatenate([first.ravel(), hidden.ravel(), last.ravel()])
     layers = fused_layers(flat, 32, 2)
-    for found, wanted in zip(layers.weights, (first, hidden, last[:1]), strict=True):
+    for (found, bias), wanted in zip(layers, (first, hidden, last[:1]), strict=True):
         np.testing.assert_array_equal(found, wanted)
+        assert not bias.any()
     for wrong, hidden_layers in ((flat[:-1], 2), (flat, 1), (flat, 0), (flat, 9)):
         with pytest.raises(FieldFormatError) as caught:
             fused_layers(wrong, 32, hidden_layers)

@@ -9,7 +9,7 @@ import msgpack
 import pytest
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.radiance.msgpack import read_msgpack, unpacked
+from regnf_core.importing.snapshots.msgpack import read_msgpack, unpacked
 
 NUMBERS = [
     0,

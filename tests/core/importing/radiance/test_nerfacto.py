@@ -52,7 +52,7 @@ class Imported:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Imported:
     """Of plain PyTorch, all files in one archive as nerfstudio leaves them, and the dataset's transforms.json."""
     folder = tmp_path_factory.mktemp("run")
-    poses = [scenes.into_dataset(pose) for pose in scenes.cameras(16)]
+    poses = [scenes.into_dataset(pose) for pose in scenes.cameras(12)]
     trained = scenes.checkpoint(folder / "trained", scenes.state_of(scenes.nerfacto(tiny=False)))
     with zipfile.ZipFile(folder / "run.zip", "w") as archive:
         for name, text in SETTINGS.items():
@@ -71,7 +71,7 @@ def into_dataset(points: Doubles) -> Doubles:
 def test_a_run_is_named_for_what_it_is(run: Imported) -> None:
     assert run.report["family"] == "nerfstudio_nerfacto"
     assert "8 levels of 2, 8 to 220 nodes" in run.report["why"][1]
-    assert "16 of the 16 cameras" in run.report["why"][2]
+    assert "12 of the 12 cameras" in run.report["why"][2]
     assert any("in the dataset's frame" in line for line in run.report["why"])
     words = [line.partition(":")[0] for line in run.report["warnings"]]
     assert words == ["SURFACE_RECONSTRUCTED"]
@@ -113,7 +113,7 @@ def test_the_confined_process_sees_by_given_cameras_in_the_trainers_frame(tmp_pa
     """tiny-cuda-nn's one vector, without settings: what is assumed is said."""
     upload = scenes.checkpoint(tmp_path / "upload", scenes.state_of(scenes.nerfacto(tiny=True)))
     cameras = tmp_path / "transforms.json"
-    cameras.write_text(json.dumps(scenes.transforms(scenes.cameras(5))))
+    cameras.write_text(json.dumps(scenes.transforms(scenes.cameras(4))))
     said = BASE | {"bounds": [[-0.6, -0.6, -0.4], [0.7, 0.6, 0.3]]}
     report = import_field(upload, tmp_path / "out", said, cameras=cameras)
     assert report.family == "nerfstudio_nerfacto"
@@ -193,6 +193,21 @@ def test_faint_fog_has_no_surface(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(json.dumps(scenes.transforms(scenes.cameras(4))))
     error = refusal(upload, BASE, tmp_path / "transforms.json")
     assert error.reason == "NO_ZERO_LEVEL"
+
+
+def test_a_network_that_would_take_hours_is_refused(tmp_path: Path) -> None:
+    """1024 neurons in each of six layers: about 2^24 places times 4 million weights."""
+    state = scenes.state_of(scenes.nerfacto(False))
+    layers = "mlp_base.model.1.layers."
+    shapes = [(1024, 16), *[(1024, 1024)] * 4, (16, 1024)]
+    for number, shape in enumerate(shapes):
+        state |= {f"{layers}{number}.weight": torch.zeros(shape), f"{layers}{number}.bias": torch.zeros(shape[0])}
+    upload = scenes.checkpoint(tmp_path / "a", state)
+    (tmp_path / "transforms.json").write_text(json.dumps(scenes.transforms(scenes.cameras(2))))
+    beside = Companions(cameras=("transforms.json", tmp_path / "transforms.json"))
+    with pytest.raises(FieldFormatError) as caught:
+        convert_file(upload, tmp_path, BASE, ImportLimits(wall_s=120.0), beside=beside)
+    assert caught.value.reason == "IMPORT_TOO_COSTLY"
 
 
 def test_layouts_that_do_not_fit_are_refused(tmp_path: Path) -> None:

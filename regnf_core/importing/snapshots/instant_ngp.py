@@ -87,7 +87,7 @@ def read_radiance(keys: Keys, tensor_bytes: int, overrides: UploadDescription) -
     step = keys.whole("snapshot.training_step") or 0
     why = (
         f"instant-ngp's snapshot, step {step}: {config.levels} levels of {config.features_per_level}, "
-        f"{len(layers.weights)} layers; the density's activation is taken for the exponential"
+        f"{len(layers)} layers; the density's activation is taken for the exponential"
     )
     return Radiance(FAMILY, field, reach, why)
 
