@@ -6,13 +6,14 @@ and corrected poses are left behind: where a camera stands a little beside its o
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import Float32Array, require_shape
+from regnf_core.importing.arrays import require_shape
 from regnf_core.importing.families.layers import (
     Layers,
     contradiction,
@@ -38,42 +39,30 @@ _NEAR = 0.05
 """From where on the trainer samples rays."""
 _OTHER = "mlp_background_color."
 """Of generfacto, whose other tensors have the same names."""
-_BLOCK, _HIDDEN = 16, 1
-_BASE = 16
+_BLOCK, _WIDTHS = 16, (64, 128, 256, 32, 16)
+_BASE, _FARTHEST = 16, 1e6
 _DENSITY = 0.01
 """``average_init_density`` of the usual configurations, since releases have it."""
 
 
 @dataclass(frozen=True)
 class _Names:
-    """Of tensors. one: grid and network in one vector · has_factor: whether releases of these names may multiply the
+    """Of tensors: grid and network may be in one. has_factor: whether releases with these names may multiply the
     density."""
 
     table: str
     network: str
     tiny: bool
-    one: bool = False
     has_factor: bool = False
 
 
 _NAMES = (
     _Names("mlp_base.model.0.hash_table", "mlp_base.model.1.layers.", tiny=False, has_factor=True),
-    _Names("mlp_base.model.params", "mlp_base.model.params", tiny=True, one=True, has_factor=True),
+    _Names("mlp_base.model.params", "mlp_base.model.params", tiny=True, has_factor=True),
     _Names("mlp_base.0.hash_table", "mlp_base.1.layers.", tiny=False),
     _Names("mlp_base.0.tcnn_encoding.params", "mlp_base.1.tcnn_encoding.params", tiny=True),
-    _Names("mlp_base.params", "mlp_base.params", tiny=True, one=True),
+    _Names("mlp_base.params", "mlp_base.params", tiny=True),
 )
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """What is known of the grid; None where nobody says."""
-
-    levels: int
-    features: int
-    log2: int
-    base: int
-    top: int
 
 
 def read_radiance(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> Radiance | None:
@@ -101,8 +90,8 @@ def read_radiance(checkpoint: dict[Any, Any], source: TensorSource, overrides: U
         box = source.array("aabb", state["aabb"])
         require_shape("aabb", box, (2, 3))
         low, high = box.astype(np.float64)
-        if not (low < high).all():
-            raise FieldFormatError("the aabb is empty", reason="BOUNDS_INVALID")
+        if not (low < high).all() or np.abs(box).max() > _FARTHEST:
+            raise FieldFormatError("the aabb is empty, or too far away", reason="BOUNDS_INVALID")
     kind = "tiny-cuda-nn's layout" if names.tiny else "plain PyTorch's layout"
     why = f"tensors {names.table.rpartition('.')[0]}*, {kind}: {told}, {len(layers)} layers"
     text = "without config.yml the trainer's defaults are taken: " + ", ".join(assumed)
@@ -126,50 +115,28 @@ def _density(
     """The grid, the network, and a few words. What nobody says goes to ``assumed``."""
     table = source.array(names.table, state[names.table])
     require_shape(names.table, table, (None,) if names.tiny else (None, None))
-    grid = _grid(state, source, overrides, 2 if names.tiny else table.shape[1], assumed)
-    width = grid.levels * grid.features
-    told = f"{grid.levels} levels of {grid.features}, {grid.base} to {grid.top} nodes"
+    grid, top = _grid(state, source, overrides, 2 if names.tiny else table.shape[1], assumed)
+    told = f"{grid.levels} levels of {grid.features_per_level}, {grid.base_resolution} to {top} nodes"
     if not names.tiny:
-        if table.shape != (grid.levels << grid.log2, grid.features):
-            raise contradiction("hash", f"{grid.levels} levels of 2^{grid.log2} entries", f"{table.shape}")
-        plain = _plain_network(state, names.network, source, width)
+        if table.shape != (grid.levels << grid.log2_table_size, grid.features_per_level):
+            raise contradiction("hash", f"{grid.levels} levels of 2^{grid.log2_table_size} entries", f"{table.shape}")
+        plain = _plain_network(state, names.network, source, grid.width)
         layers = tuple(zip(plain.weights, plain.biases, strict=True))
-        return plain_levels(grid.base, grid.top, table, grid.levels), layers, told
-    if width % _BLOCK:
-        message = f"a hash grid of {width} columns, which tiny-cuda-nn fills up, is not supported: export a mesh"
+        return plain_levels(grid.base_resolution, top, table, grid.levels), layers, told
+    if grid.width % _BLOCK:
+        message = f"a hash grid of {grid.width} columns, which tiny-cuda-nn fills up, is not supported: export a mesh"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
-    values = {"features_per_level": grid.features, "log2_table_size": grid.log2, "base_resolution": grid.base}
-    config = HashGridConfig.from_top_resolution(grid.top, levels=grid.levels, interpolation="linear", **values)
-    if not names.one:
-        flat = source.array(names.network, state.get(names.network))
-    else:
-        flat, table = _parted(table, config)
-    require_shape(names.network, flat, (None,))
-    if table.size % grid.features:
-        raise contradiction("hash.features_per_level", grid.features, f"{table.size} numbers")
-    config = _fitting(config, table.size // grid.features)
-    return tiny_levels(config, table), fused_layers(flat, width, _HIDDEN), told
-
-
-def _parted(values: Float32Array, config: HashGridConfig) -> tuple[Float32Array, Float32Array]:
-    """Network and table in one vector, the network first: the number of its neurons tells where it ends."""
-    for width in (64, 128, 256, 32, 16):
-        split = width * (config.width + _BLOCK)
-        entries, rest = divmod(values.size - split, config.features_per_level)
-        if not rest and entries > 0:
-            try:
-                config.with_entry_count(entries)
-            except FieldFormatError:
-                continue
-            return values[:split], values[split:]
-    raise _not_recognized(f"{values.size} numbers")
-
-
-def _fitting(config: HashGridConfig, entries: int) -> HashGridConfig:
-    try:
-        return config.with_entry_count(entries)
-    except FieldFormatError as error:
-        raise _not_recognized(f"{entries} rows") from error
+    sizes = [width * (grid.width + _BLOCK) for width in _WIDTHS]
+    if names.network != names.table:
+        own = source.array(names.network, state.get(names.network)).ravel()
+        table, sizes = np.concatenate([own, table]), [own.size]
+    for size in sizes:  # of the network, which comes first: the number of its neurons is not stored
+        entries, rest = divmod(table.size - size, grid.features_per_level)
+        with contextlib.suppress(FieldFormatError):
+            if not rest:
+                fitting = grid.with_entry_count(entries)
+                return tiny_levels(fitting, table[size:]), fused_layers(table[:size], grid.width, 1), told
+    raise _not_recognized(f"{table.size} numbers")
 
 
 def _plain_network(state: dict[str, Any], prefix: str, source: TensorSource, width: int) -> Layers:
@@ -183,8 +150,8 @@ def _plain_network(state: dict[str, Any], prefix: str, source: TensorSource, wid
 
 def _grid(
     state: dict[str, Any], source: TensorSource, overrides: UploadDescription, features: int, assumed: list[str]
-) -> _Grid:
-    """By what the description and the checkpoint say, which must agree."""
+) -> tuple[HashGridConfig, int]:
+    """The grid and its finest resolution, by what the description and the checkpoint say, which must agree."""
     said = overrides.hash
     if said.interpolation not in (None, "linear") or said.radius is not None or said.per_level_scale is not None:
         message = f"description.hash: interpolation, radius and per_level_scale are not possible for {FAMILY}"
@@ -197,7 +164,8 @@ def _grid(
         assumed.append(f"the coarsest level has {_BASE} nodes")
     if top < base:
         raise contradiction("hash.top_resolution", top, f"a coarsest level of {base} nodes")
-    return _Grid(levels, said.features_per_level or features, log2, base, top)
+    values = {"levels": levels, "features_per_level": said.features_per_level or features, "log2_table_size": log2}
+    return HashGridConfig.from_top_resolution(top, base_resolution=base, interpolation="linear", **values), top
 
 
 def _stored(

@@ -17,7 +17,7 @@ from regnf_core.importing.families.layers import contradiction, refuse_other_ent
 from regnf_core.importing.families.radiance_field import Radiance
 from regnf_core.importing.observing.trajectory import MOST_CAMERAS, Intrinsics, Trajectory, trajectory_of
 from regnf_core.importing.radiance.density import RadianceField, fused_layers, tiny_levels
-from regnf_core.importing.settings.facts import Rows
+from regnf_core.importing.settings.facts import Rows, is_similarity
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.splats.gaussians import Doubles
 from regnf_core.importing.upload_description import UploadDescription
@@ -30,7 +30,7 @@ _TOP = 2048.0
 """Of the finest level along the unit cube, where the configuration has no growth."""
 _TYPES: dict[str, np.dtype[Any]] = {"__half": np.dtype("<f2"), "float": np.dtype("<f4")}
 _INSTEAD = "export its mesh (in the program: Export mesh), and give the mesh"
-_BLOCK = 16
+_BLOCK, _FARTHEST = 16, 1e6
 
 
 def snapshot_of(tree: Any) -> Keys:
@@ -80,7 +80,8 @@ def read_radiance(keys: Keys, tensor_bytes: int, overrides: UploadDescription) -
     field = RadianceField(tiny_levels(fitting, table), layers, low, high, False, 1.0, _NEAR, smooth)
     middle, half = (low + high) / 2.0, np.minimum((high - low) / 2.0, 1.0)
     reach = (middle - half, middle + half)
-    if keys.has("snapshot.render_aabb") and _is_identity(keys):
+    turn = keys.matrix("snapshot.render_aabb_to_local", 3, 3)
+    if keys.has("snapshot.render_aabb") and (turn is None or np.allclose(turn, np.eye(3))):
         crop = _box(keys, "snapshot.render_aabb")
         cut = np.maximum(reach[0], crop[0]), np.minimum(reach[1], crop[1])
         reach = cut if (cut[0] < cut[1]).all() else reach
@@ -94,23 +95,21 @@ def read_radiance(keys: Keys, tensor_bytes: int, overrides: UploadDescription) -
 
 def cameras_of(keys: Keys) -> Trajectory:
     """The cameras of the training, in the trainer's unit cube. Raises FieldFormatError: CAMERAS_MALFORMED."""
-    dataset = keys.below("snapshot.nerf.dataset")
-    poses, intrinsics = [], []
-    frames = dataset.find("xforms")
-    for index in range(min(len(frames) if isinstance(frames, list) else 0, MOST_CAMERAS)):
-        frame = Keys(keys.file, frames[index], f"xforms.{index}.")
-        rows = frame.matrix("start", 3, 4) if isinstance(frames[index], dict) else _bare(keys, frames[index])
-        seen = dataset.find("metadata")
-        one = Keys(keys.file, seen[index] if isinstance(seen, list) and index < len(seen) else None, "metadata.")
+    dataset = keys.find("snapshot.nerf.dataset")
+    frames, seen = (dataset[name] if isinstance(dataset.get(name), list) else [] for name in ("xforms", "metadata"))
+    poses, intrinsics = np.zeros((0, 4, 4)), []
+    for index, (frame, lens) in enumerate(zip(frames[:MOST_CAMERAS], seen, strict=False)):
+        # Releases without a rolling shutter have one pose.
+        pose = Keys(keys.file, frame if isinstance(frame, dict) else {"start": frame}, f"xforms.{index}.")
+        one, rows = Keys(keys.file, lens, f"metadata.{index}."), pose.matrix("start", 3, 4)
         told = [one.numbers(name) or [] for name in ("focal_length", "resolution", "principal_point")]
         if rows is None or any(len(values) != 2 for values in told):
             message = f"{keys.file}: camera {index} has no pose, focal_length, resolution or principal_point"
             raise FieldFormatError(message, reason="CAMERAS_MALFORMED")
-        poses.append(np.array([*rows, [0.0, 0.0, 0.0, 1.0]]))
+        poses = np.concatenate([poses, [[*rows, [0.0, 0.0, 0.0, 1.0]]]])
         (fx, fy), (width, height), (x, y) = told
         intrinsics.append(Intrinsics(fx, fy, x * width, y * height, width, height))
-    stacked = np.stack(poses) if poses else np.zeros((0, 4, 4))
-    return trajectory_of(keys.file, stacked, intrinsics, None)
+    return trajectory_of(keys.file, poses, intrinsics, None)
 
 
 def to_dataset(keys: Keys) -> Rows | None:
@@ -122,8 +121,9 @@ def to_dataset(keys: Keys) -> Rows | None:
     # cube = cycled(scale x + offset), where x y z becomes y z x
     turn = np.eye(3) if dataset.flag("from_mitsuba") else np.eye(3)[[2, 0, 1]]
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = turn / scale, -np.array(offset) / scale
-    return [[float(value) for value in row] for row in matrix]
+    with np.errstate(all="ignore"):
+        matrix[:3, :3], matrix[:3, 3] = turn / scale, -np.array(offset) / scale
+        return [[float(value) for value in row] for row in matrix] if is_similarity(matrix) else None
 
 
 def _grid(keys: Keys, grid: Keys) -> HashGridConfig:
@@ -137,7 +137,9 @@ def _grid(keys: Keys, grid: Keys) -> HashGridConfig:
         scale = keys.number("snapshot.nerf.aabb_scale") or keys.number("snapshot.nerf.dataset.aabb_scale") or 1.0
         growth = float(np.exp(np.log(np.float32(max(_TOP * scale / base, 1.0))) / max(levels - 1, 1)))
     smooth = (grid.text("interpolation") or "").lower() == "smoothstep"
-    bounded = 1 <= levels <= 32 and 1 <= features <= 8 and 3 <= log2 <= 24 and 2 <= base <= 1024 and growth <= 8.0
+    bounded = (
+        1 <= levels <= 32 and 1 <= features <= 8 and 3 <= log2 <= 24 and 2 <= base <= 1024 and 1.0 <= growth <= 8.0
+    )
     if not bounded:
         raise _unsupported(f"a grid of {levels} levels, 2^{log2} entries and growth {growth:g}")
     return HashGridConfig(levels, features, log2, base, growth, interpolation="smoothstep" if smooth else "linear")
@@ -146,7 +148,7 @@ def _grid(keys: Keys, grid: Keys) -> HashGridConfig:
 def _params(keys: Keys, tensor_bytes: int) -> Float32Array:
     name, raw = str(keys.find("snapshot.params_type") or "__half"), keys.find("snapshot.params_binary")
     kind = _TYPES.get(name)
-    if not isinstance(raw, memoryview) or kind is None or len(raw) % kind.itemsize:
+    if not isinstance(raw, bytes) or kind is None or len(raw) % kind.itemsize:
         raise tensor_error(f"params_binary is no vector of {name[:20]}", "TENSOR_EXPECTED")
     if 4 * len(raw) // kind.itemsize > tensor_bytes:
         raise tensor_error("with params_binary the tensors exceed the limit", "TENSOR_TOO_LARGE")
@@ -186,19 +188,13 @@ def _direction_columns(keys: Keys) -> int:
 
 def _box(keys: Keys, path: str) -> tuple[Doubles, Doubles]:
     low, high = keys.numbers(f"{path}.min"), keys.numbers(f"{path}.max")
-    if low is None or high is None or len(low) != 3 or len(high) != 3 or not (np.array(low) < high).all():
+    if low is None or high is None or len(low) != 3 or len(high) != 3 or not _is_box(low, high):
         raise FieldFormatError(f"{keys.file}: {path} is no box", reason="BOUNDS_INVALID")
     return np.array(low), np.array(high)
 
 
-def _is_identity(keys: Keys) -> bool:
-    rows = keys.matrix("snapshot.render_aabb_to_local", 3, 3)
-    return rows is None or np.allclose(rows, np.eye(3))
-
-
-def _bare(keys: Keys, rows: Any) -> list[list[float]] | None:
-    """A pose of releases that had no rolling shutter."""
-    return Keys(keys.file, {"pose": rows}, "xforms.").matrix("pose", 3, 4)
+def _is_box(low: list[float], high: list[float]) -> bool:
+    return all(-_FARTHEST < least < most < _FARTHEST for least, most in zip(low, high, strict=True))
 
 
 def _unsupported(what: str) -> FieldFormatError:
