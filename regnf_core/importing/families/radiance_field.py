@@ -32,9 +32,9 @@ _DOUBTFUL = 0.5
 _AT_ONCE = 2.0
 """A camera stands in matter if it sees no farther than so many times the nearest that was trained."""
 WITHOUT_CAMERAS = (
-    "a radiance field has no surface of its own: give the cameras of its training (--cameras transforms.json, or the "
-    "run's folder with transforms.json and dataparser_transforms.json in it); or render depth images (ns-render) and "
-    "fuse them (regnf fuse), or export a mesh (ns-export tsdf or poisson)"
+    "a radiance field has no surface of its own: give the cameras of its training (regnf convert --cameras "
+    "transforms.json, or put that file into the run's folder, beside dataparser_transforms.json); or render depth "
+    "images (ns-render) and fuse them (regnf fuse), or export a mesh (ns-export tsdf or poisson)"
 )
 
 

@@ -55,9 +55,8 @@ def studio(keys: Keys, said: Said) -> None:
 
 
 def is_radiance(keys: Keys) -> bool:
-    """Whether nerfstudio wrote it of a model without a signed distance: a radiance field, or Gaussian splats."""
-    theirs = keys.tag().endswith("nerfstudio.engine.trainer.TrainerConfig")
-    return theirs and isinstance(keys.find("pipeline.model"), dict) and not isinstance(keys.find(_FIELD), dict)
+    """Whether one of the two wrote it of a model without a signed distance: a radiance field, or Gaussian splats."""
+    return is_studio(keys) and isinstance(keys.find("pipeline.model"), dict) and not keys.has(_FIELD)
 
 
 def radiance(keys: Keys, said: Said) -> None:

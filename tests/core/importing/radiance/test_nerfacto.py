@@ -33,6 +33,7 @@ from tests.core.importing.meshes.test_facing import converted
 from tests.core.importing.radiance import scenes
 from tests.core.importing.radiance.fitted import Doubles, looking
 
+DATA = Path(__file__).with_name("data")
 BASE = {"hash": {"base_resolution": scenes.HASH["base_res"]}}
 VOXEL = 3.2 / 256
 """Of the region, whose longest edge is about 3 in the trainer's coordinates."""
@@ -134,6 +135,16 @@ def radiance_of(path: Path, said: dict[str, Any] | None = None) -> Radiance | No
     archive = read_archive(memoryview(path.read_bytes()))
     source = TensorSource(archive, 1 << 30)
     return read_radiance(read_pickle(archive.read("data.pkl")), source, UploadDescription.from_dict(said))
+
+
+def test_a_file_of_the_trainers_own_code_has_its_densities() -> None:
+    """data/: NerfactoField of nerfstudio 1.1.5 in plain PyTorch, five levels up to 100 nodes, random tensors, saved by
+    torch.save; and what its density_fn gives, within and beyond the part of space that is contracted."""
+    found = radiance_of(DATA / "nerfacto.ckpt")
+    assert found is not None
+    assert "5 levels of 2, 16 to 100 nodes, 2 layers" in found.why
+    with np.load(DATA / "nerfacto.npz") as told:
+        np.testing.assert_allclose(np.log(found.field.density(told["points"])), np.log(told["density"]), atol=1e-4)
 
 
 @pytest.mark.parametrize("names", ["model", "sequence", "params"])
