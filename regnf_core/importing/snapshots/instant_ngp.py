@@ -57,7 +57,7 @@ def read_radiance(keys: Keys, tensor_bytes: int, overrides: UploadDescription) -
         (grid, "type", ("hash", "")),
         (grid, "hash", ("coherentprime", "")),
         (grid, "interpolation", ("linear", "smoothstep", "")),
-        (network, "otype", ("fullyfusedmlp", "cutlassmlp", "megakernelmlp")),
+        (network, "otype", ("fullyfusedmlp",)),
         (network, "activation", ("relu", "")),
         (network, "output_activation", ("none", "")),
     ):
@@ -97,7 +97,7 @@ def cameras_of(keys: Keys) -> Trajectory:
     """The cameras of the training, in the trainer's unit cube. Raises FieldFormatError: CAMERAS_MALFORMED."""
     dataset = keys.find("snapshot.nerf.dataset")
     frames, seen = (dataset[name] if isinstance(dataset.get(name), list) else [] for name in ("xforms", "metadata"))
-    poses, intrinsics = np.zeros((0, 4, 4)), []
+    poses, intrinsics = [], []
     for index, (frame, lens) in enumerate(zip(frames[:MOST_CAMERAS], seen, strict=False)):
         # Releases without a rolling shutter have one pose.
         pose = Keys(keys.file, frame if isinstance(frame, dict) else {"start": frame}, f"xforms.{index}.")
@@ -106,10 +106,10 @@ def cameras_of(keys: Keys) -> Trajectory:
         if rows is None or any(len(values) != 2 for values in told):
             message = f"{keys.file}: camera {index} has no pose, focal_length, resolution or principal_point"
             raise FieldFormatError(message, reason="CAMERAS_MALFORMED")
-        poses = np.concatenate([poses, [[*rows, [0.0, 0.0, 0.0, 1.0]]]])
+        poses.append([*rows, [0.0, 0.0, 0.0, 1.0]])
         (fx, fy), (width, height), (x, y) = told
         intrinsics.append(Intrinsics(fx, fy, x * width, y * height, width, height))
-    return trajectory_of(keys.file, poses, intrinsics, None)
+    return trajectory_of(keys.file, np.array(poses, np.float64).reshape(-1, 4, 4), intrinsics, None)
 
 
 def to_dataset(keys: Keys) -> Rows | None:

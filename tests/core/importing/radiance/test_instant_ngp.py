@@ -209,6 +209,7 @@ def test_poses_and_frame_are_those_of_transforms_json() -> None:
         ({"encoding__per_level_scale": 0.0, "snapshot__nerf__aabb_scale": 1e-9}, "SETTINGS_CONTRADICT_TENSORS"),
         ({"snapshot__aabb": {"min": [-1e300] * 3, "max": [1e300] * 3}}, "BOUNDS_INVALID"),
         ({"network__activation": "Sine"}, "FAMILY_NOT_SUPPORTED"),
+        ({"network__otype": "CutlassMLP"}, "FAMILY_NOT_SUPPORTED"),
         ({"dir_encoding__nested": [{"otype": "HashGrid"}]}, "FAMILY_NOT_SUPPORTED"),
         ({"encoding__log2_hashmap_size": 16}, "SETTINGS_CONTRADICT_TENSORS"),
         ({"network__n_neurons": 32}, "SETTINGS_CONTRADICT_TENSORS"),
