@@ -65,13 +65,13 @@ _NAMES = (
 )
 
 
-def read_radiance(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> Radiance | None:
+def read_radiance(checkpoint: Any, source: TensorSource, overrides: UploadDescription) -> Radiance | None:
     """The density of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, HASH_GRID_NOT_RECOGNIZED, SETTINGS_CONTRADICT_TENSORS and what
     TensorSource raises.
     """
-    state, names = _named(checkpoint)
+    state, names = _named(checkpoint) if isinstance(checkpoint, dict) else ({}, None)
     if names is None:
         return None
     require_family(overrides, FAMILY)
