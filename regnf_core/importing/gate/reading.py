@@ -185,6 +185,8 @@ class _Trained:
         self.description = replace(said, frame="dataset") if known else said
         if cameras is None and own is not None:
             cameras, said = own, replace(said, dataset_transform=None)
+        elif cameras is not None:
+            radiance = replace(radiance, assumes=(*radiance.assumes, *cameras.assumes))
         return surface_of(radiance, cameras, said, limits.tensor_bytes, limits.refused_beyond_s)
 
 

@@ -78,7 +78,7 @@ def test_a_run_is_named_for_what_it_is(run: Imported) -> None:
     assert words == ["SURFACE_RECONSTRUCTED"]
     assert "a density, and no distance" in run.report["warnings"][0]
     assert run.report["settings"]["used"]["output_scale"] == 0.01
-    assert [line.partition(":")[0] for line in run.report["assumed"]] == ["unit", "axes"]
+    assert [line.partition(":")[0] for line in run.report["assumed"]] == ["unit", "axes", "cameras"]
 
 
 def test_distances_are_those_of_the_shape_in_the_datasets_frame(run: Imported) -> None:
