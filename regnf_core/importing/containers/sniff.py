@@ -183,11 +183,20 @@ def _is_splat(head: bytes) -> bool:
     return True
 
 
-def _is_packed_spz(head: bytes) -> bool:
+def _packed_format(head: bytes) -> str | None:
+    """What a file packed by gzip holds, if it is no archive."""
     try:
-        return zlib.decompressobj(31).decompress(head, len(_NGSP)) == _NGSP
+        start = zlib.decompressobj(31).decompress(head, _START)
     except zlib.error:
-        return False
+        return None
+    return "spz" if start.startswith(_NGSP) else "instant-ngp" if _SNAPSHOT.match(start) else None
+
+
+_START = 64
+_SNAPSHOT = re.compile(
+    rb"(?:[\x81-\x8f]|\xde..)[\xa1-\xbf](?:aabb|[a-z_]*encoding|distortion_map|envmap|loss)", re.DOTALL
+)
+"""A map of MessagePack that begins with one of the keys of instant-ngp's snapshots, in the order of the alphabet."""
 
 
 HEAD_BYTES = 4096
@@ -217,8 +226,8 @@ _BLANK = b"\xef\xbb\xbf \t\r\n"
 
 
 def sniff_format(head: bytes) -> str | None:
-    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, a mesh's format, one
-    of ``SPLAT_FORMATS`` or of ``RUN_ARCHIVES``, or None for what is not taken.
+    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, ``"instant-ngp"``, a
+    mesh's format, one of ``SPLAT_FORMATS`` or of ``RUN_ARCHIVES``, or None for what is not taken.
 
     ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
     about the rest of the file.
@@ -235,7 +244,9 @@ def sniff_format(head: bytes) -> str | None:
         return None if head.startswith(_OLD_TORCH_TAR) else "tar"
     for magic, packing in _PACKED:
         if head.startswith(magic):
-            return "spz" if packing == "gzip" and _is_packed_spz(head) else packing
+            return (_packed_format(head) if packing == "gzip" else None) or packing
+    if _SNAPSHOT.match(head):
+        return "instant-ngp"
     if head.startswith(_SQLITE_MAGIC):
         return "sqlite"
     if (splats := sniff_splats(head)) is not None:

@@ -12,6 +12,7 @@ from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 
 _MESH = "extract its mesh, and give the mesh"
+_DENSITY = "render depth images and fuse them (regnf fuse), or extract its mesh, and give the mesh"
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,10 @@ class _Known:
     instead: str
     top: tuple[str, ...] = ()
     tensors: tuple[str, ...] = ()
+
+
+def _density(what: str, *tensors: str, top: str | None = None) -> _Known:
+    return _Known(f"{what}, a radiance field without distances", _DENSITY, (top,) if top else (), tensors)
 
 
 _KNOWN = (
@@ -37,13 +42,16 @@ _KNOWN = (
         ("feature_octree", "geo_decoder"),
     ),
     _Known("NICE-SLAM's, grids of occupancies", _MESH, ("c", "decoder_state_dict")),
-    _Known(
-        "nerfstudio's nerfacto, a radiance field without distances",
-        "train neus-facto, or export a mesh (ns-export tsdf or poisson), and give the mesh",
-        ("pipeline",),
-        ("_model.field.mlp_base",),
-    ),
-    _Known("NeRF's, a radiance field without distances", _MESH, ("network_fn_state_dict",)),
+    _density("nerfstudio's generfacto", "_model.field.mlp_background_color."),
+    _density("nerfstudio's vanilla NeRF", "_model.field_fine."),
+    _density("nerfstudio's TensoRF", "_model.field.density_encoding."),
+    _density("nerfstudio's mip-NeRF", "_model.field.field_output_density."),
+    _density("nerfstudio's nerfacto or a model with its names", "_model.field.mlp_base"),
+    _density("TensoRF's", "density_line."),
+    _density("K-Planes'", "field.grids.", "field.sigma_net."),
+    _density("DirectVoxGO's", "density.grid", "k0.grid"),
+    _density("ngp_pl's", "model.xyz_encoder."),
+    _density("NeRF's", top="network_fn_state_dict"),
 )
 
 

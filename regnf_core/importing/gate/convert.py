@@ -59,10 +59,11 @@ _PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
 """Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
 _SMALL_PICTURE = Calls((40_000, 37_000), (12_000,))
 """About as many points as a small picture takes."""
-_THREADED_FORMATS = RUN_ARCHIVES | {"e57", "las", "npy", "pcd", "ply", "xyz", *SPLAT_FORMATS}
-"""May be, or hold, clouds of points or Gaussian splats; the library that makes their surface needs threads."""
-_THREADED_MARKS = (GAUSSIANS, b"gauss_params")
-"""What stands near the beginning of other files with Gaussian splats: glTF files, checkpoints."""
+_THREADED_FORMATS = RUN_ARCHIVES | {"e57", "las", "npy", "pcd", "ply", "xyz", "instant-ngp", *SPLAT_FORMATS}
+"""May be, or hold, clouds of points, Gaussian splats or radiance fields; the library that makes their surface needs
+threads."""
+_THREADED_MARKS = (GAUSSIANS, b"gauss_params", b"field.mlp_base")
+"""What stands near the beginning of other files with Gaussian splats or radiance fields: glTF files, checkpoints."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 

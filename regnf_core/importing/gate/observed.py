@@ -42,8 +42,8 @@ def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, 
     would pass. Cameras found beside the file come last, if they can be used. Raises FieldFormatError as
     ``observed_by_cameras`` does, if ``required``.
     """
-    if converted.description.get(OBSERVATION) is not None and not required:
-        return converted
+    if converted.description.get(OBSERVATION) is not None and (not required or read.cameras is None):
+        return converted  # without cameras that are left, the import has used them
     found = observed_by_weights(converted.description, converted.tensors)
     if found is not None:
         if required:

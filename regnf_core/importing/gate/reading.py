@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.families.radiance_field import Radiance
     from regnf_core.importing.observing.trajectory import Trajectory
     from regnf_core.importing.run.opened import OpenedUpload, SettingsFile
     from regnf_core.importing.settings.facts import Facts
@@ -71,8 +72,11 @@ def read_upload(
     path = upload if opened.name is None else new_file(folder)
     if (kind := splat_format(opened.data)) is not None:
         return _read_splats(kind, opened, said, trajectory, limits)
-    converted = _convert(opened, path, translated, limits)
+    trained = _Trained(trajectory, files)
+    converted = _convert(opened, path, translated, limits, trained)
     converted = translated.noted(converted, opened.name)
+    if trained.description is not None:
+        return ReadUpload(converted, trained.description, translated.settings.report(), None)
     if trajectory is None:
         trajectory, converted = _found_cameras(files, translated.description, converted)
     return ReadUpload(converted, translated.description, translated.settings.report(), trajectory)
@@ -160,7 +164,35 @@ class _Translation:
         )
 
 
-def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: ImportLimits) -> ConvertedField:
+class _Trained:
+    """Radiance fields are seen by the cameras of their training: those given, or those in the run or the file."""
+
+    def __init__(self, given: Trajectory | None, files: tuple[SettingsFile, ...]) -> None:
+        self._given, self._files = given, files
+        self.description: UploadDescription | None = None
+        """Of such a field: the frame is the dataset's, whose cameras they are, if it is known and no other is said."""
+
+    def surface(
+        self, radiance: Radiance, said: UploadDescription, limits: ImportLimits, own: Trajectory | None = None
+    ) -> ConvertedField:
+        """The field of what the cameras see. own: in the file, in its frame. Raises FieldFormatError."""
+        from regnf_core.importing.families.radiance_field import surface_of
+        from regnf_core.importing.observing.reading import beside_checkpoint, read_trajectory
+
+        beside = () if own is not None else beside_checkpoint(self._files)
+        cameras = self._given or (read_trajectory(beside, said.cameras) if beside else None)
+        known = cameras is not None and said.dataset_transform is not None and said.frame is None
+        self.description = replace(said, frame="dataset") if known else said
+        if cameras is None and own is not None:
+            cameras, said = own, replace(said, dataset_transform=None)
+        elif cameras is not None:
+            radiance = replace(radiance, assumes=(*radiance.assumes, *cameras.assumes))
+        return surface_of(radiance, cameras, said, limits.tensor_bytes, limits.refused_beyond_s)
+
+
+def _convert(
+    opened: OpenedUpload, path: Path, describe: Describe, limits: ImportLimits, trained: _Trained
+) -> ConvertedField:
     """By the format's own reader. path: the upload itself, or where a file out of an archive may be written."""
     from regnf_core.importing.families.safe_field import convert_safe_field
     from regnf_core.importing.settings.facts import Facts
@@ -169,7 +201,9 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
     head = bytes(data[:HEAD_BYTES])
     kind = sniff_format(head)
     if kind in ("torch-zip", "torch-legacy"):
-        return _convert_torch(kind, opened, tensor_bytes, describe)
+        return _convert_torch(kind, opened, limits, describe, trained)
+    if kind == "instant-ngp":
+        return _convert_snapshot(opened.data, limits, describe, trained)
     if kind == "npz":
         from regnf_core.importing.containers.npz import ArraySource
         from regnf_core.importing.families.arrays import convert_arrays  # loads scipy
@@ -198,9 +232,22 @@ def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: Impor
     raise FieldFormatError(detail, reason=reason)
 
 
-def _convert_torch(kind: str, opened: OpenedUpload, tensor_bytes: int, describe: Describe) -> ConvertedField:
+def _convert_snapshot(data: memoryview, limits: ImportLimits, describe: Describe, trained: _Trained) -> ConvertedField:
+    from regnf_core.importing.settings.facts import Facts
+    from regnf_core.importing.snapshots.instant_ngp import cameras_of, read_radiance, snapshot_of, to_dataset
+    from regnf_core.importing.snapshots.msgpack import read_msgpack, unpacked
+
+    snapshot, said = snapshot_of(read_msgpack(unpacked(data, limits.file_bytes))), describe(Facts())
+    radiance = read_radiance(snapshot, limits.tensor_bytes, said)
+    said = replace(said, dataset_transform=said.dataset_transform or to_dataset(snapshot))
+    return trained.surface(radiance, said, limits, cameras_of(snapshot))
+
+
+def _convert_torch(
+    kind: str, opened: OpenedUpload, limits: ImportLimits, describe: Describe, trained: _Trained
+) -> ConvertedField:
     from regnf_core.importing.containers.legacy_container import read_archive, read_legacy
-    from regnf_core.importing.families import convert_checkpoint
+    from regnf_core.importing.families import convert_checkpoint, nerfacto
     from regnf_core.importing.pickle.pickle_reader import read_pickle
     from regnf_core.importing.settings.facts import facts_of
     from regnf_core.importing.tensor_source import TensorSource
@@ -208,11 +255,15 @@ def _convert_torch(kind: str, opened: OpenedUpload, tensor_bytes: int, describe:
     source: TensorSource
     if kind == "torch-zip":
         archive = read_archive(opened.data, members=opened.members)
-        values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes)
+        values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, limits.tensor_bytes)
     else:
         values, legacy = read_legacy(opened.data)
-        source = TensorSource(legacy, tensor_bytes)
-    return convert_checkpoint(values, source, describe(facts_of(values, source)))
+        source = TensorSource(legacy, limits.tensor_bytes)
+    said = describe(facts_of(values, source))
+    radiance = nerfacto.read_radiance(values, source, said)
+    if radiance is not None:
+        return trained.surface(radiance, said, limits)
+    return convert_checkpoint(values, source, said)
 
 
 def _mapped(path: Path) -> memoryview:

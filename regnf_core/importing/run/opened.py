@@ -18,7 +18,7 @@ from regnf_core.library_entries import shown_path
 
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
-    (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
+    (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite", ".ingp", ".msgpack"),
     (".urdf",),
     (
         *(".step", ".stp", ".3mf", ".usd", ".usda", ".usdc", ".usdz"),

@@ -75,6 +75,7 @@ def _has(path: str, beside: str = "") -> Callable[[Keys], bool]:
 
 
 TRAINERS = (
+    Trainer("nerfstudio", hash_grids.is_radiance, hash_grids.radiance),
     Trainer("nerfstudio", hash_grids.is_nerfstudio, hash_grids.studio),
     Trainer("sdfstudio", hash_grids.is_studio, hash_grids.studio),
     Trainer("instant-nsr-pl", _has(hash_grids.NSR_ENCODING), hash_grids.instant_nsr_pl),

@@ -110,17 +110,20 @@ def cameras_for(splats: Splats, region: Region) -> list[Camera]:
     return _within(splats, region) if region.within else _around(region)
 
 
-def given_cameras(trajectory: Trained, T_file_splats: Doubles) -> list[Camera]:
+def given_cameras(
+    trajectory: Trained, T_file_splats: Doubles, most: int = _MOST_GIVEN, pixels: int = MOST_PIXELS
+) -> list[Camera]:
     """Of the cameras from whose images the splats were trained, some, spread over the trajectory.
 
-    T_file_splats: (4, 4), a similarity from the frame of the splats to that of the cameras' poses.
+    T_file_splats: (4, 4), a similarity from the frame of the splats to that of the cameras' poses · most: of the
+    cameras · pixels: of an image, at most.
     """
     scale = float(np.cbrt(np.linalg.det(T_file_splats[:3, :3])))
-    chosen = np.unique(np.linspace(0, len(trajectory) - 1, min(_MOST_GIVEN, len(trajectory))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(trajectory) - 1, min(most, len(trajectory))).round().astype(int))
     found = []
     for number in chosen:
         aspect = float(trajectory.aspect[number])
-        height = int(min(_SIDE_ROUND, np.sqrt(MOST_PIXELS / aspect)))
+        height = int(min(_SIDE_ROUND, np.sqrt(pixels / aspect)))
         size = np.array([max(1, int(height * aspect)), height])
         focal, middle = trajectory.focal[number] * size, trajectory.middle[number] * size
         T_camera_splats = np.linalg.inv(trajectory.poses[number]) @ T_file_splats
@@ -226,11 +229,11 @@ def _moved(cells: npt.NDArray[np.bool_], shift: npt.NDArray[np.int64]) -> npt.ND
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a camera sees: depths (H, W), 0 where it does not tell, and colors (H, W, 3)."""
+    """What a camera sees: depths (H, W), 0 where it does not tell, and colors (H, W, 3), if they are known."""
 
     camera: Camera
     depth: Floats
-    color: npt.NDArray[np.uint8]
+    color: npt.NDArray[np.uint8] | None
 
     def ends(self) -> Doubles:
         """(H, W, 3): where the depths end, in the world; the camera's place where there is none."""

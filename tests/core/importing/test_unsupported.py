@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,8 +15,22 @@ from regnf_core.importing.gate.report import ImportLimits
 
 ONE = torch.ones(4)
 CASES: dict[str, tuple[dict[str, Any], str]] = {
-    "nerfacto": ({"step": 1, "pipeline": {"_model.field.mlp_base.params": ONE}}, "nerfacto"),
-    "nerfacto, distributed": ({"pipeline": {"module._model.field.mlp_base.0.weight": ONE}}, "nerfacto"),
+    "nerfacto of no known release": ({"pipeline": {"module._model.field.mlp_base.0.weight": ONE}}, "nerfacto"),
+    "nerfstudio's NeRF": ({"pipeline": {"_model.field_fine.mlp_base.layers.0.weight": ONE}}, "vanilla NeRF"),
+    "nerfstudio's mip-NeRF": (
+        {
+            "pipeline": {
+                "_model.field.mlp_base.layers.0.weight": ONE,
+                "_model.field.field_output_density.net.weight": ONE,
+            }
+        },
+        "mip-NeRF",
+    ),
+    "nerfstudio's TensoRF": ({"pipeline": {"_model.field.density_encoding.plane_coef": ONE}}, "TensoRF"),
+    "TensoRF": ({"kwargs": {}, "state_dict": {"density_plane.0": ONE, "density_line.0": ONE}}, "TensoRF"),
+    "K-Planes": ({"model": {"field.grids.0.0": ONE, "field.sigma_net.params": ONE}}, "K-Planes"),
+    "DirectVoxGO": ({"model_state_dict": {"density.grid": ONE, "k0.grid": ONE}}, "DirectVoxGO"),
+    "ngp_pl": ({"state_dict": {"model.xyz_encoder.params": ONE, "model.rgb_net.params": ONE}}, "ngp_pl"),
     "SHINE-Mapping": ({"iters": 9, "feature_octree": {"a": ONE}, "geo_decoder": {"lout.weight": ONE}}, "SHINE"),
     "Co-SLAM, fused": ({"pose": {}, "model": {"embed_fn.params": ONE, "decoder.sdf_net.model.params": ONE}}, "Co-SLAM"),
     "NICE-SLAM": ({"c": {"grid_fine": ONE}, "decoder_state_dict": {"a": ONE}}, "NICE-SLAM"),
@@ -57,3 +72,10 @@ def test_a_program_of_torchscript_is_named(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError, match="ONNX") as caught:
         convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
     assert caught.value.reason == "ARCHIVE_TORCHSCRIPT"
+
+
+def test_plenoxels_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "upload.npz", links=np.zeros((2, 2, 2)), density_data=np.ones((4, 1)), sh_data=np.ones((4, 27)))
+    with pytest.raises(FieldFormatError, match=r"Plenoxels.*mesh") as caught:
+        convert_file(tmp_path / "upload.npz", tmp_path, None, ImportLimits())
+    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"

@@ -14,6 +14,8 @@ from regnf_core.importing.settings.said import Said
 _FIELD = "pipeline.model.sdf_field"
 _DEGREE = 6
 _STEPS_A_LEVEL = 10_000
+_BASE = 16
+"""Nodes of nerfacto's coarsest level, where releases had no setting for it."""
 _OTHER_COLORS = ("use_diffuse_color", "use_specular_tint", "use_reflections", "use_n_dot_v")
 """Each makes the color another function."""
 
@@ -49,6 +51,26 @@ def studio(keys: Keys, said: Said) -> None:
     said.values["contraction"] = "linf_grid" if theirs else "none"
     _studio_schedule(keys, field, said)
     said.about_color(lambda: _studio_color(keys.below("pipeline.model"), field, said))
+    _studio_frame(keys, said)
+
+
+def is_radiance(keys: Keys) -> bool:
+    """Whether one of the two wrote it of a model without a signed distance: a radiance field, or Gaussian splats."""
+    return is_studio(keys) and isinstance(keys.find("pipeline.model"), dict) and not keys.has(_FIELD)
+
+
+def radiance(keys: Keys, said: Said) -> None:
+    """Fill ``said``: of nerfacto, or the frame alone. Raises FieldFormatError (SETTINGS_MALFORMED)."""
+    model = keys.below("pipeline.model")
+    if said.facts.count("field.mlp_base", ""):
+        grid = {"hash.levels": "num_levels", "hash.features_per_level": "features_per_level"}
+        grid |= {"hash.log2_table_size": "log2_hashmap_size", "hash.base_resolution": "base_res"}
+        said.take(model, Keys.whole, grid | {"hash.top_resolution": "max_res"})
+        said.values["hash.base_resolution"] = said.values.get("hash.base_resolution", _BASE)
+        said.values["contraction"] = "linf"
+        said.choose("contraction", model, "disable_scene_contraction", ("none", "linf"))
+        said.values["output_scale"] = 1.0
+        said.put("output_scale", model.number("average_init_density"), model, "average_init_density")
     _studio_frame(keys, said)
 
 

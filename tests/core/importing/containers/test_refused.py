@@ -106,7 +106,7 @@ SHAPES: list[tuple[bytes, str]] = [
         (b"\x08\x05\x12\x90\x01\x0a\x10\x0a\x05image", "Core ML"),
         (b"<?xml version='1.0'?>\n<net name='a'>", "OpenVINO"),
     ),
-    *((b"GGUF\x03\0\0\0", "language model"), (b"\x83\xa8encoding\x85", "instant-ngp"), (b"\x82\xa6params\x81", "Flax")),
+    *((b"GGUF\x03\0\0\0", "language model"), (b"\x82\xa6params\x81", "Flax")),
     *((b"ftrt\0\0\0\0", "TensorRT"), (b"\x20\0\0\0ORTM", "ONNX Runtime")),
 ]
 OTHERS: list[tuple[bytes, str]] = [
@@ -151,7 +151,10 @@ def test_a_file_of_another_kind_is_named(head: bytes, named: str) -> None:
     assert (reason, named in detail, "; " in detail) == ("FORMAT_NOT_RECOGNIZED", True, True), detail
 
 
-READ = (b"ISO-10303-21;", b"PXR-USDC", b"<robot name='r'>", _zip("scene.usdc"), _zip("[Content_Types].xml"))
+READ = (
+    *(b"ISO-10303-21;", b"PXR-USDC", b"<robot name='r'>", _zip("scene.usdc"), _zip("[Content_Types].xml")),
+    b"\x83\xa8encoding\x85",
+)
 """How files begin that are read: the table has them for names whose content is another."""
 
 
@@ -159,7 +162,7 @@ def test_each_row_of_the_table_is_tried_here() -> None:
     told = [refused(head) for head, _ in (*SHAPES, *OTHERS)]
     told += [refused(b"\x01\x02", name) for name, _ in NAMES]
     told += [refused(head) for head in READ]
-    assert len(SHAPES) + len(OTHERS) > 140
+    assert len(SHAPES) + len(OTHERS) > 139
     assert {row.told() for row in _rows()} == set(told)
 
 

@@ -169,7 +169,7 @@ def test_every_reason_is_documented_and_of_the_file_or_of_the_circumstances() ->
     page = (ROOT / "docs" / "import-gate.md").read_text()
     assert {word for word in words - FUNCTIONS if f"`{word}`" not in page} == set()
     assert words - OF_THE_FILE == OF_THE_CIRCUMSTANCES | WARNED_OF | FUNCTIONS
-    assert OF_THE_FILE - words == {"CAMERAS_OF_ANOTHER_FRAME"}, "raised by regnf_core.surface.observing"
+    assert OF_THE_FILE - words == set()
 
 
 def test_a_hanging_import_with_closed_streams_is_ended(in_child: InChild) -> None:
