@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -141,7 +142,7 @@ def world_row(
             models.append(other)
     fields = [MeshField(one.mesh.vertices, one.mesh.faces) for one in models]
     library = [
-        LibraryObject(f"{one.name} {n}", lambda field=field: field, model_object(field))
+        LibraryObject(f"{one.name} {n}", partial(_itself, field), model_object(field))
         for n, (one, field) in enumerate(zip(models, fields, strict=True))
     ]
     scene, _ = room_field(home)
@@ -176,6 +177,10 @@ def _with_boxes(home: Path) -> Iterator[bool]:
         yield result.verdict != "rejected" and min(float(each.amax(1).min()) for each in off) <= _RIGHT * size
 
 
+def _itself(field: MeshField) -> MeshField:
+    return field
+
+
 def _same(one: Model, other: Model) -> bool:
     a, b = one.mesh.vertices, other.mesh.vertices
     return one.name == other.name and a.shape == b.shape and bool(np.allclose(a, b))
@@ -199,8 +204,7 @@ def room_rows(fields: Path, processes: int) -> Iterator[dict[str, Any]]:
     pairs = load_pairs(fields)
     names = sorted({one.object for one in pairs})
     library = [
-        LibraryObject(name, lambda name=name: open_field(fields, name), model_object(open_field(fields, name)))
-        for name in names
+        LibraryObject(name, partial(open_field, fields, name), model_object(open_field(fields, name))) for name in names
     ]
     surfaces = [one.model.frame.out_of(one.model.samples.on_surface()) for one in library]
     for room in sorted({one.room for one in pairs}):
