@@ -34,7 +34,6 @@ from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "deepsdf"
-_PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
 
 
@@ -45,12 +44,11 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     what TensorSource raises.
     """
     network = checkpoint.get("model_state_dict")
-    prefix = next((p for p in _PREFIXES if strip_prefix(network, p)), None)
-    if prefix is None:
+    if not strip_prefix(network, "lin"):
         _refuse_codes_alone(checkpoint)
         return None
     refuse_other_entries(overrides, FAMILY, ("latent", "latent_index", *FORM_ENTRIES))
-    state = strip_prefix(network, prefix.removesuffix("lin"))
+    state = strip_prefix(network, "")
     names = layer_names(state, "lin")
     layers = read_layers(state, names, source, column=overrides.output_column or 0)
     norms = _norms(state, layers, source)
@@ -69,7 +67,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     seeing = [i for i, extra in enumerate(layers.extra_columns) if extra]
     require_extra_columns(layers, names, {i: layers.input_width if i in whole else 3 for i in seeing})
     why = (
-        f"keys model_state_dict.{prefix}*, {len(names)} layers",
+        f"keys model_state_dict.lin*, {len(names)} layers",
         whence,
         "bounds [-1, 1]: the cube around the unit sphere, into which shapes are scaled",
     )
