@@ -62,7 +62,9 @@ def _dictionaries(checkpoint: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, A
         if any(isinstance(value, TensorRef) for value in state.values()):
             yield path, beside, state
         if depth < _DEEPEST:
-            inner = ((name, value) for name, value in state.items() if isinstance(name, str) and isinstance(value, dict))
+            inner = (
+                (name, value) for name, value in state.items() if isinstance(name, str) and isinstance(value, dict)
+            )
             waiting += [(f"{path}.{name}" if path else name, state, value, depth + 1) for name, value in inner]
 
 

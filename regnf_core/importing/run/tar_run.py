@@ -189,6 +189,7 @@ class TarRun:
         packing = self._packing
         source = iter((self._data,)) if packing is None else _unpacked(self._data, packing, self._most)
         stream = _Forward(source)
+        single = f"a single file compressed with {packing}, or a damaged archive: decompress it, and give the file"
         try:
             archive = tarfile.TarFile(fileobj=stream, encoding="utf-8", errors="strict")  # type: ignore[arg-type]
             for number, member in enumerate(archive):
@@ -202,8 +203,11 @@ class TarRun:
         except (tarfile.TarError, ValueError, RecursionError) as error:
             if packing is None:
                 raise archive_error("a header is malformed") from error
-            message = f"a single file compressed with {packing}, or a damaged archive: decompress it, and give the file"
-            raise archive_error(message) from error
+            raise archive_error(single) from error
+        except FieldFormatError as error:
+            if packing is None or error.reason != "FILE_TRUNCATED" or stream.tell() > tarfile.BLOCKSIZE:
+                raise
+            raise archive_error(single) from error  # shorter than an archive's first header
         stream.require_end()
 
 

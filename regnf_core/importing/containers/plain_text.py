@@ -1,0 +1,41 @@
+"""Numbers and texts as programs write them, made plain. Imports the standard library alone."""
+
+from __future__ import annotations
+
+import codecs
+import re
+
+BLANK = b"\xef\xbb\xbf \t\r\n"
+"""What may stand before the first statement: a byte-order mark, blanks, ends of lines."""
+_ENDED = b"\0\x1a"
+"""What some disks and editors leave behind the last one."""
+_WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_ODD = re.compile(
+    rb"[-+]?(?:\d\.#(?:INF|IND|[QS]NAN)\w*|nan\(\w*\))|\xef\xbb\xbf|(?<=\d)[dD](?=[-+]?\d)", re.IGNORECASE
+)
+"""Numbers that are none, as Microsoft's C library writes them; marks of joined files; Fortran's exponents."""
+
+
+def unmarked(text: bytes) -> bytes:
+    """Without a mark and blanks at the beginning; UTF-16 that has a mark becomes UTF-8."""
+    if text.startswith(_WIDE):
+        text = text[: len(text) & ~1].decode("utf-16", "replace").encode()
+    return text.lstrip(BLANK)
+
+
+def text_alone(text: bytes) -> bytes:
+    """Also without the zeros, or the sign for its end, behind a text."""
+    return unmarked(text).rstrip(_ENDED)
+
+
+def plain_numbers(text: bytes) -> bytes:
+    """With numbers that ``float`` reads; other words stay."""
+    return _ODD.sub(lambda odd: b"e" if odd[0] in b"dD" else b" " if odd[0] == b"\xef\xbb\xbf" else b"nan", text)
+
+
+def number(word: bytes) -> float:
+    """Raises ValueError."""
+    try:
+        return float(word)
+    except ValueError:
+        return float(plain_numbers(word))
