@@ -85,9 +85,11 @@ def _frames(keys: Keys) -> Iterator[Keys]:
 
 
 def _pose(frame: Keys, name: str) -> Array:
-    """(4, 4) from four rows, or from three."""
+    """(4, 4) from four rows, or from three; NaN for a camera that was lost."""
     value = frame.find(name)
     rows = len(value) if isinstance(value, list) else 0
+    if (value is None and name in frame.find("")) or any(None in row for row in value or () if isinstance(row, list)):
+        return np.full((4, 4), np.nan)
     found = frame.matrix(name, 3 if rows == 3 else 4, 4)
     if found is None:
         raise malformed(f"{frame.file}: {frame.at}{name} is missing")
@@ -149,30 +151,60 @@ def _to_dataset(keys: Keys, ours: bool) -> Array | None:
     return np.asarray(np.linalg.inv(forward), np.float64)
 
 
-# Poses as plain numbers: a file of TUM's (timestamp tx ty tz qx qy qz qw), or a folder with a matrix a file.
+# Poses as plain numbers: a file of lines, TUM's, EuRoC's or matrices; or a folder with a matrix a file.
 
 MOST_BYTES = 8 << 20
-_TUM = 8
+_NANOSECONDS = 1e15
+"""Time stamps beyond are no seconds."""
 _NUMBERS = re.compile(r"[0-9]+")
 _SEPARATORS = re.compile(r"[\s,;]+")
 _CELLS = re.compile(r"[;\t]")
+_STARTS = re.compile(r"[-+.\d]|nan|inf", re.IGNORECASE)
+_NAMES_FIRST = re.compile(r"(time|stamp|frame|x$|tx$|p_)", re.IGNORECASE)
 
 
-def read_tum(name: str, data: bytes | memoryview) -> Array | None:
-    """The poses (N, 4, 4), camera to world, of a file with eight numbers a line; None where it is none.
+def read_lines(name: str, data: bytes | memoryview) -> Array | None:
+    """The poses (N, 4, 4), camera to world, of a file of lines; None where it is none.
 
-    Lines that are empty or begin with # are passed over. Raises FieldFormatError (CAMERAS_MALFORMED).
+    TUM's (t, place, quaternion x y z w, with a number behind of RTAB-Map), EuRoC's (ns, w first, by commas), Stray
+    Scanner's (t, frame, place, quaternion), matrices of 12 (KITTI) or 16 numbers, or in four rows, with or without
+    their number before (Redwood). Lines that are empty or begin with # or with names of columns are passed over.
+    Raises FieldFormatError (CAMERAS_MALFORMED).
     """
     rows = _rows(name, data)
-    if not rows or any(len(row) != _TUM for row in rows):
+    widths = {len(row) for row in rows}
+    if widths == {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
+        rows, widths = [row for at, row in enumerate(rows) if at % 5], {4}
+    if widths == {4} and len(rows) % 4 == 0:
+        return np.array(rows, np.float64).reshape(-1, 4, 4)
+    if widths in ({12}, {16}):
+        return _closed(np.array(rows, np.float64).reshape(len(rows), -1, 4))
+    if len(widths) != 1 or not 8 <= (width := widths.pop()) <= 32:
         return None
     values = np.array(rows, np.float64)
+    stray = width in (9, 13) and bool((values[:, 1] == np.arange(len(values))).all())
+    at = 2 if stray else 1
+    if width > 8 and not stray and not (width == 9 or (values[:, 0] > _NANOSECONDS).all()):
+        return None
+    euroc = not stray and bool((values[:, 0] > _NANOSECONDS).all()) and b"," in bytes(data[:4096])
+    quaternions = values[:, at + 3 : at + 7]
+    return poses_of(values[:, at : at + 3], np.roll(quaternions, -1, axis=1) if euroc else quaternions)
+
+
+def poses_of(places: Array, quaternions: Array) -> Array:
+    """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w, of any length; NaN where that is zero."""
     with np.errstate(all="ignore"):
-        length = np.linalg.norm(values[:, 4:], axis=1, keepdims=True)
-        x, y, z, w = (values[:, 4:] / length).T
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[:, :3, 3] = values[:, 1:4]
+        x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
     poses[:, :3, :3] = np.array(rotation_rows(x, y, z, w)).transpose(2, 0, 1)
+    return poses
+
+
+def _closed(rows: Array) -> Array:
+    """(N, 4, 4) of (N, 3 or 4, 4)."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, : rows.shape[1]] = rows
     return poses
 
 
@@ -199,7 +231,11 @@ def read_matrices(files: Sequence[tuple[str, bytes | memoryview]]) -> tuple[Arra
 def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
     """The lines' numbers; NaN and infinity are such, as trackers write them for a camera that they have lost."""
     lines = (line.strip() for line in decoded(name, data, MOST_BYTES).splitlines())
-    words = (_words(line) for line in lines if line and not line.startswith("#"))
+    words = [_words(line) for line in lines if line and not line.startswith("#")]
+    if len(words) > 1 and _NAMES_FIRST.match(words[0][0]):  # what the columns are
+        del words[0]
+    if words and not _STARTS.match(words[0][0]):  # a text of something else
+        return []
     return [[_number(name, word) for word in line] for line in words]
 
 
@@ -225,6 +261,7 @@ def _order(name: str) -> tuple[list[int], str]:
 
 
 _ARRAY_BYTES = 64 << 20
+_OPEN3D_SIZE = ("intrinsic.width", "intrinsic.height")
 _KNOWN_NAMES = ("transforms.json", "transforms_train.json", "meta_data.json", "cameras_sphere.npz")
 
 
@@ -243,7 +280,8 @@ def read_trajectory(files: Sequence[SettingsFile], said: CamerasDescription) -> 
     if found is None:
         names = ", ".join(PurePosixPath(file.name).name[:60] for file in files[:6]) or "no file"
         message = (
-            f"no cameras in {names}: expected transforms.json, meta_data.json, a TUM trajectory, or one matrix per file"
+            f"no cameras in {names}: expected transforms.json, meta_data.json, lines of TUM, EuRoC or KITTI, a "
+            f"trajectory of Open3D, COLMAP's text model, or one matrix per file"
         )
         raise FieldFormatError(message, reason="CAMERAS_NOT_RECOGNIZED")
     return found
@@ -261,12 +299,14 @@ def _read(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory
         if name.lower().endswith(".npz"):
             return _of_arrays(name, ArraySource(file.data, _ARRAY_BYTES), said)
         if looks_like_json(file.data) or bytes(file.data[:64]).lstrip()[:2] == b"[{":
-            keys = Keys(name, read_json(name, file.data))
+            keys = Keys(name, read_json(name, file.data, lost=True))
             if isinstance(keys.tree, list):
                 return _of_list(keys)
             if is_trajectory(keys):
                 return read_trajectory_json(keys, _said(said), said.axes)
-    return _of_text(files, said)
+            if (found := _of_open3d(keys, said)) is not None:
+                return found
+    return _of_colmap(files) or _of_text(files, said)
 
 
 def _rank(name: str) -> tuple[int, str]:
@@ -296,6 +336,59 @@ def _of_list(keys: Keys) -> Trajectory:
     return trajectory_of(keys.file, np.stack(poses), intrinsics, None)
 
 
+def _of_open3d(keys: Keys, said: CamerasDescription) -> Trajectory | None:
+    """Open3D's trajectory, world to camera with intrinsics, or pose graph, camera to world: matrices by columns."""
+    poses, intrinsics = [], []
+    for key, member in (("parameters", "extrinsic"), ("nodes", "pose")):
+        listed = keys.find(key)
+        for index, one in enumerate(listed if isinstance(listed, list) else []):
+            each = Keys(keys.file, one, f"{key}.{index}.")
+            numbers = each.numbers(member)
+            if numbers is None or len(numbers) != 16:
+                return None
+            pose = np.array(numbers, np.float64).reshape(4, 4).T
+            poses.append(np.linalg.inv(pose) if member == "extrinsic" and np.linalg.det(pose) else pose)
+            K, width, height = (each.numbers("intrinsic.intrinsic_matrix"), *map(each.number, _OPEN3D_SIZE))
+            if K is not None and len(K) == 9 and width and height:
+                intrinsics.append(Intrinsics(K[0], K[4], K[6], K[7], width, height))
+    if not poses:
+        return None
+    known = _said(said) or (intrinsics if len(intrinsics) == len(poses) else None)
+    if known is None:
+        raise without_intrinsics(keys.file)
+    return trajectory_of(keys.file, np.stack(poses), known, said.axes or "opencv")
+
+
+def _of_colmap(files: Sequence[SettingsFile]) -> Trajectory | None:
+    """COLMAP's model as text: cameras.txt, and images.txt with world-to-camera quaternions, w first."""
+    named = {PurePosixPath(file.name).name: file for file in files}
+    if not {"cameras.txt", "images.txt"} <= named.keys():
+        return None
+    cameras: dict[str, Intrinsics] = {}
+    for line in _lines_of(named["cameras.txt"]):
+        number, model, *sizes = line.split()
+        numbers = [_number("cameras.txt", word) for word in sizes]
+        if not _PINHOLES.fullmatch(model) or len(numbers) < 5:
+            message = f"cameras.txt: cameras of the model {model[:40]} are not supported"
+            raise FieldFormatError(message, reason="CAMERAS_NOT_SUPPORTED")
+        width, height, fx, *rest = numbers
+        fy, cx, cy = (fx, *rest[:2]) if model.startswith(("SIMPLE", "RADIAL")) else rest[:3]
+        cameras[number] = Intrinsics(fx, fy, cx, cy, width, height)
+    words = [line.split(maxsplit=9) for line in _lines_of(named["images.txt"], every=True)[::2]]
+    words = [line for line in words if line]
+    if not words or any(len(line) < 10 or line[8] not in cameras for line in words):
+        raise malformed("images.txt is not a list of images of the cameras in cameras.txt")
+    values = np.array([[_number("images.txt", word) for word in line[1:8]] for line in words])
+    poses = np.linalg.inv(poses_of(values[:, 4:], np.roll(values[:, :4], -1, axis=1)))
+    return trajectory_of("images.txt", poses, [cameras[line[8]] for line in words], None)
+
+
+def _lines_of(file: SettingsFile, every: bool = False) -> list[str]:
+    """Without comments. every: with empty lines, which an image without points has."""
+    lines = decoded(file.name, file.data, _ARRAY_BYTES).split("\n")
+    return [line for line in map(str.strip, lines) if (every or line) and not line.startswith("#")]
+
+
 def _of_text(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory | None:
     texts = [(file.name, file.data) for file in files if not file.name.lower().endswith((".json", ".npz"))]
     if not texts:
@@ -303,7 +396,7 @@ def _of_text(files: Sequence[SettingsFile], said: CamerasDescription) -> Traject
     poses, matrix = read_matrices(texts)
     name = texts[0][0] if len(texts) == 1 else "the folder of poses"
     if poses is None:
-        found = [(tum, file) for file, data in texts if (tum := read_tum(file, data)) is not None]
+        found = [(lines, file) for file, data in texts if (lines := read_lines(file, data)) is not None]
         if not found:
             return None
         poses, name = found[0]
