@@ -17,7 +17,7 @@ from regnf_cli.batch_file import read_pairs
 from regnf_cli.options import description, read_detection, read_options, read_transform
 from regnf_cli.render import _edits
 from regnf_core.errors import FieldFormatError, InvalidInputError
-from regnf_core.importing.observing.reading import read_matrices, read_lines
+from regnf_core.importing.observing.reading import read_lines, read_matrices
 from regnf_core.importing.run.opened import SettingsFile
 from regnf_core.importing.settings.documents import read_documents
 from regnf_core.texts import TextError, decode_text
