@@ -157,7 +157,7 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
 def _color_path(folder: Path, name: Any) -> Path | None:
     if not isinstance(name, str) or not name:
         return None
-    path = (folder / name).resolve()
+    path = (folder / name.replace("\\", "/")).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise DatasetError(f"file_path leaves the folder: {name!r:.200}", reason="DATASET_PATH_OUTSIDE")
     return path if path.is_file() else _first_file(path.parent, (path.name,), _COLORS)

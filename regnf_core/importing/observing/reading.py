@@ -12,6 +12,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.npz import ArraySource
+from regnf_core.importing.containers.plain_text import number
 from regnf_core.importing.observing.trajectory import (
     MOST_CAMERAS,
     Array,
@@ -99,20 +100,20 @@ def _pose(frame: Keys, name: str) -> Array:
 def _intrinsics(frame: Keys, keys: Keys) -> Intrinsics | None:
     """The frame's own, or else those of all frames; None where neither says."""
 
-    def number(*names: str) -> float | None:
+    def stated(*names: str) -> float | None:
         found = (each.number(name) for each in (frame, keys) for name in names)
         return next((one for one in found if one is not None), None)
 
-    width, height = number("w", "width"), number("h", "height")
+    width, height = stated("w", "width"), stated("h", "height")
     matrix = next((rows for each in (frame, keys) if (rows := _matrix(each)) is not None), None)
     if matrix is not None:
         (fx, _, cx, *_), (_, fy, cy, *_) = matrix[:2]
         return Intrinsics(fx, fy, cx, cy, width or 2 * cx, height or 2 * cy)
-    middle_x, middle_y = number("cx"), number("cy")
+    middle_x, middle_y = stated("cx"), stated("cy")
     width = width or (2 * middle_x if middle_x else _SIDE)
     height = height or (2 * middle_y if middle_y else width)
-    focal_x = number("fl_x") or _focal(width, number("camera_angle_x"))
-    focal_y = number("fl_y") or _focal(height, number("camera_angle_y"))
+    focal_x = stated("fl_x") or _focal(width, stated("camera_angle_x"))
+    focal_y = stated("fl_y") or _focal(height, stated("camera_angle_y"))
     if focal_x is None and focal_y is None:
         return None
     cx = width / 2 if middle_x is None else middle_x
@@ -154,10 +155,12 @@ def _to_dataset(keys: Keys, ours: bool) -> Array | None:
 # Poses as plain numbers: a file of lines, TUM's, EuRoC's or matrices; or a folder with a matrix a file.
 
 MOST_BYTES = 8 << 20
+_NOT_UNIT = 0.05
+"""How far from one a quaternion's length may be in lines of more than eight numbers."""
 _NANOSECONDS = 1e15
 """Time stamps beyond are no seconds."""
 _NUMBERS = re.compile(r"[0-9]+")
-_SEPARATORS = re.compile(r"[\s,;]+")
+_SEPARATORS = re.compile(r"[\s,;\[\]()]+")
 _CELLS = re.compile(r"[;\t]")
 _STARTS = re.compile(r"[-+.\d]|nan|inf", re.IGNORECASE)
 _NAMES_FIRST = re.compile(r"(time|stamp|frame|x$|tx$|p_)", re.IGNORECASE)
@@ -188,6 +191,10 @@ def read_lines(name: str, data: bytes | memoryview) -> Array | None:
         return None
     euroc = not stray and bool((values[:, 0] > _NANOSECONDS).all()) and b"," in bytes(data[:4096])
     quaternions = values[:, at + 3 : at + 7]
+    with np.errstate(all="ignore"):
+        odd = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > _NOT_UNIT
+    if width > 8 and odd.any():  # other tables have as many numbers
+        return None
     return poses_of(values[:, at : at + 3], np.roll(quaternions, -1, axis=1) if euroc else quaternions)
 
 
@@ -231,7 +238,7 @@ def read_matrices(files: Sequence[tuple[str, bytes | memoryview]]) -> tuple[Arra
 def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
     """The lines' numbers; NaN and infinity are such, as trackers write them for a camera that they have lost."""
     lines = (line.strip() for line in decoded(name, data, MOST_BYTES).splitlines())
-    words = [_words(line) for line in lines if line and not line.startswith("#")]
+    words = [words_of(line) for line in lines if line and not line.startswith("#")]
     if len(words) > 1 and _NAMES_FIRST.match(words[0][0]):  # what the columns are
         del words[0]
     if words and not _STARTS.match(words[0][0]):  # a text of something else
@@ -239,7 +246,7 @@ def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
     return [[_number(name, word) for word in line] for line in words]
 
 
-def _words(line: str) -> list[str]:
+def words_of(line: str) -> list[str]:
     """A line's numbers. A spreadsheet that writes decimal commas parts them by semicolons or tabs."""
     cells = _CELLS.split(line)
     if len(cells) > 1 and "." not in line and all(cell.count(",") <= 1 for cell in cells):
@@ -250,7 +257,7 @@ def _words(line: str) -> list[str]:
 def _number(name: str, word: str) -> float:
     try:
         if len(word) <= MAX_NUMBER_CHARACTERS:
-            return float(word)
+            return number(word.encode())
     except ValueError:
         pass
     raise malformed(f"{name}: {word[:MAX_NUMBER_CHARACTERS]!r} is not a number")
