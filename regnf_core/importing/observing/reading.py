@@ -386,7 +386,7 @@ def _of_colmap(files: Sequence[SettingsFile]) -> Trajectory | None:
     if not words or any(len(line) < 10 or line[8] not in cameras for line in words):
         raise malformed("images.txt is not a list of images of the cameras in cameras.txt")
     values = np.array([[_number("images.txt", word) for word in line[1:8]] for line in words])
-    poses = np.linalg.inv(poses_of(values[:, 4:], np.roll(values[:, :4], -1, axis=1)))
+    poses: Array = np.linalg.inv(poses_of(values[:, 4:], np.roll(values[:, :4], -1, axis=1)))
     return trajectory_of("images.txt", poses, [cameras[line[8]] for line in words], None)
 
 
