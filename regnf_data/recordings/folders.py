@@ -17,7 +17,8 @@ from PIL import Image
 
 from regnf_core.errors import DatasetError
 from regnf_core.importing.containers.plain_text import number
-from regnf_core.importing.observing.reading import words_of
+from regnf_core.importing.observing import reading
+from regnf_core.importing.observing.reading import open3d_poses, read_lines, words_of
 from regnf_core.texts import TextError, decode_text
 from regnf_data.recordings.camera import Array, Camera, CameraFile, camera_of, of_color, read_camera_file
 from regnf_data.recordings.recording import (
@@ -157,16 +158,11 @@ def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
 
 def poses_of(places: Array, quaternions: Array, name: str) -> Array:
     """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w. Raises DatasetError (DATASET_POSE_NOT_RIGID)."""
-    from scipy.spatial.transform import Rotation
-
     lengths = np.linalg.norm(quaternions, axis=1)
     if (odd := np.flatnonzero(~(np.abs(lengths - 1.0) <= 0.05))).size:
         said = f"{name}: the quaternion of pose {odd[0]} has the length {lengths[odd[0]]:.3g}, not 1"
         raise DatasetError(said, reason="DATASET_POSE_NOT_RIGID")
-    poses = np.tile(np.eye(4), (len(places), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
-    poses[:, :3, 3] = places
-    return poses
+    return reading.poses_of(places, quaternions)
 
 
 def interpolated(stamps: Array, poses: Array, wanted: Array) -> list[Array | None]:
@@ -266,26 +262,13 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
             number = int(_number(lines[at].split()[0], path.name))
             poses[number] = [[_number(word, path.name) for word in line.split()] for line in lines[at + 1 : at + 5]]
         return poses
-    if path.suffix in _POSE_LISTS:
-        rows = matrix_file(path)
-        lengths = {len(row) for row in rows}
-        if lengths in ({9}, {13}):  # Stray Scanner's; intrinsics may follow
-            table = np.array(rows)
-            return dict(zip(map(int, table[:, 1]), poses_of(table[:, 2:5], table[:, 5:9], path.name), strict=True))
-        if lengths == {4} and len(rows) % 4 == 0:
-            return dict(enumerate(np.split(np.array(rows), len(rows) // 4)))
-        if lengths not in ({12}, {16}):
-            raise DatasetError(f"{path.name}: expected one pose per line, 12 or 16 numbers", reason=_INVALID)
-        return dict(enumerate(rows))
-    values = read_json(path)
-    # Open3D's PoseGraph, and its PinholeCameraTrajectory, world to camera: matrices by columns.
-    for key, member, inverse in (("nodes", "pose", False), ("parameters", "extrinsic", True)):
-        listed = values.get(key) if isinstance(values, dict) else None
-        if isinstance(listed, list):
-            found = {index: each[member] for index, each in enumerate(listed) if member in each}
-            poses = {index: np.array(each, np.float64).reshape(4, 4).T for index, each in found.items()}
-            return {index: np.linalg.inv(pose) for index, pose in poses.items()} if inverse else poses
-    raise DatasetError(f"{path.name} has no poses in Open3D's form (nodes or parameters)", reason=_INVALID)
+    if path.suffix == ".npy":
+        return dict(enumerate(matrix_file(path)))
+    found = read_lines(path.name, path.read_bytes()) if path.suffix != ".json" else open3d_poses(read_json(path))
+    if found is None:
+        said = f"{path.name}: expected one pose per line, 12 or 16 numbers, or Open3D's trajectory or pose graph"
+        raise DatasetError(said, reason=_INVALID)
+    return dict(enumerate(found))
 
 
 # ScanNet, extracted: color/0.jpg, depth/0.png, pose/0.txt, intrinsic/.

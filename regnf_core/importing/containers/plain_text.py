@@ -39,3 +39,11 @@ def number(word: bytes) -> float:
         return float(word)
     except ValueError:
         return float(plain_numbers(word))
+
+
+def is_number(word: bytes) -> bool:
+    try:
+        number(word)
+    except ValueError:
+        return False
+    return True

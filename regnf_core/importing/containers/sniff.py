@@ -7,7 +7,7 @@ import re
 import struct
 import zlib
 
-from regnf_core.importing.containers.plain_text import number, text_alone, unmarked
+from regnf_core.importing.containers.plain_text import is_number, text_alone, unmarked
 from regnf_core.importing.containers.refused import is_package, refused
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
@@ -139,11 +139,7 @@ def _is_place(words: list[bytes]) -> bool:
 
 def _is_number(word: bytes) -> bool:
     """Also with a decimal comma, which the reader then names."""
-    try:
-        number(word.replace(b",", b"."))
-    except ValueError:
-        return False
-    return True
+    return is_number(word.replace(b",", b"."))
 
 
 def _is_binary_stl(head: bytes) -> bool:

@@ -25,7 +25,6 @@ from regnf_core.importing.families.layers import (
     require_extra_columns,
     require_family,
     shared_entries,
-    states,
     strip_prefix,
 )
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, form_variant, network_field
@@ -166,10 +165,9 @@ def convert_blocks(
     Raises FieldFormatError: LATENT_MISSING, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what TensorSource
     raises.
     """
-    found = [state for _, state in states(checkpoint) if "final_layer.0.bias" in state and "net.0.0.bias" in state]
-    if len(found) != 1:
+    if not ("final_layer.0.bias" in checkpoint and "net.0.0.bias" in checkpoint):
         return None
-    (state,) = found
+    state = {name: value for name, value in checkpoint.items() if isinstance(value, TensorRef)}
     require_family(overrides, BLOCKS)
     refuse_other_entries(overrides, BLOCKS, ("latent", "latent_index", "skip_layer", *FORM_ENTRIES))
     blocks = [f"net.{name}.0" for name in layer_names(strip_prefix(state, "net."), "", minimum=1)]

@@ -24,7 +24,9 @@ _NEUS, _DEEPSDF = "sdf_network_fine", "model_state_dict"
 """Homes of layers ``lin*``."""
 _OWN_NAMES = re.compile(r"(?:(?:model|net|network|decoder|sdf_network|sdf_network_fine)\.)*")
 """What may stand before ``lin*``: other networks have such layers too."""
-_DEEPEST = 3
+_PLACES = ("", "pipeline", "model", "state_dict", _NEUS, _DEEPSDF)
+_OTHERS = re.compile("colou?r|rgb|radiance|nerf")
+_DEEPEST, _MOST = 3, 50_000
 
 
 def unwrapped(checkpoint: Any, family: str | None) -> Any:
@@ -38,10 +40,13 @@ def unwrapped(checkpoint: Any, family: str | None) -> Any:
     if not isinstance(checkpoint, dict):
         return checkpoint
     found = {}
-    for path, beside, state in _dictionaries(checkpoint):
+    # What lies at a home already comes first.
+    for path, beside, state in sorted(_dictionaries(checkpoint), key=lambda one: one[0] not in _PLACES):
         named = {WRAPPED.sub("", name): value for name, value in state.items() if isinstance(name, str)}
         if (told := _home(named)) is not None:
             home, before = told
+            if home == "lin" and _OTHERS.search(path):
+                continue
             if home == "lin":
                 home = _home_of_layers(path, before, {**checkpoint, **beside}, family)
             moved = {name.removeprefix(before): value for name, value in named.items() if name.startswith(before)}
@@ -57,8 +62,11 @@ def unwrapped(checkpoint: Any, family: str | None) -> Any:
 def _dictionaries(checkpoint: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, Any], dict[Any, Any]]]:
     """Path, the dictionary around it, and each dictionary that has tensors."""
     waiting: list[tuple[str, dict[Any, Any], dict[Any, Any], int]] = [("", {}, checkpoint, 0)]
+    left = _MOST
     while waiting:
         path, beside, state, depth = waiting.pop(0)
+        if (left := left - len(state)) < 0:
+            return
         if any(isinstance(value, TensorRef) for value in state.values()):
             yield path, beside, state
         if depth < _DEEPEST:

@@ -12,7 +12,7 @@ import numpy as np
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.assumptions import PLACES
 from regnf_core.importing.containers.npz import array_header
-from regnf_core.importing.containers.plain_text import number
+from regnf_core.importing.containers.plain_text import is_number, number
 from regnf_core.importing.containers.sniff import names_places
 from regnf_core.importing.meshes.thinning import Thinning, lines_of, numbers_of, parts_of, rows_of_text
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, malformed, not_numbers, unsupported
@@ -244,7 +244,7 @@ def _rows_of_lines(body: memoryview, like: list[bytes], thinning: Thinning) -> t
     """The kept rows (K, columns), and how many lines are none. like: the words of the first line; those of its columns
     that are no numbers are read as NaN. Raises FieldFormatError (MESH_INVALID) where many lines are none.
     """
-    named = [column for column, word in enumerate(like) if not _is_number(word)]
+    named = [column for column, word in enumerate(like) if not is_number(word)]
     parts, read, odd = [np.zeros((0, len(like)))], 0, 0
     first_odd = b""
     for part in parts_of(body, "point"):
@@ -256,8 +256,8 @@ def _rows_of_lines(body: memoryview, like: list[bytes], thinning: Thinning) -> t
             sound = []
             for line in lines:
                 words = line.split()
-                if len(words) == len(like) and all(map(_is_number, words[:3])):
-                    sound.append([number(word) if _is_number(word) else math.nan for word in words])
+                if len(words) == len(like) and all(map(is_number, words[:3])):
+                    sound.append([number(word) if is_number(word) else math.nan for word in words])
                 else:
                     odd, first_odd = odd + 1, first_odd or line
             rows = np.array(sound, np.float64).reshape(-1, len(like))
@@ -269,14 +269,6 @@ def _rows_of_lines(body: memoryview, like: list[bytes], thinning: Thinning) -> t
     rows = np.concatenate(parts)
     rows[:, named] = np.nan
     return rows, odd
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        number(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _columns_told(rows: Float64Array, names: list[bytes]) -> tuple[list[int], list[int] | None]:

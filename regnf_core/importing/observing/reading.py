@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -343,27 +343,35 @@ def _of_list(keys: Keys) -> Trajectory:
     return trajectory_of(keys.file, np.stack(poses), intrinsics, None)
 
 
-def _of_open3d(keys: Keys, said: CamerasDescription) -> Trajectory | None:
-    """Open3D's trajectory, world to camera with intrinsics, or pose graph, camera to world: matrices by columns."""
-    poses, intrinsics = [], []
+def open3d_poses(tree: Any) -> Array | None:
+    """The poses (N, 4, 4), camera to world, of Open3D's trajectory or pose graph, whose matrices are by columns."""
     for key, member in (("parameters", "extrinsic"), ("nodes", "pose")):
-        listed = keys.find(key)
-        for index, one in enumerate(listed if isinstance(listed, list) else []):
-            each = Keys(keys.file, one, f"{key}.{index}.")
-            numbers = each.numbers(member)
-            if numbers is None or len(numbers) != 16:
+        listed = tree.get(key) if isinstance(tree, dict) else None
+        if isinstance(listed, list) and listed and all(isinstance(one, dict) and member in one for one in listed):
+            try:
+                poses = np.array([one[member] for one in listed], np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
+                return np.asarray(np.linalg.inv(poses) if member == "extrinsic" else poses, np.float64)
+            except (TypeError, ValueError, np.linalg.LinAlgError):
                 return None
-            pose = np.array(numbers, np.float64).reshape(4, 4).T
-            poses.append(np.linalg.inv(pose) if member == "extrinsic" and np.linalg.det(pose) else pose)
-            K, width, height = (each.numbers("intrinsic.intrinsic_matrix"), *map(each.number, _OPEN3D_SIZE))
-            if K is not None and len(K) == 9 and width and height:
-                intrinsics.append(Intrinsics(K[0], K[4], K[6], K[7], width, height))
-    if not poses:
+    return None
+
+
+def _of_open3d(keys: Keys, said: CamerasDescription) -> Trajectory | None:
+    if (poses := open3d_poses(keys.tree)) is None:
         return None
-    known = _said(said) or (intrinsics if len(intrinsics) == len(poses) else None)
-    if known is None:
+    first = Keys(keys.file, (keys.tree.get("parameters") or [{}])[0], "parameters.0.")
+    K, width, height = first.numbers("intrinsic.intrinsic_matrix"), *map(first.number, _OPEN3D_SIZE)
+    found = Intrinsics(K[0], K[4], K[6], K[7], width, height) if K and len(K) == 9 and width and height else None
+    if (known := _said(said) or found) is None:
         raise without_intrinsics(keys.file)
-    return trajectory_of(keys.file, np.stack(poses), known, said.axes or "opencv")
+    return trajectory_of(keys.file, poses, known, said.axes or "opencv")
+
+
+def colmap_lines(text: str, is_images: bool) -> list[list[str]]:
+    """The words of each camera, or of each image, of COLMAP's text model; a line of points follows each image."""
+    lines = [line.strip() for line in text.split("\n") if not line.startswith("#")]
+    words = (line.split(maxsplit=9 if is_images else -1) for line in (lines[::2] if is_images else lines))
+    return [line for line in words if line]
 
 
 def _of_colmap(files: Sequence[SettingsFile]) -> Trajectory | None:
@@ -371,29 +379,23 @@ def _of_colmap(files: Sequence[SettingsFile]) -> Trajectory | None:
     named = {PurePosixPath(file.name).name: file for file in files}
     if not {"cameras.txt", "images.txt"} <= named.keys():
         return None
+    listed, images = (
+        colmap_lines(decoded(name, named[name].data, _ARRAY_BYTES), name == "images.txt")
+        for name in ("cameras.txt", "images.txt")
+    )
     cameras: dict[str, Intrinsics] = {}
-    for line in _lines_of(named["cameras.txt"]):
-        number, model, *sizes = line.split()
-        numbers = [_number("cameras.txt", word) for word in sizes]
-        if not _PINHOLES.fullmatch(model) or len(numbers) < 5:
+    for one, model, *sizes in (line for line in listed if len(line) > 7 - ("SIMPLE" in line[1])):
+        if not _PINHOLES.fullmatch(model):
             message = f"cameras.txt: cameras of the model {model[:40]} are not supported"
             raise FieldFormatError(message, reason="CAMERAS_NOT_SUPPORTED")
-        width, height, fx, *rest = numbers
+        width, height, fx, *rest = (_number("cameras.txt", word) for word in sizes)
         fy, cx, cy = (fx, *rest[:2]) if model.startswith(("SIMPLE", "RADIAL")) else rest[:3]
-        cameras[number] = Intrinsics(fx, fy, cx, cy, width, height)
-    words = [line.split(maxsplit=9) for line in _lines_of(named["images.txt"], every=True)[::2]]
-    words = [line for line in words if line]
-    if not words or any(len(line) < 10 or line[8] not in cameras for line in words):
+        cameras[one] = Intrinsics(fx, fy, cx, cy, width, height)
+    if not images or any(len(line) < 10 or line[8] not in cameras for line in images):
         raise malformed("images.txt is not a list of images of the cameras in cameras.txt")
-    values = np.array([[_number("images.txt", word) for word in line[1:8]] for line in words])
-    poses: Array = np.linalg.inv(poses_of(values[:, 4:], np.roll(values[:, :4], -1, axis=1)))
-    return trajectory_of("images.txt", poses, [cameras[line[8]] for line in words], None)
-
-
-def _lines_of(file: SettingsFile, every: bool = False) -> list[str]:
-    """Without comments. every: with empty lines, which an image without points has."""
-    lines = decoded(file.name, file.data, _ARRAY_BYTES).split("\n")
-    return [line for line in map(str.strip, lines) if (every or line) and not line.startswith("#")]
+    values = np.array([[_number("images.txt", word) for word in line[1:8]] for line in images])
+    poses = np.linalg.inv(poses_of(values[:, 4:], np.roll(values[:, :4], -1, axis=1)))
+    return trajectory_of("images.txt", np.asarray(poses, np.float64), [cameras[line[8]] for line in images], None)
 
 
 def _of_text(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory | None:
