@@ -104,7 +104,8 @@ _OLD_TORCH = frozenset({"sys_info", "pickle", "storages", "tensors"})
 class _Forward:
     """Bytes from first to last, as ``tarfile`` reads them; there is no way back."""
 
-    def __init__(self, source: Iterator[bytes] | Iterator[memoryview]) -> None:
+    def __init__(self, source: Iterator[bytes] | Iterator[memoryview], is_packed: bool) -> None:
+        self._is_packed = is_packed
         self._source, self._waiting, self._at = source, memoryview(b""), 0
         self.last = b""
         """What was read last; a header of zeros is the archive's end."""
@@ -115,6 +116,8 @@ class _Forward:
         while size:
             if not self._waiting:
                 piece = next(self._source, None)
+                if piece is None and self._is_packed and self._at <= tarfile.BLOCKSIZE:
+                    raise tarfile.ReadError  # a whole file, shorter than an archive's first header
                 if piece is None:
                     raise truncated()
                 self._waiting = memoryview(piece)
@@ -188,8 +191,7 @@ class TarRun:
         """Name and size of each plain file in order, and the stream, which stands at its content."""
         packing = self._packing
         source = iter((self._data,)) if packing is None else _unpacked(self._data, packing, self._most)
-        stream = _Forward(source)
-        single = f"a single file compressed with {packing}, or a damaged archive: decompress it, and give the file"
+        stream = _Forward(source, packing is not None)
         try:
             archive = tarfile.TarFile(fileobj=stream, encoding="utf-8", errors="strict")  # type: ignore[arg-type]
             for number, member in enumerate(archive):
@@ -203,11 +205,8 @@ class TarRun:
         except (tarfile.TarError, ValueError, RecursionError) as error:
             if packing is None:
                 raise archive_error("a header is malformed") from error
-            raise archive_error(single) from error
-        except FieldFormatError as error:
-            if packing is None or error.reason != "FILE_TRUNCATED" or stream.tell() > tarfile.BLOCKSIZE:
-                raise
-            raise archive_error(single) from error  # shorter than an archive's first header
+            message = f"a single file compressed with {packing}, or a damaged archive: decompress it, and give the file"
+            raise archive_error(message) from error
         stream.require_end()
 
 
