@@ -9,6 +9,7 @@ BLANK = b"\xef\xbb\xbf \t\r\n"
 """What may stand before the first statement: a byte-order mark, blanks, ends of lines."""
 _ENDED = b"\0\x1a"
 """What some disks and editors leave behind the last one."""
+codecs.lookup("utf-16")  # now: the import's process may load no module once it is confined
 _WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _ODD = re.compile(
     rb"[-+]?(?:\d\.#(?:INF|IND|[QS]NAN)\w*|nan\(\w*\))|\xef\xbb\xbf|(?<=\d)[dD](?=[-+]?\d)", re.IGNORECASE
