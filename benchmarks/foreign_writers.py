@@ -44,7 +44,7 @@ class File:
 
 S = solid()
 V, F = np.asarray(S.vertices), np.asarray(S.faces)
-POINTS, _index = (np.asarray(each) for each in trimesh.sample.sample_surface(S, 20_000, seed=0))
+POINTS, _index = (np.asarray(each) for each in trimesh.sample.sample_surface(S, 8_000, seed=0))
 NORMALS = np.asarray(S.face_normals)[_index]
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, FieldFormatError
 from regnf_core.importing.containers.plain_text import number
 from regnf_core.importing.observing import reading
 from regnf_core.importing.observing.reading import open3d_poses, read_lines, words_of
@@ -264,7 +264,11 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
         return poses
     if path.suffix == ".npy":
         return dict(enumerate(matrix_file(path)))
-    found = read_lines(path.name, path.read_bytes()) if path.suffix != ".json" else open3d_poses(read_json(path))
+    try:
+        is_text = path.suffix != ".json"
+        found = read_lines(path.name, path.read_bytes(), _MOST_TEXT) if is_text else open3d_poses(read_json(path))
+    except FieldFormatError as error:
+        raise DatasetError(str(error), reason=_INVALID) from error
     if found is None:
         said = f"{path.name}: expected one pose per line, 12 or 16 numbers, or Open3D's trajectory or pose graph"
         raise DatasetError(said, reason=_INVALID)

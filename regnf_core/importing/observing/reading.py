@@ -166,7 +166,7 @@ _STARTS = re.compile(r"[-+.\d]|nan|inf", re.IGNORECASE)
 _NAMES_FIRST = re.compile(r"(time|stamp|frame|x$|tx$|p_)", re.IGNORECASE)
 
 
-def read_lines(name: str, data: bytes | memoryview) -> Array | None:
+def read_lines(name: str, data: bytes | memoryview, most: int = MOST_BYTES) -> Array | None:
     """The poses (N, 4, 4), camera to world, of a file of lines; None where it is none.
 
     TUM's (t, place, quaternion x y z w, with a number behind of RTAB-Map), EuRoC's (ns, w first, by commas), Stray
@@ -174,7 +174,7 @@ def read_lines(name: str, data: bytes | memoryview) -> Array | None:
     their number before (Redwood). Lines that are empty or begin with # or with names of columns are passed over.
     Raises FieldFormatError (CAMERAS_MALFORMED).
     """
-    rows = _rows(name, data)
+    rows = _rows(name, data, most)
     widths = {len(row) for row in rows}
     if widths == {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
         rows, widths = [row for at, row in enumerate(rows) if at % 5], {4}
@@ -235,9 +235,9 @@ def read_matrices(files: Sequence[tuple[str, bytes | memoryview]]) -> tuple[Arra
     return (np.stack(poses) if poses else None), intrinsics
 
 
-def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
+def _rows(name: str, data: bytes | memoryview, most: int = MOST_BYTES) -> list[list[float]]:
     """The lines' numbers; NaN and infinity are such, as trackers write them for a camera that they have lost."""
-    lines = (line.strip() for line in decoded(name, data, MOST_BYTES).splitlines())
+    lines = (line.strip() for line in decoded(name, data, most).splitlines())
     words = [words_of(line) for line in lines if line and not line.startswith("#")]
     if len(words) > 1 and _NAMES_FIRST.match(words[0][0]):  # what the columns are
         del words[0]
