@@ -166,8 +166,8 @@ _DOUBLED = 0.5
 """Share of the faces that are there twice, once turned: beyond this the file is a double-sided mesh."""
 _ODD = 0.01
 """Of the faces so many, or one, may have corners that do not exist."""
-_CLOSING = 0.5
-"""Of the open edges so many may be left without one side of the doubled faces: then it is those that open it."""
+_CLOSED_BUT_FOR = 0.005
+"""Share of the edges that may be open in a mesh that counts as closed."""
 _MANY_PARTS = 1000
 _STRAY = 4.0
 """Diagonals of the rest: parts beyond so wide a gap are said."""
@@ -329,9 +329,9 @@ def _once(corners: Int64Array) -> tuple[Int64Array, tuple[str, ...]]:
         corners, begun = corners[found], begun[found]
     sides = _first_of(np.sort(begun, axis=1))
     twice = len(corners) - len(sides)
-    # Two solids that touch have a wall twice, too; but without one side of it more of their edges are open.
+    # Of fewer one side is dropped only where that closes the mesh. Walls between solids, which are closed, stay.
     if 2 * twice > _DOUBLED * len(corners) or (
-        twice and _open_edge_share(corners[sides]) < _CLOSING * _open_edge_share(corners)
+        twice and _edges(corners)[1].any() and (_edges(corners[sides])[0] != 2).mean() <= _CLOSED_BUT_FOR
     ):
         ignored.append(f"{twice} triangles of the other side: the mesh is double-sided")
         corners = corners[sides]
@@ -395,6 +395,14 @@ def _scattered(vertices: npt.NDArray[np.float32], faces: Int64Array) -> tuple[st
             found.append(f"STRAY_PARTS: {text}: remove them if they do not belong to the object")
             break
     return tuple(found)
+
+
+def _edges(faces: Int64Array) -> tuple[Int64Array, Float64Array]:
+    """Of each edge how many faces (F, 3) it has, and how many more run through it one way than the other."""
+    start, end = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+    _, number, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.asarray(count, np.int64), np.bincount(number, np.where(start < end, 1.0, -1.0)).astype(np.float64)
 
 
 def _open_edge_share(faces: Int64Array) -> float:

@@ -212,6 +212,13 @@ def test_a_double_sided_mesh_has_one_side() -> None:
     assert f"ignored: {len(BALL.faces)} triangles of the other side: the mesh is double-sided" in found.why
 
 
+def test_a_wall_between_two_solids_has_both_sides() -> None:
+    beside = trimesh.creation.box((1, 1, 1))
+    beside.apply_translation((1, 0, 0))
+    both = trimesh.util.concatenate([trimesh.creation.box((1, 1, 1)), beside])
+    assert len(converted(bytes(both.export(file_type="stl"))).tensors["faces"]) == 24
+
+
 def test_what_changes_the_shape_and_is_not_read_is_warned_of() -> None:
     found = converted((SHEET + "cstype bezier\nsurf 0 1 0 1 1 2 3 4\nend\n").encode())
     assert "GEOMETRY_IGNORED: not read: 1 free-form surfaces" in found.warnings
