@@ -10,6 +10,7 @@ BLANK = b"\xef\xbb\xbf \t\r\n"
 _ENDED = b"\0\x1a"
 """What some disks and editors leave behind the last one."""
 codecs.lookup("utf-16")  # now: the import's process may load no module once it is confined
+_LOOKED_AT = 4096
 _WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _ODD = re.compile(
     rb"[-+]?(?:\d\.#(?:INF|IND|[QS]NAN)\w*|nan\(\w*\))|\xef\xbb\xbf|(?<=\d)[dD](?=[-+]?\d)", re.IGNORECASE
@@ -27,6 +28,15 @@ def unmarked(text: bytes) -> bytes:
 def text_alone(text: bytes) -> bytes:
     """Also without the zeros, or the sign for its end, behind a text."""
     return unmarked(text).rstrip(_ENDED)
+
+
+def without_marks(data: memoryview, is_text: bool) -> memoryview:
+    """The same of a whole file; only one in UTF-16 is copied. is_text: to its end."""
+    head, tail = bytes(data[:_LOOKED_AT]), bytes(data[-_LOOKED_AT:])
+    if head.startswith(_WIDE):
+        return memoryview(text_alone(bytes(data)))
+    behind = len(tail) - len(tail.rstrip(_ENDED)) if is_text else 0
+    return data[len(head) - len(head.lstrip(BLANK)) : len(data) - behind]
 
 
 def plain_numbers(text: bytes) -> bytes:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from regnf_core.importing.containers.plain_text import BLANK, text_alone
+from regnf_core.importing.containers.plain_text import without_marks
 from regnf_core.importing.meshes.e57 import read_e57
 from regnf_core.importing.meshes.glb import read_glb, read_gltf
 from regnf_core.importing.meshes.las import read_las
@@ -41,7 +41,6 @@ _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
 }
 _AT_FIXED_BYTES = frozenset({"3mf", "glb", "las", "npy", "stl", "usd"})
 _TEXTS = frozenset({"gltf", "obj", "urdf", "xyz"})
-_MOST_BLANKS = 4096
 MESH_READERS = (*_WHOLE, *_OF_NODES, "e57")
 """The names that ``sniff_format`` gives files with a reader here."""
 
@@ -63,11 +62,8 @@ def read_mesh(
         if path is None:
             raise ValueError("an E57 file is read from its path")
         return read_e57(path)
-    if format_ in _TEXTS:
-        data = memoryview(text_alone(bytes(data)))
-    elif format_ not in _AT_FIXED_BYTES:  # text may begin with a byte-order mark and blank lines
-        head = bytes(data[:_MOST_BLANKS])
-        data = data[len(head) - len(head.lstrip(BLANK)) :]
+    if format_ not in _AT_FIXED_BYTES:
+        data = without_marks(data, format_ in _TEXTS)
     if format_ in _OF_NODES:
         return _OF_NODES[format_](data, siblings or {}, node)
     refuse_node(node, format_)
