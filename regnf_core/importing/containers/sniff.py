@@ -97,7 +97,7 @@ def _is_xyz(text: bytes) -> bool:
     said = _statements(text.replace(b",", b" ").replace(b";", b" "), (b"#", b"//", b"%"))
     if said and (names_places(said[0]) or (len(said[0]) == 1 and said[0][0].isdigit())):
         said = said[1:]
-    if not said or len(said[0]) < 3:
+    if not said or len(said[0]) < 3 or not all(map(_is_number, said[0][:3])):  # names of columns that are no places
         return False
     # Words behind three numbers may be names; and the odd row may be cut.
     whole = sum(len(words) == len(said[0]) and all(map(_is_number, words[:3])) for words in said)

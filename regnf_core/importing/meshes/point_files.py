@@ -222,6 +222,10 @@ def read_xyz(data: memoryview) -> Geometry:
             break
     if not 3 <= len(words) <= _MOST_COLUMNS:
         raise malformed(f"lines of {len(words)} numbers are not points")
+    if not all(map(is_number, words[:3])):
+        raise not_numbers(
+            "the first line of the points is not numbers, nor names of columns with x, y and z", head[:80]
+        )
     if names and len(names) != len(words):
         raise malformed(f"the point file has {len(names)} names of columns, and {len(words)} numbers in a line")
     body = data[start:]

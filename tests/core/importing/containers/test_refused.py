@@ -100,7 +100,7 @@ SHAPES: list[tuple[bytes, str]] = [
     (b'{"version": "2.0", "points": 9, "hierarchy": {"firstChunkSize": 22}}', "Potree"),
     (b'{"bounds": [0], "hierarchyType": "json"}', "Entwine"),
     *((b"PAR1\x15\x04", "columns"), (b"ARROW1\0\0", "columns")),
-    *((b"lon,lat,h\n1,2,3\n4,5,6\n", "column names"), (b"E N H Intensity\r\n0.5 1 2 7\r\n", "column names")),
+    *((b"lon,lat,h\n" + 99 * b"1,2,3\n", "column names"), (b"E N H Intensity\r\n0.5 1 2 7\r\n", "column names")),
     (b"; made by a slicer\nG28 ; home\n", "milling"),
     *((_zip("config.json"), "Keras"), (_zip("metadata.json"), "Keras"), (b"\x1c\0\0\0TFL3", "TensorFlow Lite")),
     *(
