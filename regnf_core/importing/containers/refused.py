@@ -53,7 +53,7 @@ shape    a CAD or office document         .sldprt .ipt .max  \xd0\xcf\x11\xe0\xa
 shape    a Rhino file                     .3dm              3D Geometry File Format
 shape    a SketchUp model                 .skp              \xff\xfe\xff\x0eS\0k\0e\0t\0c\0h\0U\0p
 shape    a DWG drawing                    .dwg              AC10\d\d
-shape    a DXF drawing                    .dxf              0 SECTION 2 |AutoCAD Binary DXF
+shape    a DXF drawing                    .dxf              (999 .{0,200}?)?0 SECTION 2 |AutoCAD Binary DXF
 shape    a U3D or PRC model               .u3d .prc         U3D\0|PRC[\0-\x1f]
 shape    a USD scene                      .usd .usda .usdc  PXR-USDC|#usda
 shape    a USDZ scene                     .usdz             PK\x03\x04.{26}[^\0]*?\.usd[ac]?(?![^\0]*/)
@@ -80,9 +80,10 @@ shape    a COLLADA scene                  .dae              <COLLADA
 shape    a city model                     .gml .kml         <(core:)?CityModel|<kml
 shape    a CityJSON model                 .city.json        \{"CityJSON"
 shape    an AMF model                     .amf              <amf
-shape    an OFF mesh                      .off              (#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Z])
+shape    an OFF mesh                      .off              (#[^\n]*\n\s*)*[STCN4n]{0,6}OFF(?![A-Z])
 shape    an OpenCTM mesh                  .ctm              OCTM
 shape    a Draco mesh                     .drc              DRACO
+shape    an ANSYS Fluent mesh             .msh              \([01] "|\(2 [23]\)
 shape    a Gmsh mesh                      .msh              \$MeshFormat|\$NOD
 shape    a Medit mesh                     .meshb            MeshVersionFormatted
 shape    a Nastran model                  .nas .bdf         (\$[^\n]*\n\s*)*(SOL \d|CEND|BEGIN BULK|GRID[*, ])

@@ -14,7 +14,6 @@ from regnf_core.importing.containers.refused import is_package, refused
 
 MESH_FORMATS = (*("3mf", "e57", "glb", "gltf", "las", "npy", "obj", "pcd", "ply", "step", "stl", "urdf", "usd", "xyz"),)
 
-_OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _MAGICS = ((b"glTF", "glb"), (b"LASF", "las"), (b"ASTM-E57", "e57"), (b"\x93NUMPY", "npy"))
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50

@@ -101,7 +101,8 @@ SHAPES: list[tuple[bytes, str]] = [
     (b'{"bounds": [0], "hierarchyType": "json"}', "Entwine"),
     *((b"PAR1\x15\x04", "columns"), (b"ARROW1\0\0", "columns")),
     *((b"lon,lat,h\n" + 99 * b"1,2,3\n", "column names"), (b"E N H Intensity\r\n0.5 1 2 7\r\n", "column names")),
-    (b"; made by a slicer\nG28 ; home\n", "milling"),
+    *((b"; made by a slicer\nG28 ; home\n", "milling"), (b'(1 "meshio 5.3.5")\n(2 3)\n', "Fluent")),
+    *((b"NCOFF\n32 60 0\n", "OFF"), (b"999\nDXF by a library\n0\nSECTION\n2\nHEADER\n", "DXF")),
     *((_zip("config.json"), "Keras"), (_zip("metadata.json"), "Keras"), (b"\x1c\0\0\0TFL3", "TensorFlow Lite")),
     *(
         (b"\x08\x05\x12\x90\x01\x0a\x10\x0a\x05image", "Core ML"),
