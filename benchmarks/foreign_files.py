@@ -2,8 +2,8 @@
 
     python -m benchmarks.foreign_files --output benchmarks/results/foreign_files.md
 
-Only this benchmark needs the writers: pip install plyfile meshio numpy-stl pygltflib lib3mf pyvista pymeshlab
-cadquery-ocp, beside regnf[cad]; what is not installed is skipped. The solid, a union of boxes, has no symmetry: a
+Only this benchmark needs the writers: pip install plyfile meshio numpy-stl pygltflib lib3mf pymeshlab pyvista
+pyvista-validation cadquery-ocp, beside regnf[cad]; what is not installed is skipped. The solid, a union of boxes, has no symmetry: a
 mirrored, turned, scaled or inverted file is told from a right one, which has the true surface within 1 % (clouds) or
 .01 % (meshes) of the diagonal, and every box's middle on its side.
 """
@@ -72,10 +72,10 @@ def main() -> None:
                 skipped.append(writer)
     total = Counter(result.partition(":")[0] for results in found.values() for result in results)
     text = "# Files by other writers\n\n`python -m benchmarks.foreign_files`: "
-    text += f"{total.total()} files of {len({key[0] for key in found})} formats by {len({key[1] for key in found})} "
+    text += f"{total.total()} files of {len({key[0] for key in found})} endings by {len({key[1] for key in found})} "
     text += f"writers: {total['right']} right, {total['refused']} refused by name, {total['misread']} misread. "
     text += f"Skipped, not installed: {', '.join(skipped) or 'none'}.\n\n"
-    text += "| format | writer and version | files | right | refused by name | misread | why |\n" + "|---" * 7 + "|\n"
+    text += "| ending | writer and version | files | right | refused by name | misread | why |\n" + "|---" * 7 + "|\n"
     for (ending, writer), results in sorted(found.items()):
         counts = [str(sum(one.startswith(kind) for one in results)) for kind in ("right", "refused", "misread")]
         why = "; ".join(dict.fromkeys(one.partition(": ")[2] for one in results if one != "right"))
