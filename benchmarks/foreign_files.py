@@ -3,9 +3,9 @@
     python -m benchmarks.foreign_files --output benchmarks/results/foreign_files.md
 
 Only this benchmark needs the writers: pip install plyfile meshio numpy-stl pygltflib lib3mf pymeshlab pyvista
-pyvista-validation cadquery-ocp, beside regnf[cad]; what is not installed is skipped. The solid, a union of boxes, has no symmetry: a
-mirrored, turned, scaled or inverted file is told from a right one, which has the true surface within 1 % (clouds) or
-.01 % (meshes) of the diagonal, and every box's middle on its side.
+pyvista-validation cadquery-ocp, beside regnf[cad]; what is not installed is skipped. The solid, a union of boxes, has
+no symmetry: a mirrored, turned, scaled or inverted file is told from a right one, which has the true surface within 1 %
+(clouds) or .01 % (meshes) of the diagonal, and every box's middle on its side.
 """
 
 from __future__ import annotations
