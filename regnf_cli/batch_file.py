@@ -18,7 +18,7 @@ from regnf_cli.options import as_transform, is_json
 from regnf_core.detections.images import plain_values, read_detection
 from regnf_core.errors import InvalidInputError, RegnfError, suggestion
 from regnf_core.options import RegistrationOptions
-from regnf_core.texts import TextError, decode_text, json_value
+from regnf_core.texts import TextError, decode_text, is_binary, json_value
 from regnf_core.version import ENGINE_REVISION
 
 MEMBERS = ("key", "scene", "object", "candidates", "detection", "detection_index", "options", "seed")
@@ -31,7 +31,8 @@ _LINE_BEGINS = b'{"id": "'
 """How every line of results begins: what is otherwise is another file of the user's."""
 _JSON_LINES = frozenset({".jsonl", ".ndjson", ".json"})
 _DELIMITERS = ",;\t|"
-_SEPARATOR_TOLD = re.compile(r"sep=([,;\t|])", re.IGNORECASE)
+_SEPARATOR_TOLD = re.compile(r"\"?sep=([,;\t|])\"?", re.IGNORECASE)
+_INVISIBLE = " \t\u00a0\u200b\u200c\u200d\u2060\ufeff"
 _WHOLE = re.compile(r"(\d{1,10})(?:[.,]0*)?")
 """Also as a spreadsheet writes the whole numbers of a column that has empty cells."""
 _TRUTH = {"true": True, "wahr": True, "false": False, "falsch": False}
@@ -64,10 +65,13 @@ def read_pairs(path: Path) -> Iterator[FilePair]:
 
     Raises InvalidInputError (TEXT_UNREADABLE, INVALID_REQUEST) for a file of which no line can be read.
     """
+    data = path.read_bytes()
     try:
-        text = decode_text(path.read_bytes())
+        text = decode_text(data).rstrip("\0\x1a")
+        if is_binary(text):
+            raise TextError("not a text: it has control characters")
     except TextError as error:
-        hint = "Save it as UTF-8."
+        hint = "Save a spreadsheet as CSV." if data.startswith((b"PK", b"\xd0\xcf")) else "Save it as UTF-8."
         raise InvalidInputError(f"{path} is {error}", reason="TEXT_UNREADABLE", hint=hint) from error
     is_table = not (is_json(text) or path.suffix.lower() in _JSON_LINES)
     for number, given in _csv_lines(path, text) if is_table else _json_lines(path, text):
@@ -79,10 +83,10 @@ def _csv_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
     head, _, rest = text.partition("\n")
     told = _SEPARATOR_TOLD.fullmatch(head.strip())  # Excel's own first line
     delimiter = told[1] if told else _delimiter(head)
-    rows = csv.reader(io.StringIO(rest if told else text), delimiter=delimiter, skipinitialspace=True)
+    rows = csv.reader(io.StringIO(rest if told else text), delimiter=delimiter, skipinitialspace=True, strict=True)
     skipped = 1 if told else 0
     try:
-        names = [name.strip() for name in next((row for row in rows if any(row)), [])]
+        names = [name.strip(_INVISIBLE) for name in next((row for row in rows if any(row)), [])]
         while names and not names[-1]:
             names.pop()
         _check_header(path, names, rows.line_num + skipped)
@@ -110,7 +114,7 @@ def _delimiter(head: str) -> str:
 
     def known(delimiter: str) -> int:
         names = next(csv.reader([head], delimiter=delimiter, skipinitialspace=True), [])
-        return len({name.strip() for name in names} & _KNOWN)
+        return len({name.strip(_INVISIBLE) for name in names} & _KNOWN)
 
     return max(_DELIMITERS, key=known)
 
@@ -138,8 +142,8 @@ def _cell(name: str, text: str) -> Any:
 
 
 def _json_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
-    if text.lstrip()[:1] == "[":
-        raise _wrong(f"{path}: a single list, expected a JSON object on each line")
+    if text.lstrip()[:1] == "[" or text.lstrip().split("\n", 1)[0].strip() == "{":
+        raise _wrong(f"{path}: a single JSON value, expected a JSON object on each line")
     for number, line in enumerate(text.split("\n"), 1):
         if line.strip():
             try:

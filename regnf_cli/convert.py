@@ -87,7 +87,7 @@ def convert(
         Path | None,
         typer.Option(
             help="The poses of the cameras from whose images the field was made: transforms.json, "
-            "meta_data.json, a TUM trajectory, or a folder with one pose per file. The regnf field "
+            "meta_data.json, lines of poses (TUM, KITTI ...), or a folder with one pose per file. The regnf field "
             "file then records which parts the cameras observed. No image is needed.",
             parser=existing,
             metavar="PATH",

@@ -66,6 +66,11 @@ def _windows(raw: bytes, error: UnicodeDecodeError) -> str:
         raise TextError(f"not a text in UTF-8 from {place} on, and not in Windows-1252, which lacks {worse}") from error
 
 
+def is_binary(text: str) -> bool:
+    """Whether a text has control characters that no text has."""
+    return _BINARY.search(text) is not None
+
+
 class TextStream:
     """A text that arrives in pieces of any size, as lines that ``decode_text`` reads one by one.
 

@@ -102,7 +102,7 @@ def resolve(folder: Path, name: Any, what: str) -> Path:
     if not isinstance(name, str) or not name or "\0" in name:
         raise DatasetError(f"{what} is not a path", reason="DATASET_METADATA_INVALID")
     try:
-        path = (folder / name).resolve()
+        path = (folder / name.replace("\\", "/")).resolve()  # as Windows writes paths
         inside = path.is_relative_to(folder.resolve())
         exists = inside and path.is_file()
     except (OSError, RuntimeError, ValueError) as error:  # too long, links in a circle, half a character

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_core.importing.observing.reading import colmap_lines
 from regnf_data.recordings.camera import HALF_A_PIXEL, Array, Camera, camera_of, lens_of
 from regnf_data.recordings.folders import (
     _COLOR_FOLDERS,
@@ -157,7 +158,7 @@ def read_nerfstudio(path: Path, given: Given) -> Recording:
 def _color_path(folder: Path, name: Any) -> Path | None:
     if not isinstance(name, str) or not name:
         return None
-    path = (folder / name).resolve()
+    path = (folder / name.replace("\\", "/")).resolve()
     if not path.is_relative_to(folder.resolve()):
         raise DatasetError(f"file_path leaves the folder: {name!r:.200}", reason="DATASET_PATH_OUTSIDE")
     return path if path.is_file() else _first_file(path.parent, (path.name,), _COLORS)
@@ -343,18 +344,12 @@ Image = tuple[str, int, Array, Array]
 
 
 def _text_images(path: Path) -> Iterator[Image]:
-    """Every second line lists points; it may be empty."""
-    with path.open(encoding="utf-8", errors="replace") as file:
-        lines = [line.strip() for line in file if not line.startswith("#")]
-    for line in lines[::2]:
-        words = line.split(maxsplit=9)
-        if not words:
-            continue
+    for words in colmap_lines(path.read_text(encoding="utf-8", errors="replace"), is_images=True):
         try:
             w, x, y, z, *place = (float(word) for word in words[1:8])
             yield words[9], int(words[8]), np.array([x, y, z, w]), np.array(place)
         except (IndexError, ValueError) as error:
-            raise DatasetError(f"{path.name}: {line[:60]!r} is not an image", reason=_INVALID) from error
+            raise DatasetError(f"{path.name}: {' '.join(words)[:60]!r} is not an image", reason=_INVALID) from error
 
 
 def _unpack(file: BinaryIO, form: str, name: str) -> tuple[Any, ...]:

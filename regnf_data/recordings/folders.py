@@ -15,7 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, FieldFormatError
+from regnf_core.importing.containers.plain_text import number
+from regnf_core.importing.observing import reading
+from regnf_core.importing.observing.reading import open3d_poses, read_lines, words_of
+from regnf_core.texts import TextError, decode_text
 from regnf_data.recordings.camera import Array, Camera, CameraFile, camera_of, of_color, read_camera_file
 from regnf_data.recordings.recording import (
     DepthFile,
@@ -59,8 +63,13 @@ _MOST_APART_S = 0.05
 """Between an image and the poses on both sides of it, or the color beside it."""
 
 
+_ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
+"""Lists of pairs, as ORB-SLAM needs them: a time stamp and an image, twice a line."""
+
+
 def is_tum(path: Path) -> bool:
-    return path.is_dir() and (path / "depth.txt").is_file() and _tum_poses(path) is not None
+    listed = ("depth.txt", *_ASSOCIATIONS)
+    return path.is_dir() and any((path / name).is_file() for name in listed) and _tum_poses(path) is not None
 
 
 def _tum_poses(folder: Path) -> Path | None:
@@ -73,7 +82,7 @@ def read_tum(folder: Path, given: Given) -> Recording:
     published = next((value for part, value in _TUM_CAMERAS.items() if part in folder.resolve().name), None)
     note = "the folder has no intrinsics: the published ones of the benchmark are used"
     camera, unit, notes = _camera_of(folder.name, camera_beside(folder), given, _TUM_STEP_M, published, note)
-    depths, colors = _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
+    depths, colors = _tum_lists(folder)
     color_stamps = np.array([stamp for stamp, _ in colors])
     wanted = np.array([stamp for stamp, _ in depths])
     stamps, poses = _tum_trajectory(_tum_poses(folder) or folder / "groundtruth.txt", wanted)
@@ -98,13 +107,26 @@ def read_tum(folder: Path, given: Given) -> Recording:
     return recording_of(folder.name, "TUM RGB-D", frames, notes)
 
 
+def _tum_lists(folder: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
+    """Time stamps and names of the depth and of the color images."""
+    if (folder / "depth.txt").is_file():
+        return _tum_list(folder / "depth.txt"), _tum_list(folder / "rgb.txt")
+    path = next(folder / name for name in _ASSOCIATIONS if (folder / name).is_file())
+    rows = [line.split() for line in _lines(path)]
+    if not rows or any(len(row) != 4 for row in rows):
+        raise DatasetError(f"{path.name}: expected lines of a time stamp and an image, twice", reason=_INVALID)
+    halves = [[(_number(row[at], path.name), row[at + 1].replace("\\", "/")) for row in rows] for at in (0, 2)]
+    first = "depth" in rows[0][1].lower()
+    return (halves[0], halves[1]) if first else (halves[1], halves[0])
+
+
 def _tum_list(path: Path) -> list[tuple[float, str]]:
     found = []
     for line in _lines(path) if path.is_file() else ():
         words = line.split(maxsplit=1)
         if len(words) == 2:
             stamp = _number(words[0], path.name)
-            found.append((1e-9 * stamp if stamp > _NANOSECONDS else stamp, words[1]))
+            found.append((1e-9 * stamp if stamp > _NANOSECONDS else stamp, words[1].replace("\\", "/")))
     return found
 
 
@@ -136,16 +158,11 @@ def _tum_trajectory(path: Path, wanted: Array) -> tuple[Array, Array]:
 
 def poses_of(places: Array, quaternions: Array, name: str) -> Array:
     """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w. Raises DatasetError (DATASET_POSE_NOT_RIGID)."""
-    from scipy.spatial.transform import Rotation
-
     lengths = np.linalg.norm(quaternions, axis=1)
     if (odd := np.flatnonzero(~(np.abs(lengths - 1.0) <= 0.05))).size:
         said = f"{name}: the quaternion of pose {odd[0]} has the length {lengths[odd[0]]:.3g}, not 1"
         raise DatasetError(said, reason="DATASET_POSE_NOT_RIGID")
-    poses = np.tile(np.eye(4), (len(places), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
-    poses[:, :3, 3] = places
-    return poses
+    return reading.poses_of(places, quaternions)
 
 
 def interpolated(stamps: Array, poses: Array, wanted: Array) -> list[Array | None]:
@@ -245,26 +262,17 @@ def _redwood_poses(path: Path) -> dict[int, Any]:
             number = int(_number(lines[at].split()[0], path.name))
             poses[number] = [[_number(word, path.name) for word in line.split()] for line in lines[at + 1 : at + 5]]
         return poses
-    if path.suffix in _POSE_LISTS:
-        rows = matrix_file(path)
-        lengths = {len(row) for row in rows}
-        if lengths in ({9}, {13}):  # Stray Scanner's; intrinsics may follow
-            table = np.array(rows)
-            return dict(zip(map(int, table[:, 1]), poses_of(table[:, 2:5], table[:, 5:9], path.name), strict=True))
-        if lengths == {4} and len(rows) % 4 == 0:
-            return dict(enumerate(np.split(np.array(rows), len(rows) // 4)))
-        if lengths not in ({12}, {16}):
-            raise DatasetError(f"{path.name}: expected one pose per line, 12 or 16 numbers", reason=_INVALID)
-        return dict(enumerate(rows))
-    values = read_json(path)
-    # Open3D's PoseGraph, and its PinholeCameraTrajectory, world to camera: matrices by columns.
-    for key, member, inverse in (("nodes", "pose", False), ("parameters", "extrinsic", True)):
-        listed = values.get(key) if isinstance(values, dict) else None
-        if isinstance(listed, list):
-            found = {index: each[member] for index, each in enumerate(listed) if member in each}
-            poses = {index: np.array(each, np.float64).reshape(4, 4).T for index, each in found.items()}
-            return {index: np.linalg.inv(pose) for index, pose in poses.items()} if inverse else poses
-    raise DatasetError(f"{path.name} has no poses in Open3D's form (nodes or parameters)", reason=_INVALID)
+    if path.suffix == ".npy":
+        return dict(enumerate(matrix_file(path)))
+    try:
+        is_text = path.suffix != ".json"
+        found = read_lines(path.name, path.read_bytes(), _MOST_TEXT) if is_text else open3d_poses(read_json(path))
+    except FieldFormatError as error:
+        raise DatasetError(str(error), reason=_INVALID) from error
+    if found is None:
+        said = f"{path.name}: expected one pose per line, 12 or 16 numbers, or Open3D's trajectory or pose graph"
+        raise DatasetError(said, reason=_INVALID)
+    return dict(enumerate(found))
 
 
 # ScanNet, extracted: color/0.jpg, depth/0.png, pose/0.txt, intrinsic/.
@@ -281,7 +289,8 @@ def read_scannet(folder: Path, given: Given) -> Recording:
     camera, unit, _ = _camera_of(folder.name, found, given, _MILLIMETER)
     of_color = _named_camera(folder, "intrinsic_color")
     frames = []
-    for pose_file in in_order(_subfolder(folder, _POSE_FOLDERS) or folder, (".txt", ".npy")):
+    files = in_order(_subfolder(folder, _POSE_FOLDERS) or folder, (".txt", ".npy"))
+    for pose_file in [file for file in files if _NUMBER.search(file.stem)] or files:  # and no readme.txt
         name = pose_file.stem
         depth = _first_file(depths, (name,), DEPTHS)
         color = _first_file(colors, (name,), _COLORS) if colors else None
@@ -442,10 +451,10 @@ def matrix_file(path: Path) -> list[list[float]]:
     if path.suffix == ".npy":
         values = array_file(path)
         return [row.ravel().tolist() for row in (values if values.ndim > 1 else values[None])]
-    lines = [line.replace(",", " ").split() for line in _lines(path)]
+    lines = [words for line in _lines(path) if (words := words_of(line))]
     if len(lines) > 1 and lines[0][0].lower() in ("timestamp", "time", "frame", "x", "tx"):  # what the columns are
         del lines[0]
-    return [[_number(word, path.name) for word in words] for words in lines if words]
+    return [[_number(word, path.name) for word in words] for words in lines]
 
 
 def read_json(path: Path) -> Any:
@@ -462,15 +471,18 @@ def _lines(path: Path) -> Iterable[str]:
     """Without empty lines and comments."""
     if path.stat().st_size > _MOST_TEXT:
         raise DatasetError(f"{path.name} has more than {_MOST_TEXT} bytes", reason="DATASET_TOO_LARGE")
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            if (stripped := line.strip()) and not stripped.startswith("#"):
-                yield stripped
+    try:
+        text = decode_text(path.read_bytes())
+    except TextError as error:
+        raise DatasetError(f"{path.name} is {error}", reason=_INVALID) from error
+    for line in text.split("\n"):
+        if (stripped := line.strip()) and not stripped.startswith("#"):
+            yield stripped
 
 
 def _number(word: str, name: str) -> float:
     try:
-        return float(word)
+        return number(word.encode())
     except ValueError as error:
         raise DatasetError(f"{name}: {word[:40]!r} is not a number", reason=_INVALID) from error
 
@@ -486,7 +498,7 @@ def in_order(folder: Path, suffixes: Sequence[str], prefix: str = "") -> list[Pa
 
 
 def _first_file(folder: Path, stems: Iterable[str], suffixes: Sequence[str]) -> Path | None:
-    names = (folder / f"{stem}{suffix}" for stem in stems for suffix in suffixes)
+    names = (folder / f"{stem}{end}" for stem in stems for suffix in suffixes for end in (suffix, suffix.upper()))
     return next((path for path in names if path.is_file()), None)
 
 

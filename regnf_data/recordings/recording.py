@@ -342,7 +342,7 @@ def pose_of(matrix: Any, name: str, inverse: bool = False, unit: float = 1.0) ->
         given = np.array(matrix, np.float64)
     except (TypeError, ValueError) as error:
         raise DatasetError(f"{name}: the pose is not numbers", reason="DATASET_POSE_NOT_RIGID") from error
-    if given.shape in ((16,), (12,)):
+    if given.size in (12, 16) and max(given.shape) == given.size:
         given = given.reshape(-1, 4)
     if given.shape not in ((4, 4), (3, 4)):
         raise DatasetError(f"{name}: the pose is not 4 x 4 numbers", reason="DATASET_POSE_NOT_RIGID")

@@ -17,7 +17,7 @@ from regnf_cli.batch_file import read_pairs
 from regnf_cli.options import description, read_detection, read_options, read_transform
 from regnf_cli.render import _edits
 from regnf_core.errors import FieldFormatError, InvalidInputError
-from regnf_core.importing.observing.reading import read_matrices, read_tum
+from regnf_core.importing.observing.reading import read_lines, read_matrices
 from regnf_core.importing.run.opened import SettingsFile
 from regnf_core.importing.settings.documents import read_documents
 from regnf_core.texts import TextError, decode_text
@@ -85,7 +85,7 @@ def test_settings_and_poses(encode: Encode) -> None:
     }
     files = tuple(SettingsFile(name, memoryview(encode(text))) for name, text in texts.items())
     assert [keys.find("width") for keys in read_documents(files).keys] == [64, 64, 64, 64]
-    poses = read_tum("groundtruth.txt", encode("# Größe\n0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n"))
+    poses = read_lines("groundtruth.txt", encode("# Größe\n0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n"))
     assert poses is not None
     assert poses[:, :3, 3].tolist() == [[1, 2, 3], [1, 2, 3]]
 
@@ -94,7 +94,7 @@ def test_settings_and_poses(encode: Encode) -> None:
 @pytest.mark.parametrize("end", ["", ";", "\t"])
 def test_poses_with_decimal_commas(separator: str, end: str) -> None:
     line = separator.join(["1,25", "1,5", "-2,5", "3", "0", "0", "0", "1,0"]) + end
-    poses = read_tum("poses.csv", line.encode())
+    poses = read_lines("poses.csv", line.encode())
     assert poses is not None
     assert poses[0, :3, 3].tolist() == [1.5, -2.5, 3]
     found, _ = read_matrices([("0.txt", b"1, 0, 0, 4;\n0, 1, 0, 5;\n0, 0, 1, 6;\n")])
@@ -138,6 +138,8 @@ TABLES = {
     "whole numbers as others": "key,scene,object,detection,pictures,seed\n1,r.ply,o.ply,box.json,True,3.0\n",
     "with decimal commas": 'key;scene;object;detection;pictures;seed\n1;r.ply;o.ply;box.json;true;"3,00"\n',
     "a box in a cell": 'key,scene,object,detection,pictures,seed\n1,r.ply,o.ply,"{""min"": [0,0,0], ""max"": [1,1,1]}",true,3\n',
+    "a quoted separator": '"sep=;"\nkey;scene;object;detection;pictures;seed\n1;r.ply;o.ply;box.json;true;3\n',
+    "marks nobody sees": "key,scene,object,detection\u200b,pictures,seed\n1,r.ply,o.ply,box.json,true,3\n\x1a",
     "empty lines before": "\n\nkey,scene,object,detection,pictures,seed\n1,r.ply,o.ply,box.json,true,3\n",
 }  # fmt: skip
 
@@ -161,6 +163,7 @@ HEADERS = {
     "none at all": ("room.ply,chair.ply,box.json\n", "unknown member `room.ply`", "Write the column names"),
     "twice": ("scene,object,detection,scene\n", "twice", "Write the column names"),
     "empty": ("key\n", "`scene` is missing", "Write the column names"),
+    "a workbook": ("PK\x03\x04\x14\x00\x06\x00", "it has control characters", ""),
     "no text": (
         "scene,object,detection\na\x81b",
         "not a text in UTF-8 from byte 25 (0x81) on, and not in Windows-1252",
@@ -220,7 +223,7 @@ def test_every_reader_says_which_byte_it_was(tmp_path: Path) -> None:
     for kind, read in (
         (InvalidInputError, lambda: read_detection(file)),
         (FieldFormatError, lambda: read_documents((SettingsFile("a.yml", memoryview(file.read_bytes())),))),
-        (FieldFormatError, lambda: read_tum("poses.txt", file.read_bytes())),
+        (FieldFormatError, lambda: read_lines("poses.txt", file.read_bytes())),
         (InvalidInputError, lambda: read_settings(api_tokens=f"@{file}")),
     ):
         with pytest.raises(kind, match=said):

@@ -6,7 +6,8 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-_BLANK = b"\xef\xbb\xbf \t\r\n"
+from regnf_core.importing.containers.plain_text import unmarked
+
 _INSTEAD = {
     "archive": "unpack it, and give the file in it",
     "bag": "upload it with POST /recordings",
@@ -26,11 +27,16 @@ _INSTEAD = {
     "shape": "export it as .glb, .ply, .obj or .stl",
     "table": "remove the line of names: lines of numbers x y z are a cloud",
     "video": "give its images and camera poses as a recording",
+    "zeros": "it was not written to its end; copy it again",
+    "material": "give the .obj file that refers to it",
+    "columns": "read it with numpy.fromfile, and save x, y, z with numpy.save",
     "volume": "save it in .npz: numpy.savez(file, sdf=array, origin=..., spacing=...)",
     "xml": "export a model as .glb, .ply, .obj or .stl",
 }
 """What to do about a file, by the first word of its row."""
-_NO_FIELD = frozenset(["archive", "bag", "cameras", "code", "failed", "hdf5", "lfs", "none", "video", "xml"])
+_NO_FIELD = frozenset(
+    ["archive", "bag", "cameras", "code", "failed", "hdf5", "lfs", "material", "none", "video", "xml", "zeros"]
+)
 """Files that hold no field: FORMAT_NOT_RECOGNIZED; of the others FORMAT_NOT_SUPPORTED."""
 _ROWS = r"""
 shape    a STEP model of CAD              .step .stp        ISO-10303-21(?!.*FILE_SCHEMA ?\( ?\( ?'IFC)
@@ -47,7 +53,7 @@ shape    a CAD or office document         .sldprt .ipt .max  \xd0\xcf\x11\xe0\xa
 shape    a Rhino file                     .3dm              3D Geometry File Format
 shape    a SketchUp model                 .skp              \xff\xfe\xff\x0eS\0k\0e\0t\0c\0h\0U\0p
 shape    a DWG drawing                    .dwg              AC10\d\d
-shape    a DXF drawing                    .dxf              0 SECTION 2 |AutoCAD Binary DXF
+shape    a DXF drawing                    .dxf              (999 .{0,200}?)?0 SECTION 2 |AutoCAD Binary DXF
 shape    a U3D or PRC model               .u3d .prc         U3D\0|PRC[\0-\x1f]
 shape    a USD scene                      .usd .usda .usdc  PXR-USDC|#usda
 shape    a USDZ scene                     .usdz             PK\x03\x04.{26}[^\0]*?\.usd[ac]?(?![^\0]*/)
@@ -74,9 +80,10 @@ shape    a COLLADA scene                  .dae              <COLLADA
 shape    a city model                     .gml .kml         <(core:)?CityModel|<kml
 shape    a CityJSON model                 .city.json        \{"CityJSON"
 shape    an AMF model                     .amf              <amf
-shape    an OFF mesh                      .off              (#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Z])
+shape    an OFF mesh                      .off              (#[^\n]*\n\s*)*[STCN4n]{0,6}OFF(?![A-Z])
 shape    an OpenCTM mesh                  .ctm              OCTM
 shape    a Draco mesh                     .drc              DRACO
+shape    an ANSYS Fluent mesh             .msh              \([01] "|\(2 [23]\)
 shape    a Gmsh mesh                      .msh              \$MeshFormat|\$NOD
 shape    a Medit mesh                     .meshb            MeshVersionFormatted
 shape    a Nastran model                  .nas .bdf         (\$[^\n]*\n\s*)*(SOL \d|CEND|BEGIN BULK|GRID[*, ])
@@ -139,6 +146,11 @@ none     a picture                        .bmp .psd .jp2    BM.{4}\0{4}|8BPS|\0{
 none     an SVG picture                   .svg              <svg
 video    a video                          .mp4 .avi .mkv    .{4}(ftyp|moov)|RIFF.{4}AVI\x20|\x1aE\xdf\xa3|\0\0\x01\xba
 none     a sound                          .wav .mp3         RIFF.{4}WAVE|ID3|OggS|fLaC
+zeros    a file of zeros                  -                 \0{64}
+material  a file of materials             .mtl              (#[^\n]*\n\s*)*newmtl\s
+shape    an OpenSCAD program              .scad
+shape    a program of a milling machine   .gcode .nc        (;[^\n]*\n\s*)*G(0|1|21|28|90)\b
+columns  a raw array of numbers           .bin
 lfs      a Git LFS pointer, not the file itself  -                 version https://git-lfs
 failed   an HTML page, not a field        .html             <!doctype html|<html
 none     a PDF document                   .pdf .ps          %PDF|%!PS|\{\\rtf
@@ -201,7 +213,7 @@ def _rows() -> tuple[_Row, ...]:
 
 def refused(head: bytes, name: str = "") -> tuple[str, str] | None:
     """The reason and a sentence for a file of a known format, by its beginning, or else by the end of its name."""
-    start = head.lstrip(_BLANK)
+    start = unmarked(head)
     words = b" ".join(start.split())
     rows = _rows()
     by_content = next((row for row in rows if row.fits(head, words) or row.fits(start, words)), None)
@@ -209,6 +221,12 @@ def refused(head: bytes, name: str = "") -> tuple[str, str] | None:
         return by_content.told()
     ended = next((row for row in rows if name.lower().endswith(row.ends)), None)
     return None if ended is None else ended.told(by_name=True)
+
+
+def named_file(name: str) -> str | None:
+    """What a file of this name is, and what to do about it, where that alone tells it; of an archive's members."""
+    row = next((row for row in _rows() if name.lower().endswith(row.ends)), None)
+    return None if row is None or row.kind in _NO_FIELD else f"{row.name}; {_INSTEAD[row.kind]}"
 
 
 def is_package(head: bytes) -> bool:

@@ -7,23 +7,27 @@ import re
 import struct
 import zlib
 
+from regnf_core.importing.containers.plain_text import is_number, text_alone, unmarked
 from regnf_core.importing.containers.refused import is_package, refused
 
 # Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides.
 
 MESH_FORMATS = (*("3mf", "e57", "glb", "gltf", "las", "npy", "obj", "pcd", "ply", "step", "stl", "urdf", "usd", "xyz"),)
 
-_OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _MAGICS = ((b"glTF", "glb"), (b"LASF", "las"), (b"ASTM-E57", "e57"), (b"\x93NUMPY", "npy"))
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
 _MAX_STL_FACETS = 1 << 26
 _OBJ_NUMBERS = {b"v": 3, b"vn": 3, b"vt": 1}
 _OBJ_WORDS = frozenset(
-    b"v vt vn vp f l p o g s mg mtllib usemtl usemap maplib lod bevel c_interp d_interp shadow_obj trace_obj "
+    b"v vt vn vp f fo l p o g s mg mtllib usemtl usemap maplib lod bevel c_interp d_interp shadow_obj trace_obj "
     b"cstype deg bmat step curv curv2 surf parm trim hole scrv sp end con ctech stech call csh".split()
 )
 """The statements of the format's specification."""
+_USUAL = 0.9
+"""Share of a text's lines, or of an STL file's facets, that tell a format: the odd one may be damaged."""
+STL_COUNT_OPEN = (0, 0xFFFFFFFF)
+_COMMENTS = re.compile(rb"(?:(?:[#;!%]|//)[^\n]*\n\s*)+")
 _OBJ_FEW = 8
 """Statements that decide: by then every writer has written one that no other text begins with."""
 _LONG_COMMENT = 2048
@@ -46,17 +50,18 @@ def sniff_mesh(head: bytes) -> str | None:
             return format_
     if _is_binary_stl(head):
         return "stl"
-    text = head.lstrip(_BLANK)
+    text = text_alone(head)
     begin = _XML_OWN.sub(b"", text).lstrip() if text.startswith(b"<") else text
     if named := next((format_ for magic, format_ in _NAMED if begin.startswith(magic)), None):
         return None if named == "step" and _IFC.search(head) else named
-    if re.match(rb"ply[ \t]*[\r\n]", text):
+    if re.match(rb"ply[ \t]*[\r\n]", text, re.IGNORECASE):
         return "splat-ply" if _SPLAT_PROPERTY.search(text) else "ply"
     if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS) and b'"geometricError"' not in text:
         return "gltf"
     if _is_pcd(text):
         return "pcd"
-    if text[:5].lower() == b"solid" and (b"facet" in text.lower() or not _CONTROL & set(text)):
+    solid = uncommented(text)
+    if solid[:5].lower() == b"solid" and (b"facet" in text.lower() or not _CONTROL & set(text)):
         return "stl"
     if _is_obj(text):
         return "obj"
@@ -76,24 +81,43 @@ def _is_pcd(text: bytes) -> bool:
     """Its first line that is not a comment names a version, and then the fields of a point."""
     said = _statements(text, (b"#",))
     named = text.startswith(b"# .PCD") or bool(said and said[0][0] == b"VERSION")
-    return named and any(words[0] == b"FIELDS" for words in said)
+    return named and any(words[0] in (b"FIELDS", b"COLUMNS") for words in said)
+
+
+def uncommented(text: bytes) -> bytes:
+    """Without the lines of comments at the beginning."""
+    return _COMMENTS.sub(b"", text)
 
 
 def _is_xyz(text: bytes) -> bool:
     """Lines of as many numbers each, three at least; the first may be their count alone."""
     if _CONTROL & set(text):
         return False
-    said = _statements(text.replace(b",", b" ").replace(b";", b" "), (b"#", b"//"))
-    if said and len(said[0]) == 1 and said[0][0].isdigit():
+    said = _statements(text.replace(b",", b" ").replace(b";", b" "), (b"#", b"//", b"%"))
+    if said and (names_places(said[0]) or (len(said[0]) == 1 and said[0][0].isdigit())):
         said = said[1:]
-    return bool(said) and len(said[0]) >= 3 and all(len(w) == len(said[0]) and all(map(_is_number, w)) for w in said)
+    if not said or len(said[0]) < 3 or not all(map(_is_number, said[0][:3])):  # names of columns that are no places
+        return False
+    # Words behind three numbers may be names; and the odd row may be cut.
+    whole = sum(len(words) == len(said[0]) and all(map(_is_number, words[:3])) for words in said)
+    return whole == len(said) or whole >= max(_USUAL * len(said), _OBJ_FEW)
+
+
+def names_places(words: list[bytes]) -> bool:
+    """Whether a line is the names of columns, three of which are x, y and z."""
+    named = [word.strip(b"\"'").lower() for word in words]
+    return all(named.count(axis) == 1 for axis in (b"x", b"y", b"z")) and not any(map(_is_number, words))
 
 
 def _is_obj(text: bytes) -> bool:
     """Lines that begin with statements of an OBJ file, or comments alone, as far as one can see."""
     if _CONTROL & set(text):
         return False
-    said = _statements(text, (b"#",))[:_OBJ_FEW]
+    every = _statements(text, (b"#",))
+    odd = sum(words[0] not in _OBJ_WORDS for words in every)
+    if sum(map(_is_place, every)) >= 3 and odd <= max((1.0 - _USUAL) * len(every), 2):  # whatever its first lines are
+        return True
+    said = every[:_OBJ_FEW]
     if not said:
         return text.startswith(b"#") and (b"obj" in text.lower() or len(text) > _LONG_COMMENT)
     if not all(words[0] in _OBJ_WORDS for words in said):
@@ -105,31 +129,35 @@ def _is_obj(text: bytes) -> bool:
     return len(said) > 1 or len(said[0]) > 1
 
 
+def _is_place(words: list[bytes]) -> bool:
+    """Whether a line of an OBJ file is a vertex or a face."""
+    if words[0] == b"v":
+        return len(words) > 3 and all(map(_is_number, words[1:4]))
+    return words[0] in (b"f", b"fo") and len(words) > 3 and all(word[:1] in b"-0123456789" for word in words[1:4])
+
+
 def _is_number(word: bytes) -> bool:
     """Also with a decimal comma, which the reader then names."""
-    try:
-        float(word.replace(b",", b"."))
-    except ValueError:
-        return False
-    return True
+    return is_number(word.replace(b",", b"."))
 
 
 def _is_binary_stl(head: bytes) -> bool:
-    """Facets whose corners are ordinary numbers and whose normals have length one, or none at all."""
+    """Facets whose corners are ordinary numbers, but for a few. Some writers leave their count open."""
     facets = (len(head) - _STL_FACETS_AT) // _STL_FACET_BYTES
     claimed = int.from_bytes(head[80:84], "little")
-    if facets < 1 or not facets <= claimed <= _MAX_STL_FACETS:
+    if claimed in STL_COUNT_OPEN:
+        claimed = facets if facets >= _OBJ_FEW else 0
+    facets = min(facets, claimed)
+    if facets < 1 or claimed > _MAX_STL_FACETS:
         return False
-    for number in range(facets):
-        values = struct.unpack_from("<12f", head, _STL_FACETS_AT + _STL_FACET_BYTES * number)
-        if not all(math.isfinite(value) and abs(value) < 1e9 for value in values):
-            return False
-        length = math.hypot(*values[:3])
-        if not (length < 1e-6 or abs(length - 1.0) < 0.05):
-            return False
-        if all(abs(value) < 1e-30 for value in values[3:]):
-            return False
-    return True
+    each = (struct.unpack_from("<12f", head, _STL_FACETS_AT + _STL_FACET_BYTES * at) for at in range(facets))
+    return sum(map(_is_facet, each)) >= _USUAL * facets
+
+
+def _is_facet(values: tuple[float, ...]) -> bool:
+    """Of a normal and three corners. Normals are of any length, or none; corners are some numbers, not all zero."""
+    sizes = [abs(value) for value in values[3:]]
+    return all(size == 0.0 or 1e-20 < size < 1e9 for size in sizes) and any(sizes)
 
 
 # Gaussian splats. Two of their formats have no magic number.
@@ -150,7 +178,7 @@ def sniff_splats(head: bytes) -> str | None:
     """One of SPLAT_FORMATS, or None: PLY files are told by their header, see ``sniff_mesh``."""
     if head.startswith(_NGSP):
         return "spz"
-    text = head.lstrip(_BLANK)
+    text = unmarked(head)
     if text.startswith(b"{") and b'"means"' in text and b'"scales"' in text:
         return "sog"
     if len(head) >= HEAD_BYTES and head[:1] == b"\0":
@@ -172,8 +200,8 @@ def _is_splat(head: bytes) -> bool:
     """Rows of 32 bytes: numbers of a place, three lengths, and a quaternion of length one in bytes."""
     if len(head) < _SPLAT_ROWS * _SPLAT_ROW.size or (len(head) < HEAD_BYTES and len(head) % _SPLAT_ROW.size):
         return False
-    for number in range(_SPLAT_ROWS):
-        *values, _, _, _, _, w, x, y, z = _SPLAT_ROW.unpack_from(head, _SPLAT_ROW.size * number)
+    for row in range(_SPLAT_ROWS):
+        *values, _, _, _, _, w, x, y, z = _SPLAT_ROW.unpack_from(head, _SPLAT_ROW.size * row)
         place, scales = values[:3], values[3:]
         length = math.hypot(*(part / 128.0 - 1.0 for part in (w, x, y, z)))
         if not all(math.isfinite(value) and abs(value) < 1e6 for value in place) or abs(length - 1.0) > 0.03:
@@ -222,7 +250,6 @@ BAGS = (b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n")
 """How recordings of robots begin, beside those that are SQLite databases."""
 RECORDINGS = (*BAGS, _ZIP_LOCAL_HEADER)
 """How files begin that may be recordings, whatever else they look like."""
-_BLANK = b"\xef\xbb\xbf \t\r\n"
 
 
 def sniff_format(head: bytes) -> str | None:
@@ -251,7 +278,7 @@ def sniff_format(head: bytes) -> str | None:
         return "sqlite"
     if (splats := sniff_splats(head)) is not None:
         return splats
-    if head[8:9] == b"{":
+    if head[8:9] == b"{" and not any(head[5:8]):  # the length of its header
         return "safetensors"
     return "onnx" if _ONNX.match(head) else sniff_mesh(head)
 
@@ -265,7 +292,10 @@ def explain_refusal(head: bytes, name: str = "") -> tuple[str, str]:
         return "LEGACY_TORCH_FILE", "a tar archive of PyTorch before version 0.1.10; save it again"
     if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
         return "RAW_PICKLE", "a plain pickle; only files written by torch.save (1.6 or later) are supported"
-    return refused(head, name) or (
+    ending = name.lower().rpartition(".")[2]
+    if (told := refused(head, name)) is None and ending in MESH_FORMATS:
+        return "FORMAT_NOT_RECOGNIZED", f"by its name a .{ending} file, but its content is not; copy or export it again"
+    return told or (
         "FORMAT_NOT_RECOGNIZED",
         "not a supported format; supported are torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of "
         "a run",

@@ -16,6 +16,7 @@ from regnf_core.importing.families import (
     siren,
     splatfacto,
     unsupported,
+    wrappers,
 )
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.pickle.pickle_machine import GlobalRef, Placeholder
@@ -51,6 +52,7 @@ def convert_checkpoint(checkpoint: Any, source: TensorSource, description: Uploa
     if isinstance(checkpoint, (Placeholder, GlobalRef)):
         message = f"the file has an object of {checkpoint.full_name} instead of weights; save its state_dict()"
         raise FieldFormatError(message, reason="UNSAFE_GLOBAL_IN_WEIGHTS")
+    checkpoint = wrappers.unwrapped(checkpoint, description.family)
     if isinstance(checkpoint, dict):
         for family in FAMILIES:
             converted = family(checkpoint, source, description)

@@ -20,7 +20,7 @@ from regnf_core.importing.meshes.cloud_normals import Oriented, fit_their_points
 from regnf_core.importing.meshes.triangle_files import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
 
-_MIN_POINTS = 100
+MIN_POINTS = 100
 _MAX_POINTS = 300_000
 """Points beyond this are thinned: they cost time and the surface, 256 cells wide, hardly shows them."""
 _WITH_NORMALS = 0.5
@@ -148,8 +148,8 @@ def _usable(geometry: Geometry) -> tuple[Geometry, tuple[str, ...]]:
             lost.append((placed & ~turned, "points whose normals are zero, NaN or infinity"))
             placed &= turned
     dropped = tuple(f"{int(mask.sum())} {what}" for mask, what in lost if mask.any())
-    if placed.sum() < _MIN_POINTS:
-        message = f"{int(placed.sum())} of {len(points)} points are usable, at least {_MIN_POINTS} are needed"
+    if placed.sum() < MIN_POINTS:
+        message = f"{int(placed.sum())} of {len(points)} points are usable, at least {MIN_POINTS} are needed"
         if dropped:
             message += f"; left out: {', '.join(dropped)}"
         raise FieldFormatError(message, reason="POINT_CLOUD_TOO_SMALL")
@@ -164,8 +164,8 @@ def _usable(geometry: Geometry) -> tuple[Geometry, tuple[str, ...]]:
 
 def _require_surface(places: Float64Array, points: int) -> None:
     """Raise FieldFormatError (POINT_CLOUD_TOO_SMALL) for few places (N, 3), however many points, or those of a line."""
-    if len(places) < _MIN_POINTS:
-        message = f"the {points} points have only {len(places)} different positions, at least {_MIN_POINTS} are needed"
+    if len(places) < MIN_POINTS:
+        message = f"the {points} points have only {len(places)} different positions, at least {MIN_POINTS} are needed"
         raise FieldFormatError(message, reason="POINT_CLOUD_TOO_SMALL")
     wide = np.linalg.svd(places - places.mean(axis=0), compute_uv=False, full_matrices=False)
     if wide[1] < _LINE * wide[0]:

@@ -25,7 +25,6 @@ from regnf_core.importing.families.layers import (
     require_extra_columns,
     require_family,
     shared_entries,
-    states,
     strip_prefix,
 )
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, form_variant, network_field
@@ -34,7 +33,6 @@ from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "deepsdf"
-_PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
 
 
@@ -45,12 +43,11 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     what TensorSource raises.
     """
     network = checkpoint.get("model_state_dict")
-    prefix = next((p for p in _PREFIXES if strip_prefix(network, p)), None)
-    if prefix is None:
+    if not strip_prefix(network, "lin"):
         _refuse_codes_alone(checkpoint)
         return None
     refuse_other_entries(overrides, FAMILY, ("latent", "latent_index", *FORM_ENTRIES))
-    state = strip_prefix(network, prefix.removesuffix("lin"))
+    state = strip_prefix(network, "")
     names = layer_names(state, "lin")
     layers = read_layers(state, names, source, column=overrides.output_column or 0)
     norms = _norms(state, layers, source)
@@ -69,7 +66,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     seeing = [i for i, extra in enumerate(layers.extra_columns) if extra]
     require_extra_columns(layers, names, {i: layers.input_width if i in whole else 3 for i in seeing})
     why = (
-        f"keys model_state_dict.{prefix}*, {len(names)} layers",
+        f"keys model_state_dict.lin*, {len(names)} layers",
         whence,
         "bounds [-1, 1]: the cube around the unit sphere, into which shapes are scaled",
     )
@@ -168,10 +165,9 @@ def convert_blocks(
     Raises FieldFormatError: LATENT_MISSING, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what TensorSource
     raises.
     """
-    found = [state for _, state in states(checkpoint) if "final_layer.0.bias" in state and "net.0.0.bias" in state]
-    if len(found) != 1:
+    if not ("final_layer.0.bias" in checkpoint and "net.0.0.bias" in checkpoint):
         return None
-    (state,) = found
+    state = {name: value for name, value in checkpoint.items() if isinstance(value, TensorRef)}
     require_family(overrides, BLOCKS)
     refuse_other_entries(overrides, BLOCKS, ("latent", "latent_index", "skip_layer", *FORM_ENTRIES))
     blocks = [f"net.{name}.0" for name in layer_names(strip_prefix(state, "net."), "", minimum=1)]

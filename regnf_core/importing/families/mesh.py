@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from regnf_core.importing.families.cloud import convert_cloud
+from regnf_core.importing.families.cloud import MIN_POINTS, convert_cloud
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.triangles import mesh_field
 from regnf_core.importing.meshes import CLOUD_FORMATS, read_mesh
@@ -35,7 +35,9 @@ def convert_mesh(
         geometry = read_mesh(format_, data, siblings, overrides.node, path)
     if len(geometry.faces) > 0:
         return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
-    if format_ not in CLOUD_FORMATS or len(geometry.vertices) == 0:
-        raise malformed(f"the {format_} file has no triangles")
+    few = MIN_POINTS if format_ == "obj" else 1  # an OBJ file of fewer has lost its faces
+    if format_ not in CLOUD_FORMATS or len(geometry.vertices) < few:
+        others = (*geometry.left_out, *([f"{len(geometry.vertices)} vertices"] if len(geometry.vertices) else []))
+        raise malformed(f"the {format_} file has no triangles" + (f", but {', '.join(others)}" if others else ""))
 
     return convert_cloud(geometry, f"a {format_} file", overrides, work_s)

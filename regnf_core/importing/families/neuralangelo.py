@@ -34,7 +34,7 @@ from regnf_core.importing.upload_description import GridDescription, UploadDescr
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 FAMILY = "neuralangelo"
-_PREFIXES = ("module.neural_sdf.", "neural_sdf.")
+_PREFIX = "neural_sdf."
 _COLOR = "neural_rgb"
 _TABLE = "tcnn_encoding.params"
 _HABITS = GridHabits((8, 4, 2, 1), "linear")
@@ -56,17 +56,16 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     TensorSource raises.
     """
     model = checkpoint.get("model")
-    prefix = next((p for p in _PREFIXES if strip_prefix(model, p)), None)
-    if prefix is None:
+    state = strip_prefix(model, _PREFIX)
+    if not state:
         return None
     require_family(overrides, FAMILY)
     refuse_other_entries(overrides, FAMILY, ("level_mask", "hash"))
-    state = strip_prefix(model, prefix)
     layers = _layers(state, source)
     table = source.array(_TABLE, lookup(state, _TABLE))
     require_shape(_TABLE, table, (None,))
     spaces = find_spaces(table.size, layers.input_width - 3, _HABITS, overrides.hash)
-    why = [f"keys {prefix}*, {len(layers.weights)} layers", "bounds [-1, 1]: the sphere's cube, in which it trains"]
+    why = [f"keys {_PREFIX}*, {len(layers.weights)} layers", "bounds [-1, 1]: the sphere's cube, in which it trains"]
     warnings: list[str] = []
     masks = _open_levels(checkpoint, table, spaces, why, warnings) if overrides.level_mask is None else {}
     readings: list[Reading] = []
@@ -82,7 +81,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         others = [_within(radius, one) for radius in _OTHER_RADII for one in readings if one.tier == 0]
         readings = [*others, *readings]
     converted = converted_of(FAMILY, tuple(why), most_usual(readings), tuple(warnings))
-    colors = strip_prefix(model, prefix.replace("neural_sdf", _COLOR))
+    colors = strip_prefix(model, f"{_COLOR}.")
     return converted if overrides.color.keep is False else without_color(converted, [_COLOR] if colors else [], FAMILY)
 
 

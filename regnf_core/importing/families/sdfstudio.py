@@ -38,7 +38,7 @@ from regnf_core.schema.kinds import SKIP_LAYER
 
 _RADIUS = 2.0
 """Half an edge of the cube that the grid covers: contracted space."""
-_PREFIXES = ("_model.field.", "_model.module.field.")
+_PREFIX = "_model.field."
 _DEGREES = (6, 4, 8, 10, 5, 7, 9, 3, 2, 1, 0)
 """Of the sines and cosines: the usual number of frequencies first."""
 _FACTO = GridHabits((2, 4, 8, 1), "smoothstep")
@@ -77,10 +77,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     pipeline = checkpoint.get("pipeline")
     if isinstance(pipeline, (Placeholder, GlobalRef)):
         as_tensor("pipeline", pipeline)
-    prefix = next((p for p in _PREFIXES if strip_prefix(pipeline, p + "glin")), None)
-    if prefix is None:
+    if not strip_prefix(pipeline, f"{_PREFIX}glin"):
         return None
-    state = strip_prefix(pipeline, prefix)
+    state = strip_prefix(pipeline, _PREFIX)
     refuse_other_entries(
         overrides,
         "a checkpoint of sdfstudio or nerfstudio",
@@ -90,7 +89,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     variant, why = _tell_variant(state, len(names), overrides)
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names, {SKIP_LAYER: layers.input_width})
-    evidence = (f"keys {prefix}glin*, {len(names)} layers", why)
+    evidence = (f"keys {_PREFIX}glin*, {len(names)} layers", why)
     converted = _assemble(state, layers, variant, evidence, source, overrides)
     converted = with_deviation(converted, state, "deviation_network.variance", source)
     if not studio.has_color(state) or overrides.color.keep is False:

@@ -160,8 +160,14 @@ _LARGEST = 1e30
 _SHORTEST = 1e-16
 _BLUNT = 1e-6
 """Of the diagonal: steps between single-precision numbers that are longer are said."""
+_TOO_BLUNT = 2.0
+"""Percent of the diagonal: longer steps leave no shape."""
 _DOUBLED = 0.5
 """Share of the faces that are there twice, once turned: beyond this the file is a double-sided mesh."""
+_ODD = 0.01
+"""Of the faces so many, or one, may have corners that do not exist."""
+_CLOSED_BUT_FOR = 0.005
+"""Share of the edges that may be open in a mesh that counts as closed."""
 _MANY_PARTS = 1000
 _STRAY = 4.0
 """Diagonals of the rest: parts beyond so wide a gap are said."""
@@ -203,7 +209,7 @@ def mesh_field(
     low, high = places.min(axis=0), places.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
     bounds = [(low - _MARGIN * diagonal).tolist(), (high + _MARGIN * diagonal).tolist()]
-    loose = _open_edge_share(faces, len(places))
+    loose = _open_edge_share(faces)
     why = (
         f"{origin}: {len(faces)} triangles, {len(places)} vertices",
         "watertight"
@@ -268,17 +274,22 @@ def _oriented(vertices: Float64Array, faces: Int64Array, asked: Asked) -> Facing
 
 def _sound_faces(geometry: Geometry) -> tuple[Int64Array, tuple[str, ...]]:
     """The faces (F, 3) whose corners are places, and what was left out. Raises FieldFormatError (MESH_INVALID)."""
-    faces = geometry.faces
-    if faces.min() < 0 or faces.max() >= len(geometry.vertices):
-        raise malformed("a face refers to a vertex that does not exist")
+    faces, ignored = geometry.faces, list[str]()
+    known = ((faces >= 0) & (faces < len(geometry.vertices))).all(axis=1)
+    if not known.all():
+        lost = int((~known).sum())
+        if lost > max(_ODD * len(faces), 1) or lost == len(faces):
+            raise malformed(f"{lost} of its {len(faces)} faces refer to a vertex that does not exist")
+        faces = faces[known]
+        ignored.append(f"{lost} triangles with a corner of no vertex")
     with np.errstate(invalid="ignore"):
         sound = np.asarray((np.abs(geometry.vertices) <= _LARGEST).all(axis=1))
     if sound.all():
-        return faces, ()
+        return faces, tuple(ignored)
     kept = faces[sound[faces].all(axis=1)]
     if len(kept) == 0:
         raise malformed("no triangle of the mesh has finite corners")
-    ignored = [f"{int((~sound).sum())} vertices with NaN or infinity"]
+    ignored.append(f"{int((~sound).sum())} vertices with NaN or infinity")
     if len(kept) < len(faces):
         ignored.append(f"{len(faces) - len(kept)} triangles with such a corner")
     return kept, tuple(ignored)
@@ -318,7 +329,10 @@ def _once(corners: Int64Array) -> tuple[Int64Array, tuple[str, ...]]:
         corners, begun = corners[found], begun[found]
     sides = _first_of(np.sort(begun, axis=1))
     twice = len(corners) - len(sides)
-    if 2 * twice > _DOUBLED * len(corners):
+    # Of fewer one side is dropped only where that closes the mesh. Walls between solids, which are closed, stay.
+    if 2 * twice > _DOUBLED * len(corners) or (
+        twice and _edges(corners)[1].any() and (_edges(corners[sides])[0] != 2).mean() <= _CLOSED_BUT_FOR
+    ):
         ignored.append(f"{twice} triangles of the other side: the mesh is double-sided")
         corners = corners[sides]
     return corners, tuple(ignored)
@@ -341,6 +355,13 @@ def _blunt(corners: Float64Array, box: list[list[float]]) -> tuple[str, ...]:
     if step <= _BLUNT * diagonal or not (corners == corners.astype(np.float32)).all():
         return ()
     share = 100.0 * step / diagonal
+    if share > _TOO_BLUNT:
+        message = (
+            f"its vertices are {reach:.6g} from the origin in single precision, whose steps there are {step:.2g}, "
+            f"{share:.2g} % of its diagonal: its shape is lost. Move it to the origin before it is written, or write "
+            f"it with double precision"
+        )
+        raise malformed(message)
     text = (
         f"its vertices are {reach:.6g} from the origin, where single precision has steps of {step:.2g}, {share:.2g} "
         f"% of its"
@@ -376,9 +397,18 @@ def _scattered(vertices: npt.NDArray[np.float32], faces: Int64Array) -> tuple[st
     return tuple(found)
 
 
-def _open_edge_share(faces: Int64Array, vertices: int) -> float:
+def _edges(faces: Int64Array) -> tuple[Int64Array, Float64Array]:
+    """Of each edge how many faces (F, 3) it has, and how many more run through it one way than the other."""
+    start, end = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    key = np.minimum(start, end) * (int(faces.max()) + 1) + np.maximum(start, end)
+    _, number, count = np.unique(key, return_inverse=True, return_counts=True)
+    return np.asarray(count, np.int64), np.bincount(number, np.where(start < end, 1.0, -1.0)).astype(np.float64)
+
+
+def _open_edge_share(faces: Int64Array) -> float:
     """Share of the directed edges that no neighbor runs through the other way, exactly once."""
     start, end = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
+    vertices = int(faces.max()) + 1
     forward, count = np.unique(start * vertices + end, return_counts=True)
     single = forward[count == 1]
     matched = np.isin(single // vertices + (single % vertices) * vertices, single, assume_unique=True)

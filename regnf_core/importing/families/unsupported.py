@@ -7,7 +7,8 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import states, strip_prefix
+from regnf_core.importing.families.layers import states
+from regnf_core.importing.families.wrappers import WRAPPED
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 
@@ -65,4 +66,4 @@ def refuse(checkpoint: dict[Any, Any], _source: TensorSource, _description: Uplo
 
 
 def _has(checkpoint: dict[Any, Any], part: str) -> bool:
-    return any(strip_prefix(state, part) or strip_prefix(state, f"module.{part}") for _, state in states(checkpoint))
+    return any(WRAPPED.sub("", name).startswith(part) for _, state in states(checkpoint) for name in state)

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from regnf_core.importing.containers.plain_text import without_marks
 from regnf_core.importing.meshes.e57 import read_e57
 from regnf_core.importing.meshes.glb import read_glb, read_gltf
 from regnf_core.importing.meshes.las import read_las
@@ -19,7 +20,7 @@ from regnf_core.importing.meshes.triangle_files import Geometry, Siblings, read_
 from regnf_core.importing.meshes.urdf import read_urdf
 from regnf_core.importing.meshes.usd import read_usd
 
-CLOUD_FORMATS = ("ply", "pcd", "xyz", "las", "npy", "e57")
+CLOUD_FORMATS = ("ply", "pcd", "xyz", "las", "npy", "e57", "obj")
 """Formats that may hold points alone."""
 _OF_NODES: dict[str, Callable[[memoryview, Siblings, str | None], Geometry]] = {
     "3mf": read_3mf,
@@ -39,7 +40,7 @@ _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
     "xyz": read_xyz,
 }
 _AT_FIXED_BYTES = frozenset({"3mf", "glb", "las", "npy", "stl", "usd"})
-_BLANK, _MOST_BLANKS = b"\xef\xbb\xbf \t\r\n", 4096
+_TEXTS = frozenset({"gltf", "obj", "urdf", "xyz"})
 MESH_READERS = (*_WHOLE, *_OF_NODES, "e57")
 """The names that ``sniff_format`` gives files with a reader here."""
 
@@ -61,9 +62,8 @@ def read_mesh(
         if path is None:
             raise ValueError("an E57 file is read from its path")
         return read_e57(path)
-    if format_ not in _AT_FIXED_BYTES:  # text may begin with a byte-order mark and blank lines
-        head = bytes(data[:_MOST_BLANKS])
-        data = data[len(head) - len(head.lstrip(_BLANK)) :]
+    if format_ not in _AT_FIXED_BYTES:
+        data = without_marks(data, format_ in _TEXTS)
     if format_ in _OF_NODES:
         return _OF_NODES[format_](data, siblings or {}, node)
     refuse_node(node, format_)

@@ -256,7 +256,7 @@ def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Sib
 
 def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
     if len(data) < _HEADER + _CHUNK_HEADER or int.from_bytes(data[4:8], "little") != 2:
-        raise malformed("not a glTF file of version 2")
+        raise malformed("a glTF file of another version than 2: convert it to glTF 2.0")
     found: dict[bytes, memoryview] = {}
     at = _HEADER
     while at + _CHUNK_HEADER <= len(data):
@@ -281,6 +281,9 @@ def _document(text: memoryview) -> dict[str, Any]:
         raise malformed("the glTF file's JSON is malformed") from error
     if not isinstance(document, dict):
         raise malformed("the glTF file's JSON is not an object")
+    asset = document.get("asset")
+    if str(asset.get("version", "2.0") if isinstance(asset, dict) else "2.0").startswith("1."):
+        raise malformed("a glTF file of another version than 2: convert it to glTF 2.0")
     return document
 
 
@@ -312,6 +315,9 @@ def _parts(
         for primitive in mesh["primitives"]:
             if (mode := primitive.get("mode", _TRIANGLES)) not in (_TRIANGLES, _STRIP, _FAN):
                 flat.add("points" if mode == 0 else "lines")
+                continue
+            if "POSITION" not in primitive["attributes"]:
+                flat.add("parts without positions")
                 continue
             accessors.unpack(primitive)
             if accessors.denies(primitive["attributes"]["POSITION"]):
@@ -368,7 +374,5 @@ def _triangles(primitive: dict[str, Any], accessors: Accessors, vertices: int) -
         order = np.arange(vertices, dtype=np.int64)
     mode = primitive.get("mode", _TRIANGLES)
     if mode == _TRIANGLES:
-        if len(order) % 3:
-            raise malformed("glTF triangles without three corners")
-        return order.reshape(-1, 3)
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
     return fan(order) if mode == _FAN else strips(order)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.meshes.thinning import Thinning, numbers_of, rows_of_text
+from regnf_core.importing.meshes.thinning import Thinning, lines_of, numbers_of, rows_of_text
 from regnf_core.importing.meshes.triangle_files import (
     Float64Array,
     Geometry,
@@ -28,13 +28,16 @@ from regnf_core.importing.meshes.triangle_files import (
 
 ByteOrder = Literal["<", ">"]
 
-_MAX_HEADER = 1 << 16
+_MAX_HEADER = 1 << 20
 _MAX_PARTS = 256
 _CODES = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "ushort uint16"}
 _CODES |= {"i4": "int int32", "u4": "uint uint32", "f4": "float float32", "f8": "double float64"}
+_CODES |= {"i8": "int64", "u8": "uint64"}
 _TYPES = {name: code for code, names in _CODES.items() for name in names.split()}
 _FORMATS: dict[str, ByteOrder | None] = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-_END = re.compile(rb"(?:^|\n)end_header[ \t]*\r?\n")
+_END = re.compile(rb"(?:^|[\r\n])end_header[ \t]*(?:\r?\n|\r)")
+_ELEMENTS = {"vertices": "vertex", "point": "vertex", "points": "vertex", "faces": "face"}
+"""Other names of elements, and what they are taken for."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ def _read_header(data: memoryview) -> tuple[ByteOrder | None, tuple[_Element, ..
     lines = head[: end.start()].decode("latin-1").splitlines()
     words = [line.split() for line in lines[1:] if line.strip()]
     words = [line for line in words if line[0] not in ("comment", "obj_info")]
-    if not words or words[0][0] != "format" or len(words[0]) != 3 or words[0][1] not in _FORMATS:
+    if not words or words[0][0] != "format" or len(words[0]) < 2 or words[0][1] not in _FORMATS:
         raise malformed("the PLY header has an unknown format")
     return _FORMATS[words[0][1]], _elements(words[1:]), end.end()
 
@@ -78,11 +81,11 @@ def _elements(lines: list[list[str]]) -> tuple[_Element, ...]:
     for line in lines:
         match line:
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 16:
-                found.append((name, int(count), []))
+                found.append((_ELEMENTS.get(name, name), int(count), []))
             case ["property", "list", count_type, type_, name] if found and {count_type, type_} <= _TYPES.keys():
-                found[-1][2].append(_Property(name, _TYPES[type_], _TYPES[count_type]))
+                found[-1][2].append(_Property(name.lower(), _TYPES[type_], _TYPES[count_type]))
             case ["property", type_, name] if found and type_ in _TYPES:
-                found[-1][2].append(_Property(name, _TYPES[type_]))
+                found[-1][2].append(_Property(name.lower(), _TYPES[type_]))
             case _:
                 raise malformed("the PLY header has an invalid line")
     elements = tuple(_Element(name, count, tuple(properties)) for name, count, properties in found)
@@ -109,6 +112,11 @@ class _Body:
     def __init__(self, data: memoryview, order: ByteOrder | None) -> None:
         self._data = numbers_of(bytes(data), "PLY").data.cast("B") if order is None else data
         self._order = order
+
+    @property
+    def left(self) -> int:
+        """Bytes, or numbers of a text, behind what was handed out."""
+        return len(self._data) // (8 if self._order is None else 1)
 
     def _type(self, code: str) -> np.dtype[Any]:
         return np.dtype(np.float64 if self._order is None else self._order + code)
@@ -219,7 +227,7 @@ def _whole(values: npt.NDArray[Any]) -> Int64Array:
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 _COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _MAX_ROWS = 50_000_000
-_PLACES, _NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+_PLACES, _NORMALS = ("x", "y", "z"), (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 def read_ply(data: memoryview) -> Geometry:
@@ -228,6 +236,8 @@ def read_ply(data: memoryview) -> Geometry:
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE.
     """
     order, elements, size = _read_header(data)
+    if order is None and elements:
+        _require_rows(data[size:], elements)
     if _is_large_cloud(elements):
         return _thinned(data[size:], order, elements)
     body = _Body(data[size:], order)
@@ -239,8 +249,7 @@ def read_ply(data: memoryview) -> Geometry:
             require_room(element.count, 0)
             table = body.scalars(element)
             vertices = _columns(table, _PLACES)
-            if set(_NORMALS) <= table.keys():
-                normals = _columns(table, _NORMALS)
+            normals = next((_columns(table, names) for names in _NORMALS if set(names) <= table.keys()), None)
             colors = _colors(table, element)
         elif element.name == "face":
             require_room(0, element.count)
@@ -256,9 +265,22 @@ def read_ply(data: memoryview) -> Geometry:
             left_out.append(f"elements {element.name[:40]}")
     if body.flat_faces and len(faces) == 0:
         raise malformed("no face of the PLY file has three corners")
+    if body.left:
+        left_out.append(f"{body.left} bytes or numbers after its rows")
     if body.flat_faces:
         left_out.append(f"{body.flat_faces} faces of fewer than three corners")
     return Geometry(vertices, faces, normals, colors, tuple(left_out))
+
+
+def _require_rows(body: memoryview, elements: tuple[_Element, ...]) -> None:
+    """Raise FieldFormatError (MESH_INVALID) for lines of a text with more or fewer numbers than the header says."""
+    first = elements[0]
+    if first.count == 0 or any(p.count_type is not None for p in first.properties):
+        return
+    numbers = len(next((line for line in bytes(body[:_MAX_HEADER]).splitlines() if line.strip()), b"").split())
+    if numbers != len(first.properties) and lines_of(body) >= first.count:  # a row may also take several lines
+        said = f"the PLY header says {len(first.properties)} numbers for each {first.name[:40]}"
+        raise malformed(f"{said}, but its first line has {numbers}")
 
 
 def _is_large_cloud(elements: tuple[_Element, ...]) -> bool:
@@ -273,7 +295,7 @@ def _thinned(body: memoryview, order: ByteOrder | None, elements: tuple[_Element
     """The points that are kept of many."""
     element = elements[0]
     names = [p.name for p in element.properties]
-    wanted = [*_PLACES, *(_NORMALS if set(_NORMALS) <= set(names) else ())]
+    wanted = [*_PLACES, *next((each for each in _NORMALS if set(each) <= set(names)), ())]
     if not set(wanted) <= set(names):
         raise malformed("PLY vertices without x, y, z")
     thinning = Thinning(element.count)
@@ -317,7 +339,8 @@ def _columns(table: dict[str, Float64Array], names: tuple[str, ...]) -> Float64A
 
 
 def _index_property(element: _Element) -> str:
-    found = [p.name for p in element.properties if p.count_type is not None and p.name in _INDEX_NAMES]
+    lists = [p.name for p in element.properties if p.count_type is not None]
+    found = [name for name in lists if name in _INDEX_NAMES] or lists  # a single list of faces is their corners
     if len(found) != 1:
         raise malformed("PLY faces or strips without one list of vertex indices")
     return found[0]

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from regnf_core.importing.containers.plain_text import plain_numbers
 from regnf_core.importing.meshes.triangle_files import Float64Array, Int64Array, malformed, not_numbers
 
 MOST_KEPT = 2_000_000
@@ -50,33 +51,39 @@ def numbers_of(text: bytes, format_: str) -> Float64Array:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            return np.fromstring(text.decode("ascii"), dtype=np.float64, sep=" ")
+            try:
+                return np.fromstring(text.decode("ascii"), dtype=np.float64, sep=" ")
+            except (ValueError, DeprecationWarning):
+                return np.fromstring(plain_numbers(text).decode("ascii"), dtype=np.float64, sep=" ")
     except (ValueError, DeprecationWarning) as error:
         raise not_numbers(f"the {format_} file holds a word that is not a number", text) from error
 
 
-def rows_of_text(
-    text: memoryview,
-    columns: int,
-    thinning: Thinning,
-    format_: str,
-    cleaned: Callable[[bytes], bytes] = bytes,
-) -> tuple[Float64Array, int]:
-    """The kept ones (K, columns) of the rows of a text, and how many rows there are; at most ``thinning.count`` are
-    read, a part of the text at a time. cleaned: what makes plain numbers of a part, which ends with a line.
-
-    Raises FieldFormatError (MESH_INVALID) where a word is no number.
-    """
-    parts = [np.zeros((0, columns))]
-    at = read = 0
-    left = np.zeros(0)
-    while at < len(text) and read < thinning.count:
+def parts_of(text: memoryview, format_: str) -> Iterator[bytes]:
+    """Whole lines, some megabytes at a time. Raises FieldFormatError (MESH_INVALID) for a line that is longer."""
+    at = 0
+    while at < len(text):
         part = bytes(text[at : at + _AT_ONCE])
         end = len(part) if at + len(part) == len(text) else max(part.rfind(b"\n"), part.rfind(b"\r")) + 1
         if end == 0:
             raise malformed(f"the {format_} file has a line of more than {_AT_ONCE} bytes")
         at += end
-        numbers = np.concatenate([left, numbers_of(cleaned(part[:end]), format_)])
+        yield part[:end]
+
+
+def rows_of_text(text: memoryview, columns: int, thinning: Thinning, format_: str) -> tuple[Float64Array, int]:
+    """The kept ones (K, columns) of the rows of a text, and how many rows there are; at most ``thinning.count`` are
+    read, a part of the text at a time.
+
+    Raises FieldFormatError (MESH_INVALID) where a word is no number.
+    """
+    parts = [np.zeros((0, columns))]
+    read = 0
+    left = np.zeros(0)
+    for part in parts_of(text, format_):
+        if read >= thinning.count:
+            break
+        numbers = np.concatenate([left, numbers_of(part, format_)])
         whole = min(len(numbers) // columns, thinning.count - read)
         left = numbers[whole * columns :]
         rows = numbers[: whole * columns].reshape(-1, columns)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.assumptions import PLACES, Assumptions
+from regnf_core.importing.containers.plain_text import number, unmarked
+from regnf_core.importing.containers.sniff import STL_COUNT_OPEN, uncommented
 from regnf_core.schema.description import Axis
 
 Float64Array = npt.NDArray[np.float64]
@@ -124,9 +127,12 @@ def polygons(counts: npt.NDArray[Any], corners: npt.NDArray[Any]) -> Int64Array:
 
 # Wavefront OBJ: vertices and polygons. Everything else is ignored; no other file is opened.
 
+_FACES = (b"f", b"fo")
 _COMMANDS = (b"call", b"csh")
 _NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"l": "lines", b"p": "points"}
 _SURFACE = b"surf"
+_NAMING = frozenset(b"g o s usemtl mtllib usemap maplib".split())
+"""Statements that no backslash continues: it may be part of a name."""
 
 
 def read_obj(data: memoryview) -> Geometry:
@@ -138,14 +144,11 @@ def read_obj(data: memoryview) -> Geometry:
     triangles: list[tuple[int, int, int]] = []
     left_out: set[str] = set()
     flat = surfaces = 0
-    for line in bytes(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
-        words = line.split()
-        if not words:
-            continue
+    for words in _statements(bytes(data)):
         if words[0] == b"v":
             vertices.append(_place(words))
             colors.extend(_color(words))
-        elif words[0] == b"f":
+        elif words[0] in _FACES:
             corners = [_index(word, len(vertices)) for word in words[1:]]
             flat += len(corners) < 3
             triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
@@ -166,11 +169,28 @@ def read_obj(data: memoryview) -> Geometry:
     )
 
 
+def _statements(text: bytes) -> Iterator[list[bytes]]:
+    """The words of each statement, without comments. One of numbers goes on behind a backslash."""
+    begun: list[bytes] = []
+    for line in text.splitlines():
+        words = begun + line.partition(b"#")[0].split()
+        begun = []
+        if words and words[-1].endswith(b"\\") and words[0] not in _NAMING:
+            begun = [*words[:-1], *filter(None, [words[-1][:-1]])]
+        elif words:
+            yield words
+    if begun:
+        yield begun
+
+
 def _place(words: list[bytes]) -> list[float]:
+    """NaN, which is left out, for a row that is none."""
     try:
-        x, y, z = map(float, words[1:4])  # a fourth number is a weight, more are a color
+        x, y, z = map(number, words[1:4])  # a fourth number is a weight, more are a color
     except ValueError as error:
-        raise not_numbers("an OBJ vertex is not three numbers", b" ".join(words)) from error
+        if b"," in b"".join(words):
+            raise not_numbers("an OBJ vertex is not three numbers", b" ".join(words)) from error
+        return [math.nan] * 3
     return [x, y, z]
 
 
@@ -190,16 +210,18 @@ def _color(words: list[bytes]) -> list[list[float]]:
 def _index(word: bytes, so_far: int) -> int:
     """A corner as v, v/vt, v//vn or v/vt/vn: counted from 1, or backwards from the latest vertex."""
     try:
-        number = int(word.partition(b"/")[0])
+        written = word.partition(b"/")[0]
+        corner = int(written if b"." not in written else number(written))
     except ValueError as error:
         raise malformed("an OBJ face has a corner that is not a number") from error
-    if number == 0 or abs(number) >= 1 << 62:
-        raise malformed("an OBJ face has a corner of no vertex")
-    return number - 1 if number > 0 else so_far + number
+    if corner == 0 or abs(corner) >= 1 << 62:
+        raise malformed("an OBJ face has the corner 0, or one of no vertex: corners count from 1")
+    return corner - 1 if corner > 0 else so_far + corner
 
 
 # STL, binary and text: loose triangles.
 
+_SOLID_NAMES = re.compile(rb"^[ \t]*(?:end)?solid[^\r\n]*", re.IGNORECASE | re.MULTILINE)
 _COUNT_AT, _FACETS_AT, _FACET_BYTES = 80, 84, 50
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -207,25 +229,33 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 def read_stl(data: memoryview) -> Geometry:
     """The triangles of an STL file. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE."""
     count = int.from_bytes(data[_COUNT_AT:_FACETS_AT], "little")
-    behind = len(data) - (_FACETS_AT + _FACET_BYTES * count)
-    text = bytes(data).lstrip(b"\xef\xbb\xbf \t\r\n")
+    room, rest = divmod(max(len(data) - _FACETS_AT, 0), _FACET_BYTES)
+    text = uncommented(unmarked(bytes(data)))
     is_text = text[:5].lower() == b"solid"
+    if count in STL_COUNT_OPEN and not rest and not is_text:
+        count = room
+    behind = len(data) - (_FACETS_AT + _FACET_BYTES * count)
     if len(data) >= _FACETS_AT and (behind == 0 or (behind > 0 and not is_text)):
         require_room(3 * count, count)
         facets = np.frombuffer(data[_FACETS_AT:], dtype=_FACET, count=count)
         found = _loose(facets["corners"].reshape(-1, 3).astype(np.float64))
+        if behind and behind % _FACET_BYTES == 0:
+            return replace(found, not_applied=(f"{behind // _FACET_BYTES} facets beyond the {count} of its header",))
         return replace(found, left_out=(f"{behind} bytes after the triangles",)) if behind else found
     if not is_text:
-        raise malformed(f"the STL file ends within its {count} facets")
-    return _loose(_corners_of_text(text.partition(b"\n")[2] if b"\n" in text else text))  # its name may say `vertex`
+        raise malformed(f"the STL file ends within its {count} facets: it has room for {room}")
+    unnamed = _SOLID_NAMES.sub(b"", text)  # a name may say `vertex`
+    return _loose(_corners_of_text(unnamed if b"vertex" in unnamed.lower() else text))
 
 
 def _corners_of_text(text: bytes) -> Float64Array:
     words = text.split()
     at = [i for i, word in enumerate(words) if word.lower() == b"vertex"]
     require_room(len(at), len(at) // 3)
+    if at and at[-1] + 3 > len(words) - 1:
+        raise malformed("the STL file ends within a facet: it was cut off")
     try:
-        return np.array([[float(word) for word in words[i + 1 : i + 4]] for i in at], dtype=np.float64).reshape(-1, 3)
+        return np.array([[number(word) for word in words[i + 1 : i + 4]] for i in at], dtype=np.float64).reshape(-1, 3)
     except ValueError as error:
         raise not_numbers("an STL vertex is not three numbers", text) from error
 

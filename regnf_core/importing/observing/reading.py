@@ -6,12 +6,13 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.npz import ArraySource
+from regnf_core.importing.containers.plain_text import number
 from regnf_core.importing.observing.trajectory import (
     MOST_CAMERAS,
     Array,
@@ -85,9 +86,11 @@ def _frames(keys: Keys) -> Iterator[Keys]:
 
 
 def _pose(frame: Keys, name: str) -> Array:
-    """(4, 4) from four rows, or from three."""
+    """(4, 4) from four rows, or from three; NaN for a camera that was lost."""
     value = frame.find(name)
     rows = len(value) if isinstance(value, list) else 0
+    if (value is None and name in frame.find("")) or any(None in row for row in value or () if isinstance(row, list)):
+        return np.full((4, 4), np.nan)
     found = frame.matrix(name, 3 if rows == 3 else 4, 4)
     if found is None:
         raise malformed(f"{frame.file}: {frame.at}{name} is missing")
@@ -97,20 +100,20 @@ def _pose(frame: Keys, name: str) -> Array:
 def _intrinsics(frame: Keys, keys: Keys) -> Intrinsics | None:
     """The frame's own, or else those of all frames; None where neither says."""
 
-    def number(*names: str) -> float | None:
+    def stated(*names: str) -> float | None:
         found = (each.number(name) for each in (frame, keys) for name in names)
         return next((one for one in found if one is not None), None)
 
-    width, height = number("w", "width"), number("h", "height")
+    width, height = stated("w", "width"), stated("h", "height")
     matrix = next((rows for each in (frame, keys) if (rows := _matrix(each)) is not None), None)
     if matrix is not None:
         (fx, _, cx, *_), (_, fy, cy, *_) = matrix[:2]
         return Intrinsics(fx, fy, cx, cy, width or 2 * cx, height or 2 * cy)
-    middle_x, middle_y = number("cx"), number("cy")
+    middle_x, middle_y = stated("cx"), stated("cy")
     width = width or (2 * middle_x if middle_x else _SIDE)
     height = height or (2 * middle_y if middle_y else width)
-    focal_x = number("fl_x") or _focal(width, number("camera_angle_x"))
-    focal_y = number("fl_y") or _focal(height, number("camera_angle_y"))
+    focal_x = stated("fl_x") or _focal(width, stated("camera_angle_x"))
+    focal_y = stated("fl_y") or _focal(height, stated("camera_angle_y"))
     if focal_x is None and focal_y is None:
         return None
     cx = width / 2 if middle_x is None else middle_x
@@ -149,30 +152,66 @@ def _to_dataset(keys: Keys, ours: bool) -> Array | None:
     return np.asarray(np.linalg.inv(forward), np.float64)
 
 
-# Poses as plain numbers: a file of TUM's (timestamp tx ty tz qx qy qz qw), or a folder with a matrix a file.
+# Poses as plain numbers: a file of lines, TUM's, EuRoC's or matrices; or a folder with a matrix a file.
 
 MOST_BYTES = 8 << 20
-_TUM = 8
+_NOT_UNIT = 0.05
+"""How far from one a quaternion's length may be in lines of more than eight numbers."""
+_NANOSECONDS = 1e15
+"""Time stamps beyond are no seconds."""
 _NUMBERS = re.compile(r"[0-9]+")
-_SEPARATORS = re.compile(r"[\s,;]+")
+_SEPARATORS = re.compile(r"[\s,;\[\]()]+")
 _CELLS = re.compile(r"[;\t]")
+_STARTS = re.compile(r"[-+.\d]|nan|inf", re.IGNORECASE)
+_NAMES_FIRST = re.compile(r"(time|stamp|frame|x$|tx$|p_)", re.IGNORECASE)
 
 
-def read_tum(name: str, data: bytes | memoryview) -> Array | None:
-    """The poses (N, 4, 4), camera to world, of a file with eight numbers a line; None where it is none.
+def read_lines(name: str, data: bytes | memoryview, most: int = MOST_BYTES) -> Array | None:
+    """The poses (N, 4, 4), camera to world, of a file of lines; None where it is none.
 
-    Lines that are empty or begin with # are passed over. Raises FieldFormatError (CAMERAS_MALFORMED).
+    TUM's (t, place, quaternion x y z w, with a number behind of RTAB-Map), EuRoC's (ns, w first, by commas), Stray
+    Scanner's (t, frame, place, quaternion), matrices of 12 (KITTI) or 16 numbers, or in four rows, with or without
+    their number before (Redwood). Lines that are empty or begin with # or with names of columns are passed over.
+    Raises FieldFormatError (CAMERAS_MALFORMED).
     """
-    rows = _rows(name, data)
-    if not rows or any(len(row) != _TUM for row in rows):
+    rows = _rows(name, data, most)
+    widths = {len(row) for row in rows}
+    if widths == {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
+        rows, widths = [row for at, row in enumerate(rows) if at % 5], {4}
+    if widths == {4} and len(rows) % 4 == 0:
+        return np.array(rows, np.float64).reshape(-1, 4, 4)
+    if widths in ({12}, {16}):
+        return _closed(np.array(rows, np.float64).reshape(len(rows), -1, 4))
+    if len(widths) != 1 or not 8 <= (width := widths.pop()) <= 32:
         return None
     values = np.array(rows, np.float64)
+    stray = width in (9, 13) and bool((values[:, 1] == np.arange(len(values))).all())
+    at = 2 if stray else 1
+    if width > 8 and not stray and not (width == 9 or (values[:, 0] > _NANOSECONDS).all()):
+        return None
+    euroc = not stray and bool((values[:, 0] > _NANOSECONDS).all()) and b"," in bytes(data[:4096])
+    quaternions = values[:, at + 3 : at + 7]
     with np.errstate(all="ignore"):
-        length = np.linalg.norm(values[:, 4:], axis=1, keepdims=True)
-        x, y, z, w = (values[:, 4:] / length).T
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[:, :3, 3] = values[:, 1:4]
+        odd = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > _NOT_UNIT
+    if width > 8 and odd.any():  # other tables have as many numbers
+        return None
+    return poses_of(values[:, at : at + 3], np.roll(quaternions, -1, axis=1) if euroc else quaternions)
+
+
+def poses_of(places: Array, quaternions: Array) -> Array:
+    """(N, 4, 4) of places (N, 3) and quaternions (N, 4), x y z w, of any length; NaN where that is zero."""
+    with np.errstate(all="ignore"):
+        x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
     poses[:, :3, :3] = np.array(rotation_rows(x, y, z, w)).transpose(2, 0, 1)
+    return poses
+
+
+def _closed(rows: Array) -> Array:
+    """(N, 4, 4) of (N, 3 or 4, 4)."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, : rows.shape[1]] = rows
     return poses
 
 
@@ -196,14 +235,18 @@ def read_matrices(files: Sequence[tuple[str, bytes | memoryview]]) -> tuple[Arra
     return (np.stack(poses) if poses else None), intrinsics
 
 
-def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
+def _rows(name: str, data: bytes | memoryview, most: int = MOST_BYTES) -> list[list[float]]:
     """The lines' numbers; NaN and infinity are such, as trackers write them for a camera that they have lost."""
-    lines = (line.strip() for line in decoded(name, data, MOST_BYTES).splitlines())
-    words = (_words(line) for line in lines if line and not line.startswith("#"))
+    lines = (line.strip() for line in decoded(name, data, most).splitlines())
+    words = [words_of(line) for line in lines if line and not line.startswith("#")]
+    if len(words) > 1 and _NAMES_FIRST.match(words[0][0]):  # what the columns are
+        del words[0]
+    if words and not _STARTS.match(words[0][0]):  # a text of something else
+        return []
     return [[_number(name, word) for word in line] for line in words]
 
 
-def _words(line: str) -> list[str]:
+def words_of(line: str) -> list[str]:
     """A line's numbers. A spreadsheet that writes decimal commas parts them by semicolons or tabs."""
     cells = _CELLS.split(line)
     if len(cells) > 1 and "." not in line and all(cell.count(",") <= 1 for cell in cells):
@@ -214,7 +257,7 @@ def _words(line: str) -> list[str]:
 def _number(name: str, word: str) -> float:
     try:
         if len(word) <= MAX_NUMBER_CHARACTERS:
-            return float(word)
+            return number(word.encode())
     except ValueError:
         pass
     raise malformed(f"{name}: {word[:MAX_NUMBER_CHARACTERS]!r} is not a number")
@@ -225,6 +268,7 @@ def _order(name: str) -> tuple[list[int], str]:
 
 
 _ARRAY_BYTES = 64 << 20
+_OPEN3D_SIZE = ("intrinsic.width", "intrinsic.height")
 _KNOWN_NAMES = ("transforms.json", "transforms_train.json", "meta_data.json", "cameras_sphere.npz")
 
 
@@ -243,7 +287,8 @@ def read_trajectory(files: Sequence[SettingsFile], said: CamerasDescription) -> 
     if found is None:
         names = ", ".join(PurePosixPath(file.name).name[:60] for file in files[:6]) or "no file"
         message = (
-            f"no cameras in {names}: expected transforms.json, meta_data.json, a TUM trajectory, or one matrix per file"
+            f"no cameras in {names}: expected transforms.json, meta_data.json, lines of TUM, EuRoC or KITTI, a "
+            f"trajectory of Open3D, COLMAP's text model, or one matrix per file"
         )
         raise FieldFormatError(message, reason="CAMERAS_NOT_RECOGNIZED")
     return found
@@ -261,12 +306,14 @@ def _read(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory
         if name.lower().endswith(".npz"):
             return _of_arrays(name, ArraySource(file.data, _ARRAY_BYTES), said)
         if looks_like_json(file.data) or bytes(file.data[:64]).lstrip()[:2] == b"[{":
-            keys = Keys(name, read_json(name, file.data))
+            keys = Keys(name, read_json(name, file.data, lost=True))
             if isinstance(keys.tree, list):
                 return _of_list(keys)
             if is_trajectory(keys):
                 return read_trajectory_json(keys, _said(said), said.axes)
-    return _of_text(files, said)
+            if (found := _of_open3d(keys, said)) is not None:
+                return found
+    return _of_colmap(files) or _of_text(files, said)
 
 
 def _rank(name: str) -> tuple[int, str]:
@@ -296,6 +343,61 @@ def _of_list(keys: Keys) -> Trajectory:
     return trajectory_of(keys.file, np.stack(poses), intrinsics, None)
 
 
+def open3d_poses(tree: Any) -> Array | None:
+    """The poses (N, 4, 4), camera to world, of Open3D's trajectory or pose graph, whose matrices are by columns."""
+    for key, member in (("parameters", "extrinsic"), ("nodes", "pose")):
+        listed = tree.get(key) if isinstance(tree, dict) else None
+        if isinstance(listed, list) and listed and all(isinstance(one, dict) and member in one for one in listed):
+            try:
+                poses = np.array([one[member] for one in listed], np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
+                return np.asarray(np.linalg.inv(poses) if member == "extrinsic" else poses, np.float64)
+            except (TypeError, ValueError, np.linalg.LinAlgError):
+                return None
+    return None
+
+
+def _of_open3d(keys: Keys, said: CamerasDescription) -> Trajectory | None:
+    if (poses := open3d_poses(keys.tree)) is None:
+        return None
+    first = Keys(keys.file, (keys.tree.get("parameters") or [{}])[0], "parameters.0.")
+    K, width, height = first.numbers("intrinsic.intrinsic_matrix"), *map(first.number, _OPEN3D_SIZE)
+    found = Intrinsics(K[0], K[4], K[6], K[7], width, height) if K and len(K) == 9 and width and height else None
+    if (known := _said(said) or found) is None:
+        raise without_intrinsics(keys.file)
+    return trajectory_of(keys.file, poses, known, said.axes or "opencv")
+
+
+def colmap_lines(text: str, is_images: bool) -> list[list[str]]:
+    """The words of each camera, or of each image, of COLMAP's text model; a line of points follows each image."""
+    lines = [line.strip() for line in text.split("\n") if not line.startswith("#")]
+    words = (line.split(maxsplit=9 if is_images else -1) for line in (lines[::2] if is_images else lines))
+    return [line for line in words if line]
+
+
+def _of_colmap(files: Sequence[SettingsFile]) -> Trajectory | None:
+    """COLMAP's model as text: cameras.txt, and images.txt with world-to-camera quaternions, w first."""
+    named = {PurePosixPath(file.name).name: file for file in files}
+    if not {"cameras.txt", "images.txt"} <= named.keys():
+        return None
+    listed, images = (
+        colmap_lines(decoded(name, named[name].data, _ARRAY_BYTES), name == "images.txt")
+        for name in ("cameras.txt", "images.txt")
+    )
+    cameras: dict[str, Intrinsics] = {}
+    for one, model, *sizes in (line for line in listed if len(line) > 7 - ("SIMPLE" in line[1])):
+        if not _PINHOLES.fullmatch(model):
+            message = f"cameras.txt: cameras of the model {model[:40]} are not supported"
+            raise FieldFormatError(message, reason="CAMERAS_NOT_SUPPORTED")
+        width, height, fx, *rest = (_number("cameras.txt", word) for word in sizes)
+        fy, cx, cy = (fx, *rest[:2]) if model.startswith(("SIMPLE", "RADIAL")) else rest[:3]
+        cameras[one] = Intrinsics(fx, fy, cx, cy, width, height)
+    if not images or any(len(line) < 10 or line[8] not in cameras for line in images):
+        raise malformed("images.txt is not a list of images of the cameras in cameras.txt")
+    values = np.array([[_number("images.txt", word) for word in line[1:8]] for line in images])
+    poses = np.linalg.inv(poses_of(values[:, 4:], np.roll(values[:, :4], -1, axis=1)))
+    return trajectory_of("images.txt", np.asarray(poses, np.float64), [cameras[line[8]] for line in images], None)
+
+
 def _of_text(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory | None:
     texts = [(file.name, file.data) for file in files if not file.name.lower().endswith((".json", ".npz"))]
     if not texts:
@@ -303,7 +405,7 @@ def _of_text(files: Sequence[SettingsFile], said: CamerasDescription) -> Traject
     poses, matrix = read_matrices(texts)
     name = texts[0][0] if len(texts) == 1 else "the folder of poses"
     if poses is None:
-        found = [(tum, file) for file, data in texts if (tum := read_tum(file, data)) is not None]
+        found = [(lines, file) for file, data in texts if (lines := read_lines(file, data)) is not None]
         if not found:
             return None
         poses, name = found[0]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.refused import named_file
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members, require_modest
 from regnf_core.importing.run.tar_run import MAX_PARTS, TarRun, archive_error, kept
@@ -72,10 +73,10 @@ def choose_checkpoint(names: Iterable[str]) -> str:
     """
     tier = _first_tier(names)
     if not tier:
+        told = next((f"{shown_path(name)} is {what}" for name in names if (what := named_file(name))), None)
         ends = " ".join(end for ends in _TIERS for end in ends)
-        raise FieldFormatError(
-            f"no file of the run is a checkpoint; the importer looked for {ends}", reason="RUN_WITHOUT_CHECKPOINT"
-        )
+        message = told or f"the importer looked for {ends}"
+        raise FieldFormatError(f"no file of the run is a checkpoint; {message}", reason="RUN_WITHOUT_CHECKPOINT")
     tier = [one for one in tier if _TRAINED_SPLATS.search(one.name)] or tier
     if len({candidate.series for candidate in tier}) > 1:
         shown = ", ".join(sorted(shown_path(candidate.name) for candidate in tier)[:_SHOWN])

@@ -104,7 +104,8 @@ _OLD_TORCH = frozenset({"sys_info", "pickle", "storages", "tensors"})
 class _Forward:
     """Bytes from first to last, as ``tarfile`` reads them; there is no way back."""
 
-    def __init__(self, source: Iterator[bytes] | Iterator[memoryview]) -> None:
+    def __init__(self, source: Iterator[bytes] | Iterator[memoryview], is_packed: bool) -> None:
+        self._is_packed = is_packed
         self._source, self._waiting, self._at = source, memoryview(b""), 0
         self.last = b""
         """What was read last; a header of zeros is the archive's end."""
@@ -115,6 +116,8 @@ class _Forward:
         while size:
             if not self._waiting:
                 piece = next(self._source, None)
+                if piece is None and self._is_packed and self._at <= tarfile.BLOCKSIZE:
+                    raise tarfile.ReadError  # a whole file, shorter than an archive's first header
                 if piece is None:
                     raise truncated()
                 self._waiting = memoryview(piece)
@@ -188,7 +191,7 @@ class TarRun:
         """Name and size of each plain file in order, and the stream, which stands at its content."""
         packing = self._packing
         source = iter((self._data,)) if packing is None else _unpacked(self._data, packing, self._most)
-        stream = _Forward(source)
+        stream = _Forward(source, packing is not None)
         try:
             archive = tarfile.TarFile(fileobj=stream, encoding="utf-8", errors="strict")  # type: ignore[arg-type]
             for number, member in enumerate(archive):

@@ -167,15 +167,19 @@ MAX_VALUES = 400_000
 """Commas and colons; a list of two thousand cameras has a tenth of them."""
 
 
-def read_json(name: str, data: bytes | memoryview) -> Any:
-    """The value in the file ``name``. Raises FieldFormatError: SETTINGS_TOO_LARGE, SETTINGS_MALFORMED."""
+def read_json(name: str, data: bytes | memoryview, lost: bool = False) -> Any:
+    """The value in the file ``name``. lost: NaN and infinity, which JSON has not, are None.
+
+    Raises FieldFormatError: SETTINGS_TOO_LARGE, SETTINGS_MALFORMED.
+    """
     text = decoded(name, data, MAX_BYTES)
     if text.count(",") + text.count(":") > MAX_VALUES:
         raise too_large(f"{name} holds more than {MAX_VALUES} values")
     if text.count("[") + text.count("{") > MAX_DEPTH and _depth(text) > MAX_DEPTH:
         raise too_large(f"{name} is nested more than {MAX_DEPTH} deep")
+    constant = (lambda _: None) if lost else _no_constant
     try:
-        return json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant, parse_int=_whole)
+        return json.loads(text, object_pairs_hook=_object, parse_constant=constant, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise malformed(f"{name} is not valid JSON") from error
 

@@ -55,10 +55,10 @@ BLOCKS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).
 SIZE = 0.05
 
 
-def block_values(keys: Array) -> Any:
+def block_values(keys: Array, center: Any = 0.1, radius: float = 0.3) -> Any:
     voxels = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1)
     places = SIZE * (8 * keys[:, None, None, None] + voxels)
-    return np.clip(np.linalg.norm(places - 0.1, axis=-1) - 0.3, -0.2, 0.2).astype(np.float32)
+    return np.clip(np.linalg.norm(places - center, axis=-1) - radius, -0.2, 0.2).astype(np.float32)
 
 
 @pytest.mark.parametrize(
@@ -80,6 +80,14 @@ def test_blocks_that_do_not_fit_together(turned: bool, keys: Any, factor: float,
     values = np.ascontiguousarray(values.transpose(0, 2, 1, 3)[:, ::-1]) if turned else values
     found = doubts_of_map(values, np.ones(values.shape, bool), keys, SIZE)
     assert [one.partition(":")[0] for one in found] == wanted
+
+
+def test_two_layers_of_blocks_that_were_swapped() -> None:
+    """Their outer faces, which come together, are both in free space: but the surface now ends where the blocks do."""
+    keys = BLOCKS[BLOCKS[:, 0] < 1]
+    values = block_values(keys, np.array([0.0, 0.1, 0.1]), 0.25)
+    found = [doubts_of_map(values, np.ones(values.shape, bool), keys * (sign, 1, 1), SIZE) for sign in (1, -1)]
+    assert [[one.partition(":")[0] for one in each] for each in found] == [[], ["AXES_UNCERTAIN"]]
 
 
 def test_a_gltf_file_whose_numbers_are_not_in_their_stated_range() -> None:

@@ -72,6 +72,44 @@ def test_recognized_and_evaluated(case: str, tmp_path: Path) -> None:
     assert_is(tmp_path, sample.function)
 
 
+def _renamed(values: dict[str, Any], before: str) -> dict[str, Any]:
+    """With this before the name of each tensor, in all dictionaries."""
+    plain = {name.removeprefix("module."): value for name, value in values.items()}
+    return {
+        f"{before}{name}" if isinstance(value, torch.Tensor) else name: _renamed(value, before)
+        if isinstance(value, dict) and name != "latent_codes"
+        else value
+        for name, value in plain.items()
+    }
+
+
+WRAPPERS: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "DataParallel": lambda values: _renamed(values, "module."),
+    "compiled": lambda values: _renamed(values, "_orig_mod.module."),
+    "a script's": lambda values: {"epoch": 3, "model_state_dict": values},
+    "Lightning's": lambda values: {"state_dict": _renamed(values, "net."), "epoch": 3},
+    "in a list": lambda values: [values, 3],
+}
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+@pytest.mark.parametrize("case", ["neus", "siren", "deepsdf", "instant-nsr-pl", "neuralangelo"])
+def test_wrappers_of_a_network_say_nothing(case: str, wrapper: str, tmp_path: Path) -> None:
+    family, make, description = CASES[case]
+    sample = make()
+    report = imported(tmp_path, WRAPPERS[wrapper](sample.checkpoint), **description)
+    assert report["family"] == family
+    assert_is(tmp_path, sample.function)
+
+
+def test_one_network_of_several_is_asked_for(tmp_path: Path) -> None:
+    state = small.siren().checkpoint
+    assert_refused(lambda: imported(tmp_path, {"model": state, "ema": state}), "FIELD_NOT_RECOGNIZED")
+    layers = small.neus().checkpoint["sdf_network_fine"]
+    assert_refused(lambda: imported(tmp_path, {"state_dict": layers}), "FIELD_NOT_RECOGNIZED")
+    assert imported(tmp_path, {"state_dict": layers}, family="neus", **NEUS_SAID)["family"] == "neus"
+
+
 @pytest.mark.parametrize("case", ["neus", "deepsdf", "siren"])
 def test_the_old_container_holds_the_same(case: str, tmp_path: Path) -> None:
     family, make, description = CASES[case]

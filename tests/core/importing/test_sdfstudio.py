@@ -67,7 +67,7 @@ def test_a_distributed_run_in_half_precision_is_the_same_family() -> None:
     values["pipeline"] = {key: value.half() for key, value in values["pipeline"].items()}
     converted = convert(values)
     assert converted.family == "sdfstudio_neus_facto"
-    assert "_model.module.field.glin*" in converted.why[0]
+    assert "_model.field.glin*" in converted.why[0]
     assert converted.tensors["hash_table"].dtype == np.float32
 
 

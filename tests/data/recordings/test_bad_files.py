@@ -199,7 +199,33 @@ def in_a_folder(folder: Path) -> None:
         np.save(folder / "poses" / f"{i:06d}.npy", one)
 
 
+def associated(folder: Path) -> None:
+    """One list of pairs in place of two lists."""
+    lists = [(folder / f"{name}.txt") for name in ("rgb", "depth")]
+    rows = [[row for row in one.read_text().splitlines() if not row.startswith("#")] for one in lists]
+    (folder / "associations.txt").write_text("\n".join(map(" ".join, zip(*rows, strict=True))))
+    for one in lists:
+        one.unlink()
+
+
 READ: dict[str, tuple[str, Change, int]] = {
+    "pairs of images": ("tum", associated, 3),
+    "Windows's paths in a list": ("tum", all_of("*.txt", lambda p: p.write_text(p.read_text().replace("/", "\\"))), 3),
+    "Windows's paths": (
+        "nerfstudio",
+        document(
+            lambda d: [one.update(depth_file_path=one["depth_file_path"].replace("/", "\\")) for one in d["frames"]]
+        ),
+        3,
+    ),
+    "capitals": (SCENES, all_of("*.png", lambda p: p.rename(p.with_suffix(".PNG"))), 3),
+    "a matrix in one line": (SCENES, pose(lambda m: m.reshape(1, 16)), 3),
+    "a matrix in brackets": (
+        SCENES,
+        all_of("*.pose.txt", lambda p: p.write_text(str(np.loadtxt(p).tolist()).replace("], ", "],\n"))),
+        3,
+    ),
+    "a text beside the poses": ("scannet", lambda f: (f / "pose" / "readme.txt").write_text("hello"), 3),
     "millimeters with a point": (SCENES, as_array(".npy", 1.0), 3),
     "arrays by name": (SCENES, as_array(".npz", 0.001), 3),
     "Stray Scanner": ("redwood", listed("odometry.csv", lines_of_stray), 3),
@@ -242,6 +268,12 @@ READ: dict[str, tuple[str, Change, int]] = {
     "no colors": (SCENES, all_of("*.color.*", lambda p: p.unlink()), 3),
     "larger colors": (SCENES, all_of("*.color.*", lambda p: put(p, np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8))), 3),
     "comments": ("tum", all_of("*.txt", lambda p: p.write_text("# a\n\n" + p.read_text())), 3),
+    "UTF-16": ("tum", all_of("*.txt", lambda p: p.write_bytes(p.read_text().encode("utf-16"))), 3),
+    "decimal commas": (
+        "tum",
+        all_of("groundtruth.txt", lambda p: p.write_text(p.read_text().replace(" ", ";").replace(".", ","))),
+        3,
+    ),
     "KITTI's poses": ("tum", trajectory(lines_of_kitti), 3),
     "12 numbers": ("replica", first_of("traj.txt", lambda p: np.savetxt(p, np.loadtxt(p)[:, :12])), 3),
     "a fisheye": ("nerfstudio", document(lambda d: d.update(camera_model="OPENCV_FISHEYE", k1=0.01)), 3),

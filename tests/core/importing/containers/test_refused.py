@@ -100,7 +100,9 @@ SHAPES: list[tuple[bytes, str]] = [
     (b'{"version": "2.0", "points": 9, "hierarchy": {"firstChunkSize": 22}}', "Potree"),
     (b'{"bounds": [0], "hierarchyType": "json"}', "Entwine"),
     *((b"PAR1\x15\x04", "columns"), (b"ARROW1\0\0", "columns")),
-    *((b"x,y,z\n1,2,3\n4,5,6\n", "column names"), (b"X Y Z Intensity\r\n0.5 1 2 7\r\n", "column names")),
+    *((b"lon,lat,h\n" + 99 * b"1,2,3\n", "column names"), (b"E N H Intensity\r\n0.5 1 2 7\r\n", "column names")),
+    *((b"; made by a slicer\nG28 ; home\n", "milling"), (b'(1 "meshio 5.3.5")\n(2 3)\n', "Fluent")),
+    *((b"NCOFF\n32 60 0\n", "OFF"), (b"999\nDXF by a library\n0\nSECTION\n2\nHEADER\n", "DXF")),
     *((_zip("config.json"), "Keras"), (_zip("metadata.json"), "Keras"), (b"\x1c\0\0\0TFL3", "TensorFlow Lite")),
     *(
         (b"\x08\x05\x12\x90\x01\x0a\x10\x0a\x05image", "Core ML"),
@@ -129,11 +131,11 @@ OTHERS: list[tuple[bytes, str]] = [
     *((b"import numpy as np\n", "script"), (b"from pathlib import Path\n", "script")),
     *((b'{"frames": [], "camera_model": "OPENCV"}', "camera poses"), (b'{"note": "made with Blender"}', "JSON")),
     *((b"[[1, 2], [3]]", "JSON"), (b"# settings\nlearning_rate: 0.1\n", "YAML")),
-    (b"<?xml version='1.0'?>\n<thing/>", "XML"),
+    *((b"<?xml version='1.0'?>\n<thing/>", "XML"), (b"# Blender\nnewmtl a\n", "materials"), (bytes(200), "zeros")),
 ]
 NAMES = [
     *(("a.rcs", "ReCap"), ("A.FLS", "Faro"), ("a.zfs", "Zoller"), ("a.pod", "Pointools"), ("a.raw", "raw volume")),
-    *(("out/octree.bin", "Potree"), ("a.svo2", "ZED")),
+    *(("out/octree.bin", "Potree"), ("a.svo2", "ZED"), ("a.scad", "OpenSCAD"), ("000.bin", "raw array")),
 ]
 
 

@@ -105,7 +105,10 @@ def test_faulty_glb_files(reason: str, documents: list[Any]) -> None:
         *(("vertex 3", ["vertex 4"], "MESH_INVALID"), ("vertex 3", ["vertex 3000000000"], "MESH_TOO_LARGE")),
         *(("face 1", ["face 2", "face -1"], "MESH_INVALID"), ("face 1", ["face 99999999999"], "MESH_TOO_LARGE")),
         ("float z", ["float x", "float w", "list uchar float z", "quaternion z"], "MESH_INVALID"),
-        *(("uchar int", ["float int"], "MESH_INVALID"), ("vertex_indices", ["corners"], "MESH_INVALID")),
+        *(
+            ("uchar int", ["float int"], "MESH_INVALID"),
+            ("vertex_indices", ["a\nproperty list uchar int b"], "MESH_INVALID"),
+        ),
         ("element face", ["element vertex"], "MESH_INVALID"),
         ("3 0 1 2", ["3 0 1 3", "3 0 1 -1", "2 0 1", "1e300 0 1 2", "3 0 1 nan", "3 0 1 1"], "MESH_INVALID"),
         ("1 0 0", ["1 0 inf", "1 0 zero"], "MESH_INVALID"),

@@ -109,7 +109,7 @@ def test_a_cloud_of_many_points_that_is_cut_off_is_refused(
 def test_text_that_is_no_lines_of_numbers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(thinning, "_AT_ONCE", 100)
     rows = b"1.25 2.5 3.75\n" * 40
-    for faulty in (rows + b"1 2\n", rows + b"1 2 x\n", rows + b" " * 200 + b"\n" + rows):
+    for faulty in (rows + 2 * b"1 2\n", rows + 2 * b"1 2 x\n", rows + b" " * 200 + b"\n" + rows):
         assert_refused(lambda faulty=faulty: read_mesh("xyz", memoryview(faulty)), "MESH_INVALID")
 
 
@@ -132,7 +132,7 @@ def test_a_mesh_keeps_its_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     ("array", "reason"),
     [
         (np.zeros((4, 5, 6)), "FORMAT_NOT_SUPPORTED"),
-        (np.zeros((200, 4), np.float32), "FORMAT_NOT_SUPPORTED"),
+        (np.zeros((200, 20), np.float32), "FORMAT_NOT_SUPPORTED"),
         (np.zeros((200, 3), np.int32), "FORMAT_NOT_SUPPORTED"),
         (np.zeros((200, 3), np.complex64), "TENSOR_DTYPE"),
         (np.array([{}, {}, {}]), "NPY_OBJECT_ARRAY"),

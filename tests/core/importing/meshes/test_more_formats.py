@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import struct
 from functools import partial
 from typing import Any
@@ -117,7 +118,7 @@ CLOUDS = {
         *(BINARY.replace(b"POINTS 400", b"POINTS -400"), BINARY.replace(b"COUNT 1", b"COUNT 9")),
         *(BINARY.replace(b"TYPE F", b"TYPE Q"), BINARY.replace(b"SIZE 4", b"SIZE 3")),
         *(BINARY.replace(b"FIELDS x y", b"FIELDS x x"), BINARY.replace(b"DATA binary", b"DATA zipped")),
-        *(points_text(normals=True) + row for row in (b"1 2\n", b"1 2 3 4 5 six\n")),
+        *(points_text(normals=True) + row for row in (b"1 2\n" * 9, b"1 2 six 4 5 6\n" * 9)),
         *(KITTI, TUM),
     ],
 }
@@ -163,11 +164,19 @@ STL = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\
         *(("# licence\n" + "# words\n" * 200 + SHEET, "obj"), ("\ufeff" + SHEET, "obj")),
         ("\ufeff# begun\r\n" + SHEET.replace("\n", "\r\n"), "obj"),
         *(("solid " + "/" * 900 + " vertex 1 2 3\n" + STL, "stl"), ("\n  SOLID THING\n" + STL.upper(), "stl")),
-        ("\ufeffsolid thing\n" + STL, "stl"),
+        *(("\ufeffsolid thing\n" + STL, "stl"), ("# by hand\nsolid a\n" + STL + "solid vertex 9\n" + STL[:0], "stl")),
+        *(
+            ("written by a program\n" + SHEET, "obj"),
+            ("; a sign of comments\n" + SHEET, "obj"),
+            (SHEET + "\0\x1a", "obj"),
+        ),
+        ("vt -nan(ind) 1.#QNAN\n" + SHEET.replace("f 1 3 2", "f 1 \\ \n3.0 2 # three"), "obj"),
+        ("g a\\\n" + SHEET.replace("v 1 0 0", "v 1.0D+00 0 0").replace("f ", "fo "), "obj"),
     ],
 )
-def test_unusual_beginnings_are_recognized(text: str, kind: str) -> None:
-    data = text.encode()
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_unusual_beginnings_are_recognized(text: str, kind: str, encoding: str) -> None:
+    data = text.encode(encoding)
     assert sniff_format(data[:HEAD_BYTES]) == kind
     assert len(read_mesh(kind, memoryview(data)).faces) == (4 if kind == "obj" else 1)
 
@@ -182,6 +191,9 @@ def test_unusual_beginnings_are_recognized(text: str, kind: str) -> None:
         ("f 1 3 2\n", "f 1 3 2\nf 1 1 2\n", "1 triangles without an area"),
         ("f 1 3 2\n", "f 1 3 2\nf 3 2 1\n", "1 duplicate triangles"),
         ("f 1 3 2\n", "f 1 3 2\nl 1 2\np 1\n", "lines"),
+        ("v 0 0 1\n", "v 0 0 1\nv -nan(ind) 1.#QNAN -1.#IND\nv 1\n", "2 vertices with NaN or infinity"),
+        ("f 1 3 2\n", "f 1 3 2\nf 1 2 77\n", "1 triangles with a corner of no vertex"),
+        ("f 1 3 2\n", "f 1 3 2\nf 2 3 1\n", "1 triangles of the other side: the mesh is double-sided"),
     ],
 )
 def test_odd_rows_are_left_out_and_said(old: str, new: str, ignored: str) -> None:
@@ -198,6 +210,13 @@ def test_a_double_sided_mesh_has_one_side() -> None:
     assert len(found.tensors["faces"]) == len(BALL.faces)
     assert found.why[1] == "watertight"
     assert f"ignored: {len(BALL.faces)} triangles of the other side: the mesh is double-sided" in found.why
+
+
+def test_a_wall_between_two_solids_has_both_sides() -> None:
+    beside = trimesh.creation.box((1, 1, 1))
+    beside.apply_translation((1, 0, 0))
+    both = trimesh.util.concatenate([trimesh.creation.box((1, 1, 1)), beside])
+    assert len(converted(bytes(both.export(file_type="stl"))).tensors["faces"]) == 24
 
 
 def test_what_changes_the_shape_and_is_not_read_is_warned_of() -> None:
@@ -225,6 +244,59 @@ def test_ply_vertices_with_lists_are_read() -> None:
 )
 def test_scenes_and_models_of_cad_are_recognized(head: bytes, format_: str | None) -> None:
     assert sniff_format(head + bytes(500)) == format_
+
+
+@pytest.mark.parametrize("count", [0, 0xFFFFFFFF, 20])
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 0.0), (7.0, 8.0, 9.0), (math.nan,) * 3])
+def test_binary_stl_files_whose_normals_or_count_mean_nothing(count: int, normal: tuple[float, ...]) -> None:
+    corners = BALL.triangles[:20].reshape(20, 9)
+    facets = b"".join(struct.pack("<12fH", *normal, *each, 0) for each in [*corners[:19], [math.nan] * 9])
+    data = b"{a header}".ljust(80) + struct.pack("<I", count) + facets
+    assert sniff_format(data[:HEAD_BYTES]) == "stl"
+    assert len(read_mesh("stl", memoryview(data)).faces) == 20
+    beyond = read_mesh("stl", memoryview(data[:80] + struct.pack("<I", 15) + facets))
+    assert beyond.not_applied == ("5 facets beyond the 15 of its header",)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *(("ply\n", "PLY\n"), ("ascii 1.0", "ascii"), ("float x", "float X"), ("vertex_indices", "corners")),
+        *(
+            ("element vertex", "element vertices"),
+            ("uchar int", "uchar int64"),
+            ("\n", "\r"),
+            ("end_header\n", "end_header\n\ufeff"),
+        ),
+    ],
+)
+def test_unusual_ply_headers_are_read(old: str, new: str) -> None:
+    data = PLY_TRIANGLE.replace(old, new).encode()
+    assert sniff_format(data) == "ply"
+    assert read_mesh("ply", memoryview(data)).faces.tolist() == [[0, 1, 2]]
+
+
+def test_a_ply_text_whose_rows_are_not_as_its_header_says_is_refused() -> None:
+    with pytest.raises(FieldFormatError, match="says 4 numbers for each vertex, but its first line has 3"):
+        read_mesh("ply", memoryview(PLY_TRIANGLE.replace("float z\n", "float z\nproperty float w\n").encode()))
+
+
+TABLE = [f"{n},{a:.6f},{b:.6f},{c:.6f},wall,{a:.6f},{b:.6f},{c:.6f}" for n, (a, b, c) in enumerate(AROUND)]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        *(["id,x,y,z,label,nx,ny,nz", *TABLE], ['"x","y","z"', *(",".join(row.split(",")[1:4]) for row in TABLE)]),
+        *(TABLE, ["% a table", *TABLE, "END"], [*TABLE[:200], "1,2", *TABLE[200:]]),
+    ],
+)
+def test_tables_of_points_are_read_by_their_names_and_numbers(lines: list[str]) -> None:
+    data = "\n".join(lines).encode()
+    assert sniff_format(data[:HEAD_BYTES]) == "xyz"
+    found = read_mesh("xyz", memoryview(data))
+    np.testing.assert_allclose(found.vertices, AROUND, atol=1e-6)
+    assert (found.normals is None) == lines[0].startswith('"')
 
 
 def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:

@@ -121,6 +121,46 @@ READ: dict[str, tuple[list[SettingsFile], CamerasDescription]] = {
 }
 
 
+def _quaternions(w_first: bool, matrices: np.ndarray) -> np.ndarray:
+    return np.roll(Rotation.from_matrix(matrices[:, :3, :3]).as_quat(), int(w_first), axis=1)
+
+
+def _table(before: np.ndarray, *, w_first: bool = False, behind: int = 0) -> np.ndarray:
+    return np.c_[before, poses()[:, :3, 3], _quaternions(w_first, poses()), np.ones((5, behind))]
+
+
+def _colmap() -> list[SettingsFile]:
+    inverse, model = np.linalg.inv(poses()), f"1 PINHOLE {WIDTH} {HEIGHT} 525 520 319.5 239.5\n"
+    rows = np.c_[np.arange(5), _quaternions(True, inverse), inverse[:, :3, 3], np.ones(5)].tolist()
+    images = "".join(f"{row[0]:.0f} {' '.join(map(repr, row[1:8]))} 1 {row[0]:.0f}.png\n\n" for row in rows)
+    return [file("cameras.txt", "# cameras\n" + model), file("images.txt", "# images\n" + images)]
+
+
+def _open3d() -> str:
+    intrinsic = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": K.T.ravel().tolist()}
+    each = [{"extrinsic": one.T.ravel().tolist(), "intrinsic": intrinsic} for one in np.linalg.inv(poses())]
+    return json.dumps({"class_name": "PinholeCameraTrajectory", "parameters": each})
+
+
+STAMPS, COUNT = 1.4e18 + 5e6 * np.arange(5.0), np.arange(5.0)
+EUROC = "#timestamp [ns], p_x, ...\n" + lines(_table(STAMPS, w_first=True, behind=9)).replace(" ", ",")
+STRAY = "timestamp, frame, x, y, z, qx, qy, qz, qw\n" + lines(_table(np.c_[COUNT / 60, COUNT])).replace(" ", ", ")
+GRAPH = json.dumps({"class_name": "PoseGraph", "nodes": [{"pose": one.T.ravel().tolist()} for one in poses()]})
+LOST = transforms()["frames"] + [{"transform_matrix": [[math.nan] * 4] * 4}, {"transform_matrix": None}]
+READ |= {
+    "KITTI": ([file("poses.txt", lines(poses()[:, :3].reshape(5, 12)))], SAID),
+    "Replica": ([file("traj.txt", lines(poses().reshape(5, 16)))], SAID),
+    "Redwood": ([file("a.log", "".join(f"{i} {i} {i + 1}\n{lines(one)}\n" for i, one in enumerate(poses())))], SAID),
+    "EuRoC": ([file("data.csv", EUROC)], SAID),
+    "Stray Scanner": ([file("odometry.csv", STRAY)], SAID),
+    "RTAB-Map": ([file("poses.txt", lines(_table(COUNT / 30, behind=1)))], SAID),
+    "COLMAP": (_colmap(), NOTHING),
+    "Open3D": ([file("trajectory.json", _open3d())], NOTHING),
+    "a pose graph": ([file("pose_graph.json", GRAPH)], SAID),
+    "lost cameras": ([file("transforms.json", json.dumps({**transforms(), "frames": LOST}))], NOTHING),
+}
+
+
 @pytest.mark.parametrize("name", READ)
 def test_every_format_gives_the_same_cameras(name: str) -> None:
     assert_same(read_trajectory(*READ[name]))
@@ -156,7 +196,8 @@ BAD: list[tuple[list[SettingsFile], str]] = [
     ([file("a.json", "{}")], "CAMERAS_NOT_RECOGNIZED"),
     ([file("a.txt", "")], "CAMERAS_NOT_RECOGNIZED"),
     ([file("a.txt", "1 2 3\n")], "CAMERAS_NOT_RECOGNIZED"),
-    ([file("a.txt", "hello\n")], "CAMERAS_MALFORMED"),
+    ([file("a.txt", "1 hello\n")], "CAMERAS_MALFORMED"),
+    ([file("a.xml", "<cameras>\n")], "CAMERAS_NOT_RECOGNIZED"),
     ([file("a.txt", b"\xff\xfe\x00")], "CAMERAS_MALFORMED"),
     ([file("transforms.json", '{"frames": [')], "CAMERAS_MALFORMED"),
     ([file("groundtruth.txt", tum())], "CAMERAS_INTRINSICS_MISSING"),
