@@ -39,19 +39,22 @@ from regnf_core.importing.splats.views import (
 )
 from regnf_core.importing.upload_description import CamerasDescription, UploadDescription
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.schema.kinds import WEIGHTS
 from regnf_core.schema.similarity import local_origin, shift_rows
 
 FAMILY = "gaussian_splats"
 ASSUMPTIONS = {"spz": (UNIT, RUB), "sog": (UNIT, RUB), "glb": GLTF, "gltf": GLTF}
 """Of formats that define more than numbers."""
-_VOXELS = 256
-"""Along the longest edge of the region."""
+_VOXELS, _VOXELS_WITHIN = 256, 512
+"""Along the longest edge of the region, of an object and of a scene, in which things are a part of it."""
 _TRUNCATION = 4.0
 """Voxels."""
 _BEYOND = 2.0
 """Voxels beyond the region's box in which depths still count."""
 _SLAB = 8
 """Layers of the observation's cells at once: they stay in the processor's cache."""
+_FILLED_AT_ONCE = 4096
+"""Blocks: memory."""
 _ACROSS, _LOOK_THROUGH = 2.0, 2
 """Voxels along an edge of the observation's; views that must look through one for it to be free."""
 
@@ -101,13 +104,14 @@ def convert_splats(
     shift = np.array(near or (0.0, 0.0, 0.0))
     splats = replace(splats, means=splats.means - shift).chosen(shown)
     region = replace(region, low=region.low - shift, high=region.high - shift)
-    voxel = region.longest / _VOXELS
+    voxels = _VOXELS_WITHIN if region.within else _VOXELS
+    voxel = region.longest / voxels
     if cameras is None:
         placed = cameras_for(splats, region)
     else:
         placed = given_cameras(cameras, _into_file(overrides, cameras, shift))
     alone = cameras is None and not region.within
-    views, share = agreed(drawn(prepared(splats), placed, voxel, _workers()), voxel, alone)
+    views, share = agreed(drawn(prepared(splats), placed, voxel, _workers()), voxel, alone, cameras is None)
     views = [_cropped(view, region, voxel) for view in views]
     own_bounds = None if bounds is None else (scale * (bounds - shift)).tolist()
     said = replace(overrides, family=None, as_=None, cameras=CamerasDescription(), bounds=own_bounds)
@@ -120,7 +124,7 @@ def convert_splats(
     )
     text = (
         f"the surface is where half of the light is stopped, in depths of {len(placed)} views, fused to voxels of "
-        f"1/{_VOXELS} of the longest edge; left out were {floating:,} Gaussians apart from all others, and "
+        f"1/{voxels} of the longest edge; left out were {floating:,} Gaussians apart from all others, and "
         f"{100 * share:.1f} % of the depths, which other views contradicted"
     )
     warnings = [f"SURFACE_RECONSTRUCTED: {text}"]
@@ -131,8 +135,11 @@ def convert_splats(
         entries = {name: description[name] for name in ("bounds", "world_scale")}
         entries["bounds"] = [(np.array(corner) + scale * shift).tolist() for corner in entries["bounds"]]
         description |= entries_at(entries, near)
+    grid, words = _observation(views, region, voxel, alone)
+    if alone:
+        fused = _filled(fused, grid, words)
     found = replace(fused, family=FAMILY, why=why, description=description, warnings=tuple(warnings), assumes=assumes)
-    return observed_field(found, *_observation(views, region, voxel, alone), f"in depths of {len(placed)} views")
+    return observed_field(found, grid, words, f"in depths of {len(placed)} views")
 
 
 def _workers() -> int:
@@ -161,13 +168,13 @@ def _cropped(view: Seen, region: Region, voxel: float) -> Seen:
     ends = view.ends()
     low, high = region.low - _BEYOND * voxel, region.high + _BEYOND * voxel
     inside = ((ends >= low) & (ends <= high)).all(axis=-1)
-    return replace(view, depth=np.where(inside, view.depth, np.float32(0.0)))
+    return replace(view, depth=np.where(inside | np.isnan(view.depth), view.depth, np.float32(0.0)))
 
 
 def _fused(views: list[Seen], voxel: float, said: UploadDescription, tensor_bytes: int) -> ConvertedField:
     """Raises FieldFormatError (NO_ZERO_LEVEL)."""
     poses: list[Doubles] = [np.linalg.inv(view.camera.T_camera_world).astype(np.float64) for view in views]
-    depths = [np.ascontiguousarray(view.depth, np.float32) for view in views]
+    depths = [np.nan_to_num(view.depth) for view in views]
     farthest = max((float(depth.max(initial=0.0)) for depth in depths), default=0.0)
     grid = BlockGrid(voxel, _TRUNCATION, 1.01 * farthest)
     arrays = fused_arrays(depths, [view.camera.matrix for view in views], poses, grid, [view.color for view in views])
@@ -202,3 +209,34 @@ def _observation(
     low = tuple(float(value) for value in region.low)
     grid = ObservationGrid((low[0], low[1], low[2]), float(edge), (x, y, z))
     return grid, grid.pack(states)
+
+
+def _filled(fused: ConvertedField, grid: ObservationGrid, words: npt.NDArray[np.int32]) -> ConvertedField:
+    """The map with matter where no view of the object looks, to which the fusion has no distances."""
+    tensors, size = dict(fused.tensors), float(fused.description["voxel_size"])
+    blocks, values = np.asarray(tensors["blocks"], np.int32), np.asarray(tensors["values"], np.float32)
+    weights, matter = np.asarray(tensors[WEIGHTS], np.float16), np.float32(-_TRUNCATION * size)
+    edge, hidden = values.shape[1], grid.unpack(words) == UNSEEN
+    middle, low = np.array(grid.low) + grid.voxel / 2, np.floor(np.array(grid.low) / (edge * size)).astype(np.int32)
+    reached = np.zeros(np.ceil(np.array(grid.counts) * grid.voxel / (edge * size)).astype(int) + 1, np.bool_)
+    reached[tuple((np.floor((np.argwhere(hidden) * grid.voxel + middle) / (edge * size)).astype(np.int32) - low).T)] = 1
+    known = blocks - low
+    known = known[((known >= 0) & (known < reached.shape)).all(axis=1)]
+    reached[tuple(known.T)] = False
+    more = (np.argwhere(reached) + low).astype(np.int32)
+    added = (len(more), edge, edge, edge)
+    tensors["blocks"] = blocks = np.concatenate([blocks, more])
+    tensors[WEIGHTS] = weights = np.concatenate([weights, np.zeros(added, weights.dtype)])
+    tensors["values"] = values = np.concatenate([values, np.full(added, -matter, values.dtype)])
+    inner = np.indices((edge, edge, edge)).reshape(3, -1).T
+    for start in range(0, len(blocks), _FILLED_AT_ONCE):
+        part = slice(start, start + _FILLED_AT_ONCE)
+        nodes = size * (edge * blocks[part, None] + inner)
+        cells = np.floor((nodes - np.array(grid.low)) / grid.voxel).astype(np.int32)
+        within = ((cells >= 0) & (cells < grid.counts)).all(axis=-1)
+        inside = within & hidden[tuple(np.where(within[..., None], cells, 0).transpose(2, 0, 1))]
+        values[part][inside.reshape(values[part].shape) & (weights[part] == 0)] = matter
+    if "color.values" in tensors:
+        colors = np.asarray(tensors["color.values"], np.float16)
+        tensors["color.values"] = np.concatenate([colors, np.full((*added, 3), -1.0, colors.dtype)])
+    return replace(fused, tensors=tensors)
