@@ -1,7 +1,8 @@
 """Gaussian splats as fields: depths that cameras see of them, fused to a map of truncated distances with weights.
 
 The cameras are those of the training where they came with the file; else some are placed around an object, or in the
-free space of a scene. Depths that other views contradict, as floaters have them, are left out.
+free space of a scene. Depths that other views contradict, as floaters have them, are left out, and so are those of
+splats that are seen from behind.
 """
 
 from __future__ import annotations
@@ -120,10 +121,10 @@ def convert_splats(
     kind = "surfels (2D Gaussians)" if splats.flat else "Gaussians"
     why = (
         f"{origin}: {len(shown):,} {kind}, {splats.harmonics.shape[1]} coefficients of color each",
-        _from_where(region, cameras, len(placed)),
+        _from_where(region, cameras, len(views)),
     )
     text = (
-        f"the surface is where half of the light is stopped, in depths of {len(placed)} views, fused to voxels of "
+        f"the surface is where half of the light is stopped, in depths of {len(views)} views, fused to voxels of "
         f"1/{voxels} of the longest edge; left out were {floating:,} Gaussians apart from all others, and "
         f"{100 * share:.1f} % of the depths, which other views contradicted"
     )
@@ -139,7 +140,7 @@ def convert_splats(
     if alone:
         fused = _filled(fused, grid, words)
     found = replace(fused, family=FAMILY, why=why, description=description, warnings=tuple(warnings), assumes=assumes)
-    return observed_field(found, grid, words, f"in depths of {len(placed)} views")
+    return observed_field(found, grid, words, f"in depths of {len(views)} views")
 
 
 def _workers() -> int:

@@ -279,7 +279,7 @@ class Seen:
             after = np.concatenate([step, np.take(step, [-1], axis)], axis)
             shorter = (before**2).sum(-1, keepdims=True) < (after**2).sum(-1, keepdims=True)
             steps.append(np.where(shorter, before, after).reshape(-1, 3)[where])
-        normals, points = np.cross(*steps), ends.reshape(-1, 3)[where]
+        normals, points = np.cross(steps[0], steps[1]), ends.reshape(-1, 3)[where]
         facing = ((self.place - points) * normals).sum(-1, keepdims=True)
         return where, points.astype(np.float32), np.where(facing < 0.0, -normals, normals).astype(np.float32)
 
