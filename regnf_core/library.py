@@ -8,6 +8,7 @@ found.ranking[0].name, found.result.T_object_scene
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -135,16 +136,22 @@ def refined_objects(
     options: RegistrationOptions,
     seed: int,
     run: Run,
+    worst: float = math.inf,
 ) -> tuple[list[tuple[int, float]], list[Coarse], list[Refined], list[Comparison]]:
     """The objects nearest to the view by signature, those searched coarsely, those refined on their fields, each list
-    the best first, and what tells the first refined one from each of the others."""
+    the best first, and what tells the first refined one from each of the others.
+
+    worst: score of the coarse search, 0..1, above which no object is refined.
+    """
     with run.phase("initializing"):
         nearest = rank_by_signature(view, [one.model for one in library])
         there = view.on(working_device(scene))
         coarse = [_searched_coarsely(there, library[n], n, options, seed) for n, _ in nearest[: LIBRARY.shortlist]]
         coarse.sort(key=lambda found: found[0])
-        worth = [found for found in coarse if found[0] <= coarse[0][0] + LIBRARY.margin][: LIBRARY.max_refined]
-    refined = []
+        worth = [found for found in coarse if found[0] <= min(coarse[0][0] + LIBRARY.margin, worst)][
+            : LIBRARY.max_refined
+        ]
+    refined: list[Refined] = []
     with run.phase("optimizing"):
         for taken, (_, number, poses) in enumerate(worth):
             one, counted = library[number], CountingField(scene)
@@ -154,7 +161,7 @@ def refined_objects(
             evaluation = evaluate_candidates(problem, found, options)
             refined.append((evaluation, number, problem, counted.evaluations + obj.evaluations))
         refined.sort(key=lambda found: found[0].rank)
-        told_apart = _decided(refined)
+        told_apart = _decided(refined) if refined else []
     return nearest, coarse, refined, told_apart
 
 

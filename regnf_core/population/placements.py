@@ -23,6 +23,8 @@ from regnf_core.robust.scene import view_scene
 
 _WORTH = 0.2
 """Probability from which on a pose is looked at again, in a box of its own."""
+_WORST = 0.65
+"""Score of the coarse search, 0..1, above which a box is given up: of boxes with a likely pose none has more."""
 _TOLERANCE, _LEAST_TOLERANCE = 1.5, 0.01
 """How far from an object's surface it explains the scene's: spacings; object diameters, at least."""
 _ALIKE = 0.3
@@ -108,7 +110,9 @@ class Seeker:
         except (NoSurfaceError, InvalidDetectionError):
             return None
         some = [self.library[number] for number in numbers]
-        _, _, refined, _ = refined_objects(self.scene, view, some, self.options, self.seed, Run(None))
+        _, _, refined, _ = refined_objects(self.scene, view, some, self.options, self.seed, Run(None), _WORST)
+        if not refined:
+            return None
         evaluation, number, _, _ = refined[0]
         one, T, found = some[number], evaluation.T, evaluation.found
         return Placement(

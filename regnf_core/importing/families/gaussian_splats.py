@@ -1,7 +1,8 @@
 """Gaussian splats as fields: depths that cameras see of them, fused to a map of truncated distances with weights.
 
 The cameras are those of the training where they came with the file; else some are placed around an object, or in the
-free space of a scene. Depths that other views contradict, as floaters have them, are left out.
+free space of a scene. Depths that other views contradict, as floaters have them, are left out, and so are those of
+splats that are seen from behind.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ from regnf_core.schema.similarity import local_origin
 FAMILY = "gaussian_splats"
 ASSUMPTIONS = {"spz": (UNIT, RUB), "sog": (UNIT, RUB), "glb": GLTF, "gltf": GLTF}
 """Of formats that define more than numbers."""
+_VOXELS_WITHIN = 512
+"""Along the longest edge of the region of a scene, in which things are a part of it."""
 
 
 def read_splats(format_: str, data: memoryview, siblings: Siblings, node: str | None = None) -> Splats:
@@ -83,24 +86,25 @@ def convert_splats(
     shift = np.array(near or (0.0, 0.0, 0.0))
     splats = replace(splats, means=splats.means - shift).chosen(shown)
     region = replace(region, low=region.low - shift, high=region.high - shift)
-    voxel = region.longest / VOXELS
+    voxels = _VOXELS_WITHIN if region.within else VOXELS
+    voxel = region.longest / voxels
     if cameras is None:
         placed = cameras_for(splats, region)
     else:
         placed = given_cameras(cameras, into_file(overrides, cameras, shift))
     alone = cameras is None and not region.within
-    views, share = agreed(drawn(prepared(splats), placed, voxel, workers()), voxel, alone)
-    fused = fused_field(views, region, alone, overrides, tensor_bytes, near)
+    views, share = agreed(drawn(prepared(splats), placed, voxel, workers()), voxel, alone, cameras is None)
+    fused = fused_field(views, region, alone, overrides, tensor_bytes, near, voxels)
     floating = len(shown) - len(splats)
     kind = "surfels (2D Gaussians)" if splats.flat else "Gaussians"
     why = (
         f"{origin}: {len(shown):,} {kind}, {splats.harmonics.shape[1]} coefficients of color each",
-        _from_where(region, cameras, len(placed)),
+        _from_where(region, cameras, len(views)),
         fused.why[-1],
     )
     text = (
-        f"the surface is where half of the light is stopped, in depths of {len(placed)} views, fused to voxels of "
-        f"1/{VOXELS} of the longest edge; left out were {floating:,} Gaussians apart from all others, and "
+        f"the surface is where half of the light is stopped, in depths of {len(views)} views, fused to voxels of "
+        f"1/{voxels} of the longest edge; left out were {floating:,} Gaussians apart from all others, and "
         f"{100 * share:.1f} % of the depths, which other views contradicted"
     )
     warnings = [f"SURFACE_RECONSTRUCTED: {text}"]

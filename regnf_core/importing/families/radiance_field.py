@@ -73,7 +73,7 @@ def surface_of(
     seen = [Seen(camera, depth, None) for camera, depth in zip(placed, depths, strict=True)]
     ends = [float(np.median(depth[depth > 0.0])) if depth.any() else 0.0 for depth in depths]
     blind = [end <= _AT_ONCE * field.near and (end > 0.0 or overrides.bounds is None) for end in ends]
-    views, share = agreed(seen, voxel, False)
+    views, share = agreed(seen, voxel, False, False)
     if not any(ends):
         message = "no camera sees a surface: less than half of the light is stopped everywhere, or they look elsewhere"
         raise FieldFormatError(message, reason="NO_ZERO_LEVEL")

@@ -19,6 +19,7 @@ from regnf_core.importing.splats.gaussians import Doubles
 from regnf_core.importing.splats.views import Region, Seen, Trained
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.description import FREE, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.schema.kinds import WEIGHTS
 from regnf_core.schema.similarity import shift_rows
 
 VOXELS = 256
@@ -29,6 +30,8 @@ _BEYOND = 2.0
 """Voxels beyond the region's box in which depths still count."""
 _SLAB = 8
 """Layers of the observation's cells at once: they stay in the processor's cache."""
+_FILLED_AT_ONCE = 4096
+"""Blocks: memory."""
 _ACROSS, _LOOK_THROUGH = 2.0, 2
 """Voxels along an edge of the observation's; views that must look through one for it to be free."""
 
@@ -40,14 +43,15 @@ def fused_field(
     overrides: UploadDescription,
     tensor_bytes: int,
     near: tuple[float, float, float] | None = None,
+    voxels: int = VOXELS,
 ) -> ConvertedField:
-    """The field of what views see of a region, with its observation. alone: as of ``agreed`` · near: what was
-    subtracted from the file's coordinates.
+    """The field of what views see of a region, with its observation. alone: as of ``agreed``; what no view sees is
+    matter then · near: what was subtracted from the file's coordinates · voxels: along the region's longest edge.
 
     Raises FieldFormatError: NO_ZERO_LEVEL where no camera sees a surface.
     """
     scale, shift = overrides.world_scale or 1.0, np.array(near or (0.0, 0.0, 0.0))
-    voxel = region.longest / VOXELS
+    voxel = region.longest / voxels
     views = [_cropped(view, region, voxel) for view in views]
     bounds = None if overrides.bounds is None else (np.array(overrides.bounds) - scale * shift).tolist()
     said = UploadDescription(
@@ -59,13 +63,16 @@ def fused_field(
         color=overrides.color,
     )
     fused = _fused(views, voxel, replace(said, truncation=_TRUNCATION * voxel), tensor_bytes)
+    grid, words = _observation(views, region, voxel, alone)
+    if alone:
+        fused = _filled(fused, grid, words)
     description = fused.description
     if near is not None:
         entries = {name: description[name] for name in ("bounds", "world_scale")}
         entries["bounds"] = [(np.array(corner) + scale * shift).tolist() for corner in entries["bounds"]]
         description = {**description, **entries_at(entries, near)}
     found = replace(fused, description=description)
-    return observed_field(found, *_observation(views, region, voxel, alone), f"in depths of {len(views)} views")
+    return observed_field(found, grid, words, f"in depths of {len(views)} views")
 
 
 def workers() -> int:
@@ -86,13 +93,13 @@ def _cropped(view: Seen, region: Region, voxel: float) -> Seen:
     ends = view.ends()
     low, high = region.low - _BEYOND * voxel, region.high + _BEYOND * voxel
     inside = ((ends >= low) & (ends <= high)).all(axis=-1)
-    return replace(view, depth=np.where(inside, view.depth, np.float32(0.0)))
+    return replace(view, depth=np.where(inside | np.isnan(view.depth), view.depth, np.float32(0.0)))
 
 
 def _fused(views: list[Seen], voxel: float, said: UploadDescription, tensor_bytes: int) -> ConvertedField:
     """Raises FieldFormatError (NO_ZERO_LEVEL)."""
     poses: list[Doubles] = [np.linalg.inv(view.camera.T_camera_world).astype(np.float64) for view in views]
-    depths = [np.ascontiguousarray(view.depth, np.float32) for view in views]
+    depths = [np.ascontiguousarray(np.nan_to_num(view.depth), np.float32) for view in views]
     farthest = max((float(depth.max(initial=0.0)) for depth in depths), default=0.0)
     grid = BlockGrid(voxel, _TRUNCATION, 1.01 * farthest)
     colors = [view.color for view in views if view.color is not None] or None
@@ -128,3 +135,34 @@ def _observation(
     low = tuple(float(value) for value in region.low)
     grid = ObservationGrid((low[0], low[1], low[2]), float(edge), (x, y, z))
     return grid, grid.pack(states)
+
+
+def _filled(fused: ConvertedField, grid: ObservationGrid, words: npt.NDArray[np.int32]) -> ConvertedField:
+    """The map with matter where no view of the object looks, to which the fusion has no distances."""
+    tensors, size = dict(fused.tensors), float(fused.description["voxel_size"])
+    blocks, values = np.asarray(tensors["blocks"], np.int32), np.asarray(tensors["values"], np.float32)
+    weights, matter = np.asarray(tensors[WEIGHTS], np.float16), np.float32(-_TRUNCATION * size)
+    edge, hidden = values.shape[1], grid.unpack(words) == UNSEEN
+    middle, low = np.array(grid.low) + grid.voxel / 2, np.floor(np.array(grid.low) / (edge * size)).astype(np.int32)
+    reached = np.zeros(np.ceil(np.array(grid.counts) * grid.voxel / (edge * size)).astype(int) + 1, np.bool_)
+    reached[tuple((np.floor((np.argwhere(hidden) * grid.voxel + middle) / (edge * size)).astype(np.int32) - low).T)] = 1
+    known = blocks - low
+    known = known[((known >= 0) & (known < reached.shape)).all(axis=1)]
+    reached[tuple(known.T)] = False
+    more = (np.argwhere(reached) + low).astype(np.int32)
+    added = (len(more), edge, edge, edge)
+    tensors["blocks"] = blocks = np.concatenate([blocks, more])
+    tensors[WEIGHTS] = weights = np.concatenate([weights, np.zeros(added, weights.dtype)])
+    tensors["values"] = values = np.concatenate([values, np.full(added, -matter, values.dtype)])
+    inner = np.indices((edge, edge, edge)).reshape(3, -1).T
+    for start in range(0, len(blocks), _FILLED_AT_ONCE):
+        part = slice(start, start + _FILLED_AT_ONCE)
+        nodes = size * (edge * blocks[part, None] + inner)
+        cells = np.floor((nodes - np.array(grid.low)) / grid.voxel).astype(np.int32)
+        within = ((cells >= 0) & (cells < grid.counts)).all(axis=-1)
+        inside = within & hidden[tuple(np.where(within[..., None], cells, 0).transpose(2, 0, 1))]
+        values[part][inside.reshape(values[part].shape) & (weights[part] == 0)] = matter
+    if "color.values" in tensors:
+        colors = np.asarray(tensors["color.values"], np.float16)
+        tensors["color.values"] = np.concatenate([colors, np.full((*added, 3), -1.0, colors.dtype)])
+    return replace(fused, tensors=tensors)

@@ -23,14 +23,18 @@ _MARGIN = 0.03
 """The box around the others, longer by this share of its diagonal on every side."""
 _ROUND, _AWAY = 40, 2.2
 """Views of an object, and how many radii of its box the cameras are from its middle."""
-_SIDE_ROUND, _SIDE_WITHIN = 256, 192
+_SIDE = 256
 """Pixels along an image's side."""
-_PLACES, _CELLS = 12, 48
+_PLACES, _CELLS = 16, 48
 """Places within a scene, six views each; cells along the longest edge, in which they are looked for."""
 _FULL = 0.5
 """A cell is matter where the splats in it stop so much light."""
-_ENCLOSED = 0.8
+_ENCLOSED = 0.5
 """Places from which at least this share of what the most enclosed place has is matter, of the directions of view."""
+_CLEARANCE = 2.0
+"""Cells between a place and matter."""
+_CANDIDATES, _RAYS, _STEP = 400, 600, 0.7
+"""Places that are tried, rays from each, and cells from step to step along a ray."""
 _MOST_GIVEN = 96
 """Cameras that are used, of those given."""
 _OTHERS = 24
@@ -44,6 +48,12 @@ _AGREE = 0.02
 _AGREE_VOXELS = 3.0
 """... or this many voxels."""
 _LEAST_AGREEING = 2
+_SAME = 1.5
+"""Voxels: depths from two sides that agree so well are of one layer."""
+_MOST_BACKS = 0.1
+"""Of what is seen from a place: no camera was where more is."""
+_TRIED = 200
+"""Places that a view sees, by which others are found that see them too."""
 
 
 class Trained(Protocol):
@@ -123,7 +133,7 @@ def given_cameras(
     found = []
     for number in chosen:
         aspect = float(trajectory.aspect[number])
-        height = int(min(_SIDE_ROUND, np.sqrt(pixels / aspect)))
+        height = int(min(_SIDE, np.sqrt(pixels / aspect)))
         size = np.array([max(1, int(height * aspect)), height])
         focal, middle = trajectory.focal[number] * size, trajectory.middle[number] * size
         T_camera_splats = np.linalg.inv(trajectory.poses[number]) @ T_file_splats
@@ -148,9 +158,9 @@ def _around(region: Region) -> list[Camera]:
         local = corners @ T[:3, :3].T + T[:3, 3]
         rays = local[:, :2] / local[:, 2:]
         low, high = rays.min(axis=0), rays.max(axis=0)
-        focal = _SIDE_ROUND / float((high - low).max())
-        x, y = _SIDE_ROUND / 2 - focal * (low + high) / 2
-        found.append(Camera(T, (focal, focal), (float(x), float(y)), (_SIDE_ROUND, _SIDE_ROUND)))
+        focal = _SIDE / float((high - low).max())
+        x, y = _SIDE / 2 - focal * (low + high) / 2
+        found.append(Camera(T, (focal, focal), (float(x), float(y)), (_SIDE, _SIDE)))
     return found
 
 
@@ -166,17 +176,17 @@ def _looking(place: Doubles, forward: Doubles) -> Doubles:
 
 
 def _within(splats: Splats, region: Region) -> list[Camera]:
-    half = _SIDE_WITHIN / 2
+    half = _SIDE / 2
     sides = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
     return [
-        Camera(_looking(place, side), (half, half), (half, half), (_SIDE_WITHIN, _SIDE_WITHIN))
+        Camera(_looking(place, side), (half, half), (half, half), (_SIDE, _SIDE))
         for place in _free_places(splats, region)
         for side in sides
     ]
 
 
 def _free_places(splats: Splats, region: Region) -> Doubles:
-    """(P, 3): places in cells without matter that are enclosed by it, far from it and from each other."""
+    """(P, 3): places in cells without matter that are enclosed by it, from which together most of it is seen."""
     cell = region.longest / _CELLS
     shape = np.maximum(np.ceil((region.high - region.low) / cell), 1).astype(int)
     index = np.floor((splats.means - region.low) / cell).astype(int)
@@ -186,21 +196,36 @@ def _free_places(splats: Splats, region: Region) -> Doubles:
     share = splats.opacities[kept] * np.minimum(2.0 * np.pi * area / cell**2, 1.0)
     np.add.at(stopped, tuple(index[kept].T), share)
     matter = 1.0 - np.exp(-stopped) > _FULL
-    free = ~matter
     enclosed = _share_enclosed(matter)
-    good = free & (enclosed >= _ENCLOSED * enclosed[free].max(initial=0.0))
-    room = ndimage.distance_transform_edt(np.pad(free, 1, constant_values=True))[1:-1, 1:-1, 1:-1]
-    cells = np.argwhere(good)
-    far = np.minimum(room[good], 0.25 * min(shape))  # farther from matter is not better
+    room = ndimage.distance_transform_edt(np.pad(~matter, 1, constant_values=True))[1:-1, 1:-1, 1:-1]
+    good = (room >= _CLEARANCE) & (enclosed >= _ENCLOSED * enclosed[~matter].max(initial=0.0))
+    cells = np.argwhere(good if good.any() else ~matter)
+    cells = np.random.default_rng(0).permutation(cells)[:_CANDIDATES]
+    seen = _cells_seen(matter, cells)
     chosen: list[int] = []
-    apart = np.full(len(cells), np.inf)
+    worth = np.ones(matter.size + 1)
+    worth[-1] = 0.0
     while len(chosen) < min(_PLACES, len(cells)):
-        worth = np.minimum(2.0 * far, apart)
-        chosen.append(int(worth.argmax()))
-        apart = np.minimum(apart, np.linalg.norm(cells - cells[chosen[-1]], axis=1))
-        if apart.max() < 1.0:
+        gain = np.array([worth[own].sum() for own in seen])
+        gain[chosen] = 0.0
+        if gain.max(initial=0.0) == 0.0:
             break
+        chosen.append(int(gain.argmax()))
+        worth[seen[chosen[-1]]] *= 0.5
     return region.low + cell * (cells[chosen] + 0.5)
+
+
+def _cells_seen(matter: npt.NDArray[np.bool_], cells: npt.NDArray[np.int64]) -> list[npt.NDArray[np.int64]]:
+    """For each of the cells (C, 3) without matter, the numbers of cells with matter where rays from it end."""
+    rays = directions(_RAYS)
+    hit = np.full((len(cells), len(rays)), matter.size)
+    for step in np.arange(1.0, np.linalg.norm(matter.shape), _STEP):
+        at = np.floor(cells[:, None] + 0.5 + step * rays).astype(np.int64)
+        within = ((at >= 0) & (at < matter.shape)).all(axis=-1)
+        number = np.ravel_multi_index(tuple(np.where(within[..., None], at, 0).transpose(2, 0, 1)), matter.shape)
+        ends = within & matter.reshape(-1)[number] & (hit == matter.size)
+        hit[ends] = number[ends]
+    return [np.unique(own) for own in hit]
 
 
 def _share_enclosed(matter: npt.NDArray[np.bool_]) -> Doubles:
@@ -227,13 +252,39 @@ def _moved(cells: npt.NDArray[np.bool_], shift: npt.NDArray[np.int64]) -> npt.ND
     return moved
 
 
+_Places = tuple[npt.NDArray[np.int64], Floats, Floats]
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a camera sees: depths (H, W), 0 where it does not tell, and colors (H, W, 3), if they are known."""
+    """What a camera sees: depths (H, W), 0 where nothing stops the light and NaN where it cannot tell; colors
+    (H, W, 3), if they are known."""
 
     camera: Camera
     depth: Floats
     color: npt.NDArray[np.uint8] | None
+
+    @property
+    def place(self) -> Doubles:
+        """(3,): of the camera, in the world."""
+        T = self.camera.T_camera_world
+        place: Doubles = -T[:3, :3].T @ T[:3, 3]
+        return place
+
+    def seen_places(self) -> _Places:
+        """The pixels (M,) with a depth; where the depths end (M, 3), and normals there of any length that face the
+        camera (M, 3), in the world."""
+        ends, where = self.ends(), np.flatnonzero(self.depth > 0.0)
+        steps = []
+        for axis in (0, 1):
+            step = np.diff(ends, axis=axis)
+            before = np.concatenate([np.take(step, [0], axis), step], axis)
+            after = np.concatenate([step, np.take(step, [-1], axis)], axis)
+            shorter = (before**2).sum(-1, keepdims=True) < (after**2).sum(-1, keepdims=True)
+            steps.append(np.where(shorter, before, after).reshape(-1, 3)[where])
+        normals, points = np.cross(steps[0], steps[1]), ends.reshape(-1, 3)[where]
+        facing = ((self.place - points) * normals).sum(-1, keepdims=True)
+        return where, points.astype(np.float32), np.where(facing < 0.0, -normals, normals).astype(np.float32)
 
     def ends(self) -> Doubles:
         """(H, W, 3): where the depths end, in the world; the camera's place where there is none."""
@@ -244,18 +295,17 @@ class Seen:
         ends: Doubles = local @ T[:3, :3].T + T[:3, 3]
         return ends
 
-    def depth_at(self, points: Doubles) -> tuple[Doubles, Doubles]:
+    def depth_at(self, points: Floats) -> tuple[Floats, Floats]:
         """(M,): the depths in the directions of points (M, 3), 0 where there is none, NaN beside the image; and the
         points' own."""
-        T = self.camera.T_camera_world
-        local = points @ T[:3, :3].T + T[:3, 3]
-        own = local[:, 2]
-        with np.errstate(all="ignore"):
-            pixel = local[:, :2] / own[:, None] * self.camera.focal + self.camera.middle
+        M = (self.camera.matrix @ self.camera.T_camera_world[:3]).astype(np.float32)
+        u, v, own = M[:, :3] @ points.T + M[:, 3:]
         height, width = self.depth.shape
-        inside = (own > 0.0) & (pixel >= 0.0).all(axis=1) & (pixel < (width, height)).all(axis=1)
-        column, row = np.where(inside[:, None], pixel, 0.0).astype(int).T
-        return np.where(inside, self.depth[row, column], np.nan).astype(np.float64), own
+        inside = (own > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < width * own) & (v < height * own)
+        with np.errstate(all="ignore"):
+            column, row = (np.where(inside, part / own, 0.0).astype(np.int32) for part in (u, v))
+        column, row = np.minimum(column, width - 1), np.minimum(row, height - 1)
+        return np.where(inside, self.depth[row, column], np.float32(np.nan)), own
 
     def ahead(self, x: Doubles, y: Doubles, z: Doubles) -> Floats:
         """(X, Y, Z): how far the surface that is seen lies behind the places of a grid, by depth; infinity where there
@@ -268,7 +318,7 @@ class Seen:
         with np.errstate(all="ignore"):
             column, row = (np.where(inside, part / own, 0.0).astype(np.int32) for part in (u, v))
         column, row = np.minimum(column, width - 1), np.minimum(row, height - 1)
-        there = np.where(self.depth > 0.0, self.depth, np.float32(np.inf))[row, column]
+        there = np.where(self.depth == 0.0, np.float32(np.inf), self.depth)[row, column]
         return np.where(inside, there - own, np.float32(np.nan)).astype(np.float32)
 
 
@@ -279,27 +329,50 @@ def drawn(splats: Prepared, cameras: list[Camera], voxel: float, workers: int) -
         return [Seen(camera, *image) for camera, image in zip(cameras, images, strict=True)]
 
 
-def agreed(views: list[Seen], voxel: float, alone: bool) -> tuple[list[Seen], float]:
+def agreed(views: list[Seen], voxel: float, alone: bool, placed: bool) -> tuple[list[Seen], float]:
     """The views without depths that more of the other views see through than confirm; and the share that went.
 
     A depth stays that no other view can judge. alone: whether there is nothing behind the object, so that a view
-    without a depth looks through too.
+    without a depth looks through too · placed: whether the cameras of the training are not known. Then depths at backs
+    become NaN, and places in a scene from which many backs are seen are left out: splats look the same from behind,
+    where no camera of the training was, but what it would have seen there is missing.
     """
-    places = np.array([np.linalg.inv(view.camera.T_camera_world)[:3, 3] for view in views])
+    places = [view.seen_places() for view in views]
+    overlap = _overlap(views, places)
     kept, lost, total = [], 0, 0
-    for number, view in enumerate(views):
-        order = np.argsort(np.linalg.norm(places - places[number], axis=1), kind="stable")
-        where = np.flatnonzero(view.depth > 0.0)
-        points = view.ends().reshape(-1, 3)[where]
-        confirm, deny = np.zeros(len(where), np.int32), np.zeros(len(where), np.int32)
-        for other in order[1 : _OTHERS + 1]:
+    for number, (view, (where, points, normals)) in enumerate(zip(views, places, strict=True)):
+        confirm, deny, behind = (np.zeros(len(where), np.int32) for _ in range(3))
+        for other in np.argsort(-overlap[number], kind="stable")[:_OTHERS]:
             there, own = views[other].depth_at(points)
-            slack = np.maximum(_AGREE * own, _AGREE_VOXELS * voxel)
-            confirm += (there > 0.0) & (np.abs(there - own) < slack)
-            deny += (there > own + slack) if not alone else (there > own + slack) | (there == 0.0)
+            off, slack = there - own, np.maximum(_AGREE * own, np.float32(_AGREE_VOXELS * voxel))
+            near = there > 0.0
+            confirm += near & (np.abs(off) < slack)
+            deny += (off > slack) if not alone else (off > slack) | (there == 0.0)
+            facing = ((views[other].place.astype(np.float32) - points) * normals).sum(axis=1) > 0.0
+            behind += (near & (np.abs(off) < _SAME * voxel)) * np.where(facing, -1, 1)
         wrong = deny > np.maximum(confirm, _LEAST_AGREEING - 1)
         depth = view.depth.copy()
-        depth.reshape(-1)[where[wrong]] = 0.0
+        flat = depth.reshape(-1)
+        flat[where[(behind > 0) & placed]] = np.nan
+        flat[where[wrong]] = 0.0
         kept.append(Seen(view.camera, depth, view.color))
         lost, total = lost + int(wrong.sum()), total + len(where)
-    return kept, lost / max(total, 1)
+    sound = [view for view in kept if alone or _share_of_backs(view.place, kept) <= _MOST_BACKS]
+    return sound or kept, lost / max(total, 1)
+
+
+def _share_of_backs(place: Doubles, views: list[Seen]) -> float:
+    """Of what is seen from a place."""
+    depths = np.concatenate([view.depth.ravel() for view in views if np.allclose(view.place, place)])
+    return float(np.isnan(depths).sum() / max(np.count_nonzero(depths), 1))
+
+
+def _overlap(views: list[Seen], places: list[_Places]) -> npt.NDArray[np.int64]:
+    """(V, V): of some places that a view sees, how many lie within the other's image; -1 of itself."""
+    random, counts = np.random.default_rng(0), np.full((len(views), len(views)), -1)
+    for number, (_, points, _) in enumerate(places):
+        some = points[random.permutation(len(points))[:_TRIED]]
+        for other in range(len(views)):
+            if other != number:
+                counts[number, other] = np.isfinite(views[other].depth_at(some)[0]).sum()
+    return counts

@@ -30,18 +30,18 @@ def chair() -> trimesh.Trimesh:
     """Its back is at the side of negative x, higher at one end: there is no symmetry."""
     parts = [_box((-0.22, -0.22, 0.42), (0.22, 0.22, 0.48)), *_legs(0.18, 0.18, 0.43)]
     parts += [_box((-0.22, -0.22, 0.45), (-0.17, 0.22, 0.85)), _box((-0.22, -0.22, 0.8), (-0.17, 0.0, 1.0))]
-    return trimesh.boolean.union(parts)
+    return trimesh.util.concatenate(parts)
 
 
 def table() -> trimesh.Trimesh:
     parts = [_box((-0.5, -0.35, 0.66), (0.5, 0.35, 0.72)), *_legs(0.42, 0.28, 0.68, 0.07)]
-    return trimesh.boolean.union([*parts, _box((-0.5, -0.35, 0.45), (-0.1, 0.35, 0.68))])
+    return trimesh.util.concatenate([*parts, _box((-0.5, -0.35, 0.45), (-0.1, 0.35, 0.68))])
 
 
 def bracket() -> trimesh.Trimesh:
     """Three unlike arms at right angles."""
     parts = [_box((0.0, 0.0, 0.0), (0.3, 0.08, 0.06)), _box((0.0, 0.0, 0.0), (0.08, 0.2, 0.06))]
-    return trimesh.boolean.union([*parts, _box((0.0, 0.0, 0.0), (0.07, 0.07, 0.25))])
+    return trimesh.util.concatenate([*parts, _box((0.0, 0.0, 0.0), (0.07, 0.07, 0.25))])
 
 
 def lamp() -> trimesh.Trimesh:
@@ -51,7 +51,7 @@ def lamp() -> trimesh.Trimesh:
         trimesh.creation.cylinder(radius=0.03, height=1.2, transform=_up(0.6)),
         trimesh.creation.cone(radius=0.22, height=0.3, transform=_up(1.1)),
     ]
-    return trimesh.boolean.union(parts)
+    return trimesh.util.concatenate(parts)
 
 
 def _up(z: float) -> Matrix:

@@ -136,15 +136,56 @@ def ring_depth(camera: Camera, radius: float) -> Seen:
 def test_depths_that_other_views_see_through_are_left_out() -> None:
     region = region_of(sphere(2000), None, within=False)
     views = [ring_depth(camera, 1.0) for camera in cameras_for(sphere(2000), region)]
-    good, share = agreed(views, 0.01, alone=True)
+    good, share = agreed(views, 0.01, alone=True, placed=True)
     assert share < 0.01
     wrong = views[0].depth.copy()
     wrong[100:140, 100:140] -= 0.5  # as of a floater before one camera
-    left, _ = agreed([replace(views[0], depth=wrong), *views[1:]], 0.01, alone=True)
+    left, _ = agreed([replace(views[0], depth=wrong), *views[1:]], 0.01, alone=True, placed=True)
     assert (left[0].depth[102:138, 102:138] == 0).mean() > 0.95
     outside = np.ones(wrong.shape, bool)
     outside[95:145, 95:145] = False
     np.testing.assert_array_equal(left[0].depth[outside], good[0].depth[outside])
+
+
+def plate_depth(place: Doubles) -> Seen:
+    """What a camera at a place sees of the square |x|, |y| < 1 at z = 0, towards its middle."""
+    camera = replace(CAMERA, T_camera_world=looking(np.array(place)), focal=(40.0, 40.0))
+    rays = Seen(camera, np.ones((24, 32), np.float32), np.zeros((24, 32, 3), np.uint8)).ends() - place
+    depth = -place[2] / rays[..., 2]
+    ends = place + depth[..., None] * rays
+    on = (np.abs(ends[..., :2]) < 1.0).all(axis=-1) & (depth > 0.0)
+    return Seen(camera, np.where(on, depth, 0.0).astype(np.float32), np.zeros((24, 32, 3), np.uint8))
+
+
+def looking(place: Doubles) -> Doubles:
+    ahead = -place / np.linalg.norm(place)
+    right = np.cross(ahead, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+    T[:3, 3] = -T[:3, :3] @ place
+    return T
+
+
+@pytest.mark.parametrize(("placed", "alone"), [(True, True), (True, False), (False, False)])
+def test_what_is_seen_from_behind_tells_nothing(placed: bool, alone: bool) -> None:
+    """A plate that three views see from above and one from below: where there is nothing to see from, it is left out.
+    Cameras of the training did look from there."""
+    above = [plate_depth(np.array([x, 0.1, 2.0])) for x in (-0.5, 0.0, 0.6)]
+    below = plate_depth(np.array([0.2, 0.1, -1.5]))
+    views, _ = agreed([*above, below], 0.01, alone, placed)
+    for before, after in zip(above, views[:3], strict=True):
+        np.testing.assert_array_equal(after.depth, before.depth)
+    seen = below.depth > 0.0
+    assert seen.mean() > 0.5
+    if not placed:
+        np.testing.assert_array_equal(views[3].depth, below.depth)
+    elif alone:
+        assert np.isnan(views[3].depth[seen]).all()
+        ahead = views[3].ahead(np.zeros(1), np.zeros(1), np.array([-0.5, 0.5]))
+        assert np.isnan(ahead).all()
+    else:
+        assert len(views) == 3  # no camera was at a place that sees backs alone
 
 
 def sphere(count: int, radius: float = 1.0, seed: int = 0) -> Splats:

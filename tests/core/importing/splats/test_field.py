@@ -89,6 +89,8 @@ def test_a_ball_among_floaters_is_a_ball(tmp_path: Path) -> None:
     assert (inside < 0).mean() > 0.99
     assert (outside > 0).mean() > 0.99
     assert (off_the_surface(field, 1.2) > 0).mean() > 0.99
+    for radius in (0.9, 0.6, 0.3, 0.05):  # no view looks there: matter
+        assert (off_the_surface(field, radius) < 0).all()
 
 
 def test_a_room_is_free_within_and_observed_there(tmp_path: Path) -> None:
