@@ -3,8 +3,10 @@ size of each object.
 
 Each placement has the probability p of its pose by itself. Sets of placements without conflict are compared by the
 product of the odds p / (1 - p) of their members: a placement's probability among the others is the share of the sets
-that hold it. The set that is chosen is the one of the most surface explained, each placement's weighted by how far its
-probability is above the least one of an accepted answer: an integer program, solved exactly.
+that hold it. Among placements that exclude each other, directly or through others, the odds count times the square of
+the share of samples that each explains of what the largest does: a part of a large object is like many small ones.
+The set that is chosen is the one of the most surface explained, each placement's weighted by how far its probability
+is above the least one of an accepted answer: an integer program, solved exactly.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from regnf_core.library import LibraryObject
 from regnf_core.population.placements import Placement, placed_samples
-from regnf_core.population.proposals import Floats, Mask, SceneSurface
+from regnf_core.population.proposals import Floats, Integers, Mask, SceneSurface
 
 _SHARED_SURFACE = 0.25
 """Of the samples that the smaller of two placements explains: with more in common they explain the same surface."""
@@ -99,14 +101,16 @@ def together(placements: Sequence[Placement], excluded: Mask, least: float) -> t
         if len(members) > 1:
             members = members[np.argsort(-likely[members])]
             rest, members = members[_MOST_TOGETHER:], members[:_MOST_TOGETHER]
-            among[members] = _shares(likely[members], excluded[np.ix_(members, members)])
+            sizes = np.array([len(placements[number].explains) for number in members])
+            among[members] = shares(likely[members], sizes, excluded[np.ix_(members, members)])
             among[rest] = 0.0
     return _best_set(placements, excluded, among, least), among
 
 
-def _shares(likely: Floats, excluded: Mask) -> Floats:
-    """The probability (K,) of each of a few placements, over all sets without conflict."""
-    odds = likely / np.maximum(1.0 - likely, 1e-6)
+def shares(likely: Floats, sizes: Integers, excluded: Mask) -> Floats:
+    """The probability (K,) of each of a few placements, over all sets without conflict. sizes: (K,) samples that each
+    explains."""
+    odds = likely / np.maximum(1.0 - likely, 1e-6) * (sizes / max(sizes.max(), 1)) ** 2
     total, held = 0.0, np.zeros(len(odds))
     left: list[tuple[int, float, tuple[int, ...]]] = [(0, 1.0, ())]
     while left:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.sparse.csgraph import connected_components
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.population.consistency import conflicts, distinct, together, within_boundary
@@ -40,6 +41,16 @@ def test_two_that_exclude_each_other_share_the_odds() -> None:
     assert chosen == []
 
 
+def test_a_large_object_is_not_given_up_for_small_ones_on_its_parts() -> None:
+    large, small = placement(0.95, range(1000)), placement(0.95, range(100), 1)
+    other = placement(0.95, range(200, 300), 1)
+    chosen, likely = together([large, small, other], excluding(3, (0, 1), (0, 2)), 0.8)
+    part = 19 * 0.1**2  # the odds of each small one
+    total = (1 + part) ** 2 + 19
+    assert likely == pytest.approx([19 / total, part * (1 + part) / total, part * (1 + part) / total])
+    assert chosen == [0]
+
+
 def test_a_placement_without_conflict_keeps_its_probability() -> None:
     alone = [placement(0.9, range(100)), placement(0.3, range(200, 300), 1)]
     chosen, likely = together(alone, excluding(2), 0.8)
@@ -59,10 +70,15 @@ def test_shares_and_the_best_set_are_those_of_all_sets(seed: int) -> None:
     excluded |= excluded.T
     chosen, likely = together(many, excluded, 0.8)
     weights, held = [], []
+    label = connected_components(excluded)[1]
+    largest = [max(len(one.explains) for one, group in zip(many, label, strict=True) if group == own) for own in label]
+    odds = np.array([one.probability / (1 - one.probability) for one in many])
+    alone = np.bincount(label)[label] == 1
+    odds *= np.where(alone, 1.0, (np.array([len(one.explains) for one in many]) / largest) ** 2)
     for members in itertools.product([False, True], repeat=count):
         numbers = np.flatnonzero(members)
         if not excluded[np.ix_(numbers, numbers)].any():
-            weights.append(np.prod([many[n].probability / (1 - many[n].probability) for n in numbers]))
+            weights.append(odds[numbers].prod())
             held.append(members)
     total = np.array(weights) / sum(weights)
     assert likely == pytest.approx(total @ np.array(held, float), abs=1e-9)
