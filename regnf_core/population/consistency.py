@@ -101,7 +101,7 @@ def together(placements: Sequence[Placement], excluded: Mask, least: float) -> t
         if len(members) > 1:
             members = members[np.argsort(-likely[members])]
             rest, members = members[_MOST_TOGETHER:], members[:_MOST_TOGETHER]
-            sizes = np.array([len(placements[number].explains) for number in members])
+            sizes = np.array([len(placements[number].explains) for number in members.tolist()])
             among[members] = shares(likely[members], sizes, excluded[np.ix_(members, members)])
             among[rest] = 0.0
     return _best_set(placements, excluded, among, least), among
