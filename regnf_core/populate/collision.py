@@ -21,7 +21,7 @@ DENSITY = 300.0
 """Of boxes, kg/m^3: furniture with its hollows."""
 _MOST_CELLS = 250
 """Along the longest edge of what nothing explains: memory."""
-_STEP = 0.4
+_STEP = 0.5
 """Largest distance of the points that stand for a surface, in cells."""
 _INSIDE = 0.75
 """Winding number from which on a place is inside: a closed surface has 1 there, an open bowl up to about 0.5."""
@@ -31,6 +31,8 @@ _FLAT = 0.02
 """What is less wide than this, in cells, is a face."""
 _GAP, _GAP_SHARE = 0.03, 0.05
 """A thing is carried by what lies at most so far beneath its lowest points: meters, or a share of its height."""
+_FEET = 500
+"""So many of these points are looked at, at most."""
 LEVEL = 0.9
 """Least cosine between up and a floor's normal."""
 
@@ -139,6 +141,7 @@ def carried(points: Floats, others: Sequence[Boxes]) -> bool:
     lowest, height = points[:, 2].min(), np.ptp(points[:, 2])
     gap = max(_GAP, _GAP_SHARE * height)
     feet = points[points[:, 2] <= lowest + gap / 2.0]
+    feet = feet[np.argsort(feet[:, 2])][:: len(feet) // _FEET + 1]
     for other in others:
         if other.axes[2, 2] < LEVEL or not len(other):
             continue
