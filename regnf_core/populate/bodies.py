@@ -115,7 +115,8 @@ class World:
         everything = np.concatenate(corners) if corners else np.zeros((1, 3))
         center = (everything.min(axis=0) + everything.max(axis=0)) / 2.0
         radius = float(np.linalg.norm(np.ptp(everything, axis=0))) / 2.0 + _MARGIN_M
-        T, found = self.T_world_scene, []
+        T = self.T_world_scene
+        found: list[tuple[str, Boxes]] = []
         for plane in self.boundary:
             normal = T.rotation.numpy() @ plane.normal
             offset = self.meters * plane.offset + float(normal @ T.translation.numpy())

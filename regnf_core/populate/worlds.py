@@ -6,7 +6,7 @@ which leaves no space below a table.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
@@ -14,7 +14,6 @@ from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
-from trimesh.exchange.gltf import export_glb
 from trimesh.transformations import euler_from_matrix
 
 from regnf_core.errors import atomic_path
@@ -29,7 +28,7 @@ GRAVITY = 9.81
 
 def write_glb(world: World, path: Path) -> None:
     """One node for each thing, with its name and pose, below a node ``z_up`` that turns up to glTF's +y; meters."""
-    scene = trimesh.Scene(base_frame="base")
+    scene: Any = trimesh.Scene(base_frame="base")
     turn = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     scene.graph.update(frame_from="base", frame_to="z_up", matrix=turn)
     for body in world.bodies:
@@ -37,7 +36,7 @@ def write_glb(world: World, path: Path) -> None:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = body.R, body.t
         scene.add_geometry(mesh, body.name, body.name, parent_node_name="z_up", transform=pose)
-    data: bytes = export_glb(scene)
+    data: bytes = scene.export(file_type="glb")
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
@@ -192,7 +191,7 @@ def _sdf_model(
     place: Element, name: str, boxes: Boxes, static: bool, R: Floats | None = None, t: Floats | None = None
 ) -> Element:
     model = _add(place, "model", name=name)
-    _add(model, "static", str(static).lower())
+    _add(model, "static", "1" if static else "0")  # PyBullet does not know "true"
     if R is not None:
         _add(model, "pose", _text([*(t if t is not None else ()), *_angles(R)]))
     link = _add(model, "link", name="link")
@@ -212,8 +211,8 @@ def _sdf_model(
 
 def _angles(R: Floats) -> Sequence[float]:
     """Roll, pitch, yaw about fixed axes."""
-    angles: Sequence[float] = euler_from_matrix(R, "sxyz")
-    return angles
+    angles_of: Callable[..., Sequence[float]] = euler_from_matrix
+    return angles_of(R, "sxyz")
 
 
 def _tensor(inertia: Floats) -> Iterator[tuple[str, str]]:

@@ -314,7 +314,7 @@ def test_sdf_has_models_with_meshes_and_poses(tmp_path: Path) -> None:
     assert list(models) == [*world.static, *(body.name for body in world.bodies)]
     for body in world.bodies:
         model = models[body.name]
-        assert model.findtext("static") == str(not body.free).lower()
+        assert model.findtext("static") == ("0" if body.free else "1")
         x, y, z, *angles = map(float, model.findtext("pose").split())
         turn = Rotation.from_euler("xyz", angles).as_matrix()
         mesh = trimesh.load_mesh(tmp_path / model.findtext("link/visual/geometry/mesh/uri"), process=False)
