@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.populate.collision import LEVEL, Boxes, Floats, Integers, carried, mesh_boxes, point_boxes, slab
+from regnf_core.populate.collision import LEVEL, Boxes, Floats, Integers, apart, carried, mesh_boxes, point_boxes, slab
 from regnf_core.populate.proposals import BoundaryPlane
 
 _MARGIN_M = 1.0
@@ -106,6 +106,12 @@ class World:
         for thing in self.things:
             T = self.T_world_scene @ thing.T_scene_object
             found.append((T, *mesh_boxes(T.apply(torch.from_numpy(thing.vertices)).numpy(), thing.faces)))
+        # The larger of two things has the coarser boxes: it gives way.
+        order = sorted(range(len(found)), key=lambda number: -float(np.ptp(found[number][2], axis=0).max()))
+        for place, large in enumerate(order):
+            for small in order[place + 1 :]:
+                T, boxes, points = found[large]
+                found[large] = T, apart(boxes, found[small][1]), points
         return found
 
     @cached_property

@@ -136,6 +136,33 @@ def slab(normal: Floats, offset: float, center: Floats, radius: float, thickness
     return Boxes(axes, low[None], high[None])
 
 
+def apart(boxes: Boxes, other: Boxes) -> Boxes:
+    """Upright boxes without what their cells have too much at their sides, where that reaches into another thing.
+
+    A side recedes by a cell at most, and only where the boxes overlap less along it than in height.
+    """
+    cell = float(np.ptp([boxes.low.min(axis=0), boxes.high.max(axis=0)], axis=0).max()) / CELLS
+    turn = np.abs(boxes.axes.T @ other.axes)
+    middle, half = other.centers @ boxes.axes, other.sizes / 2.0 @ turn.T
+    at_high = boxes.high[:, None] - (middle - half)  # (B, O, 3)
+    at_low = (middle + half) - boxes.low[:, None]
+    into = np.minimum(at_high, at_low)
+    off = np.abs(boxes.centers[:, None] @ other.axes - other.centers @ other.axes)
+    meets = (into > 0.0).all(-1) & (off < (boxes.sizes / 2.0 @ turn)[:, None] + other.sizes / 2.0).all(-1)
+    axis = into[..., :2].argmin(axis=-1)
+    least = into[..., :2].min(axis=-1)
+    meets &= (least <= cell) & (least < into[..., 2])
+    low, high = boxes.low.copy(), boxes.high.copy()
+    for b, o in np.argwhere(meets).tolist():
+        k = int(axis[b, o])
+        if at_high[b, o, k] <= at_low[b, o, k]:
+            high[b, k] = min(high[b, k], boxes.high[b, k] - at_high[b, o, k])
+        else:
+            low[b, k] = max(low[b, k], boxes.low[b, k] + at_low[b, o, k])
+    left = (high - low > _LEAST * cell / 4.0).all(axis=1)
+    return Boxes(boxes.axes, low[left], high[left]) if left.any() else boxes
+
+
 def carried(points: Floats, others: Sequence[Boxes]) -> bool:
     """Whether one of the others lies just beneath the lowest of a thing's points (N, 3); z is up."""
     lowest, height = points[:, 2].min(), np.ptp(points[:, 2])
