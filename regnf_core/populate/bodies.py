@@ -106,12 +106,13 @@ class World:
         for thing in self.things:
             T = self.T_world_scene @ thing.T_scene_object
             found.append((T, *mesh_boxes(T.apply(torch.from_numpy(thing.vertices)).numpy(), thing.faces)))
-        # The larger of two things has the coarser boxes: it gives way.
+        # The larger of two things has the coarser boxes: it gives way first.
         order = sorted(range(len(found)), key=lambda number: -float(np.ptp(found[number][2], axis=0).max()))
         for place, large in enumerate(order):
             for small in order[place + 1 :]:
-                T, boxes, points = found[large]
-                found[large] = T, apart(boxes, found[small][1]), points
+                for one, other in ((large, small), (small, large)):
+                    T, boxes, points = found[one]
+                    found[one] = T, apart(boxes, found[other][1]), points
         return found
 
     @cached_property

@@ -29,6 +29,8 @@ _SAME, _LEAST, _INSET = 1.0 / 8.0, 1.0 / 4.0, 1.0 / 20.0
 """In cells: by how much ends of columns may differ to be one box, a box's least edge, what its free sides lose."""
 _FLAT = 0.02
 """What is less wide than this, in cells, is a face."""
+_GIVEN = 1.25
+"""So many cells a side gives way at most: a cell, and what a pose is wrong by."""
 _GAP, _GAP_SHARE = 0.03, 0.05
 """A thing is carried by what lies at most so far beneath its lowest points: meters, or a share of its height."""
 _FEET = 500
@@ -139,7 +141,7 @@ def slab(normal: Floats, offset: float, center: Floats, radius: float, thickness
 def apart(boxes: Boxes, other: Boxes) -> Boxes:
     """Upright boxes without what their cells have too much at their sides, where that reaches into another thing.
 
-    A side recedes by a cell at most, and only where the boxes overlap less along it than in height.
+    A side recedes by little more than a cell, and only where the boxes overlap less along it than in height.
     """
     cell = float(np.ptp([boxes.low.min(axis=0), boxes.high.max(axis=0)], axis=0).max()) / CELLS
     turn = np.abs(boxes.axes.T @ other.axes)
@@ -151,7 +153,7 @@ def apart(boxes: Boxes, other: Boxes) -> Boxes:
     meets = (into > 0.0).all(-1) & (off < (boxes.sizes / 2.0 @ turn)[:, None] + other.sizes / 2.0).all(-1)
     axis = into[..., :2].argmin(axis=-1)
     least = into[..., :2].min(axis=-1)
-    meets &= (least <= cell) & (least < into[..., 2])
+    meets &= (least <= _GIVEN * cell) & (least < into[..., 2])
     low, high = boxes.low.copy(), boxes.high.copy()
     for b, o in np.argwhere(meets).tolist():
         k = int(axis[b, o])

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.populate.bodies import Body
-from regnf_core.populate.collision import DENSITY, Boxes, carried, mesh_boxes, point_boxes, slab, surface_points
+from regnf_core.populate.collision import DENSITY, Boxes, apart, carried, mesh_boxes, point_boxes, slab, surface_points
 from regnf_core.populate.proposals import BoundaryPlane
 from regnf_core.populate.worlds import World, WorldThing, write_glb, write_mjcf, write_sdf, write_urdf, write_usd
 
@@ -185,6 +185,21 @@ def test_only_what_lies_just_beneath_carries() -> None:
     assert stands(-0.02, 0.3, 0.0, floor)
     assert not stands(0.02, 0.3, 9.0, floor)  # beside it
     assert not stands(0.02, 0.3, 0.0, wall)
+
+
+def test_boxes_give_way_at_their_sides_alone() -> None:
+    first = Boxes(np.eye(3), np.array([[0.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0]]))
+    turned = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+
+    def highest(low: tuple[float, ...], high: tuple[float, ...], axes: Floats = first.axes) -> Floats:
+        return apart(first, Boxes(axes, np.array([low]), np.array([high]))).high[0]
+
+    assert highest((0.98, 0.2, 0.2), (1.5, 0.8, 0.8)) == pytest.approx([0.98, 1.0, 1.0])
+    # Axes (y, -x): from 0.97 to 1.5 along x.
+    assert highest((0.2, -1.5, 0.2), (0.8, -0.97, 0.8), turned) == pytest.approx([0.97, 1.0, 1.0])
+    assert highest((0.2, 0.2, 0.98), (0.8, 0.8, 1.5)) == pytest.approx([1.0, 1.0, 1.0])  # it stands on it
+    assert highest((0.8, 0.2, 0.2), (1.5, 0.8, 0.8)) == pytest.approx([1.0, 1.0, 1.0])  # too far in
+    assert highest((1.01, 0.2, 0.2), (1.5, 0.8, 0.8)) == pytest.approx([1.0, 1.0, 1.0])
 
 
 # Bodies.
