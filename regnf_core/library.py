@@ -137,16 +137,18 @@ def refined_objects(
     seed: int,
     run: Run,
     worst: float = math.inf,
+    shortlist: int = LIBRARY.shortlist,
 ) -> tuple[list[tuple[int, float]], list[Coarse], list[Refined], list[Comparison]]:
     """The objects nearest to the view by signature, those searched coarsely, those refined on their fields, each list
     the best first, and what tells the first refined one from each of the others.
 
-    worst: score of the coarse search, 0..1, above which no object is refined.
+    worst: score of the coarse search, 0..1, above which no object is refined · shortlist: objects that are searched
+    coarsely.
     """
     with run.phase("initializing"):
         nearest = rank_by_signature(view, [one.model for one in library])
         there = view.on(working_device(scene))
-        coarse = [_searched_coarsely(there, library[n], n, options, seed) for n, _ in nearest[: LIBRARY.shortlist]]
+        coarse = [_searched_coarsely(there, library[n], n, options, seed) for n, _ in nearest[:shortlist]]
         coarse.sort(key=lambda found: found[0])
         worth = [found for found in coarse if found[0] <= min(coarse[0][0] + LIBRARY.margin, worst)][
             : LIBRARY.max_refined

@@ -25,6 +25,8 @@ _WORTH = 0.2
 """Probability from which on a pose is looked at again, in a box of its own."""
 _WORST = 0.65
 """Score of the coarse search, 0..1, above which a box is given up: of boxes with a likely pose none has more."""
+_SHORTLIST = 24
+"""Objects that are searched coarsely in a box: a proposal shows less of an object than a detection's box."""
 _TOLERANCE, _LEAST_TOLERANCE = 1.5, 0.01
 """How far from an object's surface it explains the scene's: spacings; object diameters, at least."""
 _ALIKE = 0.3
@@ -98,7 +100,8 @@ class Seeker:
         first = self.best_in(box)
         if first is None or first.probability < _WORTH:
             return None
-        return self.best_in(box_of_pose(self.library[first.number].model, first.T_object_scene))
+        found = self.best_in(box_of_pose(self.library[first.number].model, first.T_object_scene))
+        return None if found is None or found.reason == "OUTSIDE_DETECTION" else found
 
     def best_in(self, box: OrientedBox) -> Placement | None:
         """The library's most probable object in the box, whatever its verdict; None: no surface, or none fits in."""
@@ -110,7 +113,9 @@ class Seeker:
         except (NoSurfaceError, InvalidDetectionError):
             return None
         some = [self.library[number] for number in numbers]
-        _, _, refined, _ = refined_objects(self.scene, view, some, self.options, self.seed, Run(None), _WORST)
+        _, _, refined, _ = refined_objects(
+            self.scene, view, some, self.options, self.seed, Run(None), _WORST, _SHORTLIST
+        )
         if not refined:
             return None
         evaluation, number, _, _ = refined[0]

@@ -32,7 +32,7 @@ from regnf_core.population.proposals import (
     scene_surface,
 )
 from regnf_core.processes import can_fork, in_processes
-from regnf_core.robust.verdict.evaluation import least_probability
+from regnf_core.robust.verdict.evaluation import LEVELS
 
 _ROUNDS, _MOST_PROPOSALS, _AT_ONCE = 3, 60, 8
 """Rounds at most; proposals of the first, of each other half as many; proposals before the placements are looked at."""
@@ -124,6 +124,8 @@ def populate(
 ) -> Population:
     """Find the library's objects in a scene: any number of each, also none.
 
+    A placement is accepted from the level `strict` on, unless ``min_probability`` is given: most of the boxes hold
+    nothing of the library, while a registration's probability assumes that half of all requests are right.
     detections: boxes of a detector, which are searched before all others · processes: copies of this process that share
     the work; the result is the same for any number. Deterministic for a seed.
     Raises InvalidOptionsError (PRESET_UNSUITABLE), InvalidInputError (LIBRARY_EMPTY, FIELD_NOT_FINITE), NoSurfaceError.
@@ -134,7 +136,8 @@ def populate(
         raise InvalidInputError("the library has no objects", reason="LIBRARY_EMPTY")
     surface = scene_surface(scene)
     seeker = Seeker(scene, surface, library, options, seed)
-    found = _Found(library, surface, least_probability(options.robust))
+    said = options.robust.min_probability
+    found = _Found(library, surface, LEVELS["strict"] if said is None else said)
     tried: list[Integers] = []
     searched, total = 0, len(detections) + sum(_MOST_PROPOSALS >> turn for turn in range(_ROUNDS))
 
