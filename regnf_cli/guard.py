@@ -27,7 +27,7 @@ def main(arguments: list[str]) -> None:
 # Optional parts of the installation: a command names the one that it lacks.
 
 MODULES = {
-    "engine": ("torch", "open3d", "igl", "laspy", "lazrs", "PIL", "rosbags", "safetensors", "scipy", "trimesh", "yaml"),
+    "engine": ("torch", "open3d", "igl", "laspy", "lazrs", "msgpack", "PIL", "rosbags", "safetensors", "scipy", "trimesh", "yaml"),
     "service": (
         "PIL",
         "fastapi",

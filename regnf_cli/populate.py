@@ -186,7 +186,7 @@ class _Asked:
 def _field(scene: Path, description: dict[str, Any] | None) -> FieldSource:
     if cli.is_recording(scene):
         hint = f"Make a map of it first: regnf fuse {scene} map.safetensors"
-        raise InvalidInputError(f"{scene}: a recording, expected a field", reason="FIELD_NOT_SUPPORTED", hint=hint)
+        raise InvalidInputError(f"{scene}: a recording, expected a field", reason="NO_FIELD", hint=hint)
     return cli.source_of(scene, description, cli.choice_of(None, False), "scene")
 
 

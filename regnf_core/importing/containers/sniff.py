@@ -278,7 +278,7 @@ def sniff_format(head: bytes) -> str | None:
         return "sqlite"
     if (splats := sniff_splats(head)) is not None:
         return splats
-    if head[8:9] == b"{" and not any(head[5:8]):  # the length of its header
+    if head[8:9] == b"{" and head[9:10] != b"\0" and b"\0" in head[:8]:  # the length of its header; no text has zeros
         return "safetensors"
     return "onnx" if _ONNX.match(head) else sniff_mesh(head)
 
