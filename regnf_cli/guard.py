@@ -27,8 +27,22 @@ def main(arguments: list[str]) -> None:
 # Optional parts of the installation: a command names the one that it lacks.
 
 MODULES = {
-    "engine": ("torch", "open3d", "igl", "laspy", "lazrs", "msgpack", "PIL", "rosbags", "safetensors", "scipy", "trimesh", "yaml"),
+    "engine": (
+        "torch",
+        "open3d",
+        "igl",
+        "laspy",
+        "lazrs",
+        "msgpack",
+        "PIL",
+        "rosbags",
+        "safetensors",
+        "scipy",
+        "trimesh",
+        "yaml",
+    ),
     "service": (
+        "msgpack",
         "PIL",
         "fastapi",
         "obstore",
